@@ -1,0 +1,189 @@
+"""Keypoint messages to observations, by duck typing: nothing of ROS is imported.
+
+Live messages of rclpy and messages that rosbags read from a bag have the same fields and take the
+same path. Whatever is wrong with a message ends in a `MessageError`, before anything of a size
+that the message claims is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+POINT_CLOUD = "sensor_msgs/PointCloud2"
+MULTI_ARRAY = "std_msgs/Float32MultiArray"
+POLYGON = "geometry_msgs/PolygonStamped"
+
+# No image is this large, and sums of squares stay far below the largest float32.
+_FARTHEST = 1e9
+_LEAST = np.nextafter(np.float32(0), np.float32(1))
+_FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField datatypes FLOAT32 and FLOAT64
+
+# The layout that `pack_points` writes, as (name, offset) of float32 fields.
+POINT_FIELDS = (("x", 0), ("y", 4), ("z", 8), ("confidence", 12))
+POINT_STEP = 16
+
+
+class Observation(NamedTuple):
+    """What one message shows: n objects of q keypoints each, in the detector's order.
+
+    points: (n, q, 2) float32, x right and y down; (0, 0) where missing.
+    confidence: (n, q) float32, above 0 and at most 1; 0 where missing.
+    """
+
+    points: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+
+
+class MessageError(ValueError):
+    """A message that cannot be read: says what was expected and what came."""
+
+
+def read(message: Any, input_type: str, keypoints: int, min_confidence: float = 0.0) -> Observation:
+    """Return the observation in `message`, which is of type `input_type` (see `INPUT_TYPES`).
+
+    keypoints: q, the number that the detector's layout has; another number is an error.
+    min_confidence: a keypoint below it is missing. So is one with confidence 0, at (0, 0), or
+        with NaN or infinity in a coordinate or its confidence.
+    Raises MessageError for a malformed message, ValueError for an unknown `input_type`.
+    """
+    reader = INPUT_TYPES.get(input_type)
+    if reader is None:
+        raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
+    try:
+        values = reader(message, keypoints)
+    except (AttributeError, TypeError) as error:
+        raise MessageError(f"expected a message of type {input_type}: {error}") from None
+    return observation(values, min_confidence)
+
+
+def observation(values: NDArray[np.floating], min_confidence: float = 0.0) -> Observation:
+    """Return values (n, q, 2: x, y or 3: x, y, confidence) with missing keypoints marked.
+
+    Values without a confidence are certain; a confidence above 1 counts as 1.
+    """
+    with np.errstate(over="ignore"):
+        values = values.astype(np.float32)
+    x, y = values[..., 0], values[..., 1]
+    # NaN compares false, so the first test drops it together with infinity.
+    seen = (np.abs(values).max(-1) < _FARTHEST) & ((x != 0) | (y != 0))
+    if values.shape[-1] == 3:
+        confidence = np.minimum(values[..., 2], np.float32(1))
+        seen &= confidence >= max(np.float32(min_confidence), _LEAST)
+    else:
+        confidence = np.ones_like(x)
+    points = values[..., :2]
+    points[~seen] = confidence[~seen] = 0
+    return Observation(points, confidence)
+
+
+def pack_points(points: NDArray[np.floating], confidence: NDArray[np.floating]) -> bytes:
+    """Return the data of a little-endian PointCloud2 with the fields `POINT_FIELDS`.
+
+    points: (n, p, 3) or (n, p, 2), z is then 0. confidence: (n, p). Height is n, width is p,
+    point_step is `POINT_STEP`.
+    """
+    packed = np.zeros((*confidence.shape, 4), "<f4")
+    packed[..., : points.shape[-1]] = points
+    packed[..., 3] = confidence
+    return packed.tobytes()
+
+
+def _point_cloud(message: Any, keypoints: int) -> NDArray[np.floating]:
+    """Return (n, q, 2 or 3) of a PointCloud2: fields x, y and, where there is one, confidence."""
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    _check_keypoints(width, keypoints, "width")
+    names = ["x", "y"] + ["confidence"] * any(f.name == "confidence" for f in message.fields)
+    formats, offsets = zip(*(_field(message.fields, name, step) for name in names), strict=True)
+    if not height:
+        return np.empty((0, width, len(names)))
+    row_step = int(message.row_step) if height > 1 else width * step
+    if row_step < width * step:
+        raise MessageError(
+            f"row_step is {row_step}; {width} points of {step} bytes need at least {width * step}"
+        )
+    data = memoryview(message.data).cast("B")
+    needed = (height - 1) * row_step + width * step
+    if len(data) < needed:
+        raise MessageError(f"data has {len(data)} bytes; {height} x {width} points need {needed}")
+    order, values = ">" if message.is_bigendian else "<", np.empty((height, width, len(names)))
+    for i, (form, offset) in enumerate(zip(formats, offsets, strict=True)):
+        values[..., i] = np.ndarray((height, width), order + form, data, offset, (row_step, step))
+    return values
+
+
+def _field(fields: Sequence[Any], name: str, point_step: int) -> tuple[str, int]:
+    """Return (numpy format, offset) of the field called `name`, checked to lie in a point."""
+    found = [field for field in fields if field.name == name]
+    if len(found) != 1:
+        names = ", ".join(str(field.name) for field in fields[:20]) or "none"
+        raise MessageError(f"expected one field {name!r}; the fields are: {names}")
+    form = _FLOATS.get(int(found[0].datatype))
+    if form is None:
+        raise MessageError(
+            f"field {name!r} has datatype {found[0].datatype}; expected FLOAT32 (7) or FLOAT64 (8)"
+        )
+    offset = int(found[0].offset)
+    if offset < 0 or offset + int(form[1]) > point_step:
+        raise MessageError(
+            f"field {name!r} at offset {offset} does not fit into a point_step of {point_step}"
+        )
+    return form, offset
+
+
+def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:
+    """Return (n, q, 2 or 3) of a Float32MultiArray.
+
+    The sizes of the layout's dimensions tell the shape: q x 2, q x 3, n x q x 2 or n x q x 3,
+    rows of x, y and, in threes, confidence. Strides are not looked at: the data is dense. With no
+    dimensions, or a single one, the data is one object: 2q numbers are q x 2, 3q are q x 3.
+    """
+    data = np.asarray(message.data, np.float32)[int(message.layout.data_offset) :]
+    shape = [int(dimension.size) for dimension in message.layout.dim]
+    if len(shape) > 3:
+        raise MessageError(f"layout has {len(shape)} dimensions; expected at most 3")
+    if shape and math.prod(shape) != len(data):
+        sizes = " x ".join(map(str, shape))
+        raise MessageError(f"layout says {sizes} numbers; data has {len(data)} after its offset")
+    if len(shape) < 2:
+        if len(data) not in (2 * keypoints, 3 * keypoints):
+            raise MessageError(
+                f"data has {len(data)} numbers and no layout; {keypoints} keypoints need "
+                f"{2 * keypoints} (x, y) or {3 * keypoints} (x, y, confidence)"
+            )
+        shape = [keypoints, len(data) // keypoints]
+    *objects, count, size = shape
+    if size not in (2, 3):
+        raise MessageError(f"last dimension is {size}; expected 2 (x, y) or 3 (x, y, confidence)")
+    _check_keypoints(count, keypoints, "next to last dimension")
+    return data.reshape(*(objects or [1]), count, size)
+
+
+def _polygon(message: Any, keypoints: int) -> NDArray[np.floating]:
+    """Return (1, q, 2 or 3) of a PolygonStamped; z is the confidence.
+
+    A z of exactly 0 everywhere is a sender that gives no confidence: all points are certain.
+    """
+    points = message.polygon.points
+    _check_keypoints(len(points), keypoints, "number of points")
+    values = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(1, keypoints, 3)
+    return values if values[..., 2].any() else values[..., :2]
+
+
+def _check_keypoints(count: int, keypoints: int, where: str) -> None:
+    """Raise MessageError naming both numbers when they differ."""
+    if count != keypoints:
+        raise MessageError(
+            f"message has {count} keypoints ({where}); the keypoint layout has {keypoints}"
+        )
+
+
+INPUT_TYPES: dict[str, Callable[[Any, int], NDArray[np.floating]]] = {
+    POINT_CLOUD: _point_cloud,
+    MULTI_ARRAY: _multi_array,
+    POLYGON: _polygon,
+}
