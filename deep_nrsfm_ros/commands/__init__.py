@@ -1,0 +1,1 @@
+"""Command-line programs, each thin: options in, the library called, progress shown."""

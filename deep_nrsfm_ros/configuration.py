@@ -1,0 +1,99 @@
+"""Options: typed dataclass fields that carry their own description and range.
+
+One declaration serves every way in: the field is a Python default, a command-line option
+(`add_arguments`) and, in the node, a declared ROS parameter with descriptor (`node.parameters`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from typing import Any, TypeVar, get_type_hints
+
+Config = TypeVar("Config")
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """What an option means and allows; `low` and `high` are inclusive, None is unbounded.
+
+    A `read_only` option cannot change while a node runs.
+    """
+
+    description: str
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise ValueError that names the option, the value and what is allowed."""
+        values = value if isinstance(value, (tuple, list)) else (value,)
+        for item in values:
+            if self.choices and item not in self.choices:
+                raise ValueError(f"{name} is {item!r}; choose one of {', '.join(self.choices)}")
+            below = self.low is not None and not item >= self.low
+            above = self.high is not None and not item <= self.high
+            if below or above:
+                raise ValueError(f"{name} is {item!r}; it must be {self.allowed()}")
+
+    def allowed(self) -> str:
+        """Return the range in words, e.g. "at least 0 and at most 1"."""
+        bounds = (("at least", self.low), ("at most", self.high))
+        return " and ".join(f"{word} {bound:g}" for word, bound in bounds if bound is not None)
+
+
+def option(
+    default: Any,
+    description: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    read_only: bool = False,
+) -> Any:
+    """Return a dataclass field with its description, range and choices attached."""
+    return dataclasses.field(
+        default=default, metadata={"option": Option(description, low, high, choices, read_only)}
+    )
+
+
+def options(cls: type) -> list[tuple[dataclasses.Field[Any], Any, Option]]:
+    """Return (field, resolved type, option) for every field declared with `option`."""
+    hints = get_type_hints(cls)
+    return [
+        (field, hints[field.name], field.metadata["option"])
+        for field in dataclasses.fields(cls)
+        if "option" in field.metadata
+    ]
+
+
+def check(config: Any) -> None:
+    """Raise ValueError for the first option of `config` outside its range."""
+    for field, _, opt in options(type(config)):
+        opt.check(field.name, getattr(config, field.name))
+
+
+def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
+    """Add `--name-of-field` to `parser` for every option of the dataclass `cls`."""
+    group = parser.add_argument_group((cls.__doc__ or cls.__name__).splitlines()[0].rstrip("."))
+    for field, kind, opt in options(cls):
+        settings: dict[str, Any] = {"help": opt.description, "default": field.default}
+        if kind is bool:
+            settings["action"] = argparse.BooleanOptionalAction
+        elif isinstance(field.default, tuple):
+            element = type(field.default[0]) if field.default else str
+            settings |= {"type": element, "nargs": "*"}
+        else:
+            settings["type"] = kind
+        if opt.choices:
+            settings["choices"] = opt.choices
+        group.add_argument("--" + field.name.replace("_", "-"), **settings)
+
+
+def from_arguments(cls: type[Config], arguments: argparse.Namespace) -> Config:
+    """Return the dataclass `cls` filled from parsed arguments, ranges checked."""
+    values = {field.name: getattr(arguments, field.name) for field, _, _ in options(cls)}
+    config = cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    check(config)
+    return config
