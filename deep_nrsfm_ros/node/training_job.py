@@ -1,0 +1,168 @@
+"""A training run as a process of its own: started, watched, cancelled. Knows nothing of ROS."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+Value = str | int | float | None
+
+ACTIVE = ("starting", "reading", "training")
+ENDED = ("finished", "failed", "cancelled")
+TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
+
+_LAST_WORDS = 10
+_LINE_LIMIT = 65536
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+class Progress(NamedTuple):
+    """One step of a training run: its state, a line for people, and named figures."""
+
+    state: str
+    message: str
+    values: dict[str, Value]
+
+    @property
+    def ended(self) -> bool:
+        """Tell whether nothing will follow."""
+        return self.state in ENDED
+
+
+class TrainingJob:
+    """One run of the training command, from its start to its end.
+
+    The process runs at the lowest priority in a session of its own, so that neither Ctrl-C nor
+    its appetite reach the lifter. It prints one JSON object a line, {"state": ..., ...}; any
+    other line is kept as its last words. Its standard input is a pipe: end of file means that
+    the lifter is gone, and the process shall end.
+    """
+
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        on_progress: Callable[[Progress], None],
+        *,
+        threads: int = 1,
+        grace: float = 20.0,
+        command: Sequence[str] = TRAIN_COMMAND,
+    ) -> None:
+        """Start `command` with `arguments`; raise OSError if it cannot be started.
+
+        on_progress: called from a thread of the job for every step; the last one, and only
+            that, has `ended` set, and comes when the process is gone.
+        threads: number of threads that the numerical libraries may use.
+        grace: seconds from `cancel` until a process that does not react is killed.
+        """
+        self._on_progress = on_progress
+        self._grace = grace
+        self._cancelled = False
+        self._said: Progress | None = None
+        self._last_words: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._process = subprocess.Popen(
+            [*command, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            env=os.environ | dict.fromkeys(_THREAD_VARIABLES, str(threads)),
+        )
+        os.setpriority(os.PRIO_PROCESS, self._process.pid, 19)
+        self._watcher = threading.Thread(target=self._watch, name="training", daemon=True)
+        self._watcher.start()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the training."""
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        """Tell whether the end has yet to be reported."""
+        return self._watcher.is_alive()
+
+    def cancel(self) -> None:
+        """Ask the process to stop with the best model so far; kill it when the grace is over."""
+        if self._cancelled:
+            return
+        self._cancelled = True
+        self._signal(signal.SIGTERM)
+        threading.Thread(target=self._kill_late, daemon=True).start()
+
+    def close(self, timeout: float) -> None:
+        """Cancel and return when the process is gone; kill it after `timeout` seconds."""
+        self.cancel()
+        self._watcher.join(timeout)
+        if self.running:
+            self._signal(signal.SIGKILL)
+            self._watcher.join()
+
+    def _kill_late(self) -> None:
+        """Kill a process that outlives its grace."""
+        self._watcher.join(self._grace)
+        if self.running:
+            self._signal(signal.SIGKILL)
+
+    def _signal(self, number: signal.Signals) -> None:
+        """Send a signal to the process, or SIGKILL to it and all that it has started."""
+        try:
+            if number == signal.SIGKILL:
+                os.killpg(self.pid, number)
+            else:
+                self._process.send_signal(number)
+        except ProcessLookupError:
+            pass  # it ended by itself in this moment
+
+    def _watch(self) -> None:
+        """Pass on what the process says until it is gone, then report how it ended."""
+        assert self._process.stdout is not None and self._process.stdin is not None
+        with self._process.stdout as lines, self._process.stdin:
+            for line in iter(lambda: lines.readline(_LINE_LIMIT), b""):
+                self._listen(line.decode(errors="replace").strip())
+            code = self._process.wait()
+        self._on_progress(self._ending(code))
+
+    def _listen(self, line: str) -> None:
+        """Report a line of progress; remember any other line."""
+        progress = parse_progress(line)
+        if progress is None:
+            self._last_words.append(line)
+            return
+        self._said = progress
+        if not progress.ended:
+            self._on_progress(progress)
+
+    def _ending(self, code: int) -> Progress:
+        """Return the last progress of a process that ended with `code`."""
+        said, values = self._said, self._said.values if self._said else {}
+        if said and said.ended and (code == 0 or said.state == "failed"):
+            return said
+        if self._cancelled:
+            return Progress("cancelled", "stopped before there was a model to keep", values)
+        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
+        words = "\n".join(self._last_words) or "it said nothing"
+        return Progress("failed", f"the training process ended {how}; its last words:\n{words}", {})
+
+
+def parse_progress(line: str) -> Progress | None:
+    """Return the progress that a line of output reports; None if it reports none."""
+    try:
+        report = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(report, dict) or report.get("state") not in (*ACTIVE, *ENDED):
+        return None
+    state, message = report.pop("state"), report.pop("message", "")
+    values = {
+        str(key): value
+        for key, value in report.items()
+        if value is None or isinstance(value, (str, int, float))
+    }
+    return Progress(state, str(message) or state, values)

@@ -1,0 +1,59 @@
+"""Stands in for the training command: speaks its protocol and behaves as --name says.
+
+Its model is a copy of the first "bag".
+"""
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+
+def say(state: str, **values: object) -> None:
+    """Print one line of progress."""
+    print(json.dumps({"state": state, **values}), flush=True)
+
+
+def main() -> None:
+    """Train on nothing."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--name", choices=("finish", "wait", "deaf", "crash", "refuse", "mute"))
+    parser.add_argument("--bag", type=Path)
+    parser.add_argument("--output", type=Path)
+    options, _ = parser.parse_known_args()
+    behaviour = options.name
+    stop = threading.Event()
+    if behaviour == "deaf":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    else:
+        signal.signal(signal.SIGTERM, lambda *_: stop.set())
+        threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
+    print("a line that is no progress")
+    print("[" * 50_000)
+    say("training", step=1, steps=2, loss=0.5, niceness=os.nice(0), session=os.getsid(0))
+    if behaviour == "crash":
+        raise RuntimeError("the dictionary caught fire")
+    if behaviour == "refuse":
+        say("failed", message="topic /nowhere is not in the bag")
+        sys.exit(2)
+    if behaviour == "mute":
+        os._exit(0)
+    if behaviour == "deaf":
+        time.sleep(1000)
+    if behaviour == "wait":
+        stop.wait()
+        say("cancelled", message="kept the best of 1 step", model="best.safetensors")
+        return
+    model = "new.safetensors"
+    if options.output:
+        model = str(shutil.copy(options.bag, options.output / f"{behaviour}.safetensors"))
+    say("finished", message="done", model=model, step=2, steps=2)
+
+
+if __name__ == "__main__":
+    main()
