@@ -1,0 +1,256 @@
+"""Bags to ensembles and keypoints to bags: rosbag2, both storages, no ROS needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
+from deep_nrsfm_ros.observations.bag_files import BagError, BagFile, Topic, open_bag
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.messages import (
+    INPUT_TYPES,
+    MULTI_ARRAY,
+    POINT_CLOUD,
+    POINT_FIELDS,
+    POINT_STEP,
+    POLYGON,
+    MessageError,
+    Observation,
+    pack_points,
+    read,
+)
+
+STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
+Progress = Callable[[int, int], None]
+"""Called with the number of messages read so far and the number there are."""
+
+_BLOCK = 4096  # messages mapped and stored together
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+class BagReading(NamedTuple):
+    """What `read_bags` found.
+
+    ensemble: every object of every readable message is a frame.
+    messages: how many messages the topic gave, the unreadable ones among them.
+    unreadable: how many of them were dropped; `reason` says why, for the first of them.
+    warnings: one sentence for each bag of which a part is lost.
+    """
+
+    ensemble: Ensemble
+    messages: int
+    unreadable: int
+    reason: str
+    warnings: tuple[str, ...]
+
+
+def read_bags(
+    paths: Sequence[Path],
+    topic: str,
+    source: KeypointLayout,
+    target: KeypointLayout,
+    min_confidence: float = 0.0,
+    on_progress: Progress | None = None,
+) -> BagReading:
+    """Read the keypoints of all bags into one ensemble in the layout `target`.
+
+    paths: bag folders or single .db3 or .mcap files.
+    topic: name of the topic; "" takes the only one of a type in `messages.INPUT_TYPES`.
+    source: the layout in which the detector wrote the messages.
+    Memory stays within about twice the ensemble. Raises BagError naming the bag when one is
+    missing, damaged beyond reading or without such a topic, or when no message is readable.
+    """
+    frames, warnings = _Frames(KeypointMap(source, target)), []
+    messages, unreadable, reason = 0, 0, ""
+    if not paths:
+        raise BagError("no bag to read; name at least one")
+    for path in paths:
+        with closing(open_bag(Path(path))) as bag:
+            chosen = _choose(bag, topic)
+            done = messages
+            for raw in bag.messages(chosen):
+                messages += 1
+                try:
+                    message = _STORE.deserialize_cdr(raw, chosen.type)
+                    frames.add(read(message, chosen.input_type, len(source), min_confidence))
+                except Exception as error:  # whatever bytes a bag holds, the others still count
+                    unreadable += 1
+                    reason = reason or _text(error)
+                if on_progress and messages % 256 == 0:
+                    on_progress(messages, max(messages, done + chosen.total))
+            if warning := bag.warning(chosen):
+                warnings.append(warning)
+    names = ", ".join(path.name for path in map(Path, paths))
+    if messages == unreadable:
+        raise BagError(f"no readable message in {names} ({messages} found); {reason or 'empty'}")
+    ensemble = frames.ensemble(f"bags {names}")
+    return BagReading(ensemble, messages, unreadable, reason, tuple(warnings))
+
+
+class _Frames:
+    """Observations gathered block by block, so that memory holds arrays, not objects."""
+
+    def __init__(self, keypoint_map: KeypointMap) -> None:
+        """Start empty."""
+        self._map = keypoint_map
+        self._waiting: list[Observation] = []
+        self._points: list[NDArray[np.float32]] = []
+        self._visible: list[NDArray[np.bool_]] = []
+
+    def add(self, observation: Observation) -> None:
+        """Append the objects of one observation."""
+        self._waiting.append(observation)
+        if len(self._waiting) == _BLOCK:
+            self._store()
+
+    def _store(self) -> None:
+        """Map what is waiting to the target layout."""
+        if self._waiting:
+            points, confidence = map(np.concatenate, zip(*self._waiting, strict=True))
+            points, confidence = self._map(points, confidence)
+            self._points.append(points)
+            self._visible.append(confidence > 0)
+            self._waiting.clear()
+
+    def ensemble(self, source: str) -> Ensemble:
+        """Return everything that was added."""
+        self._store()
+        points, visible = np.concatenate(self._points), np.concatenate(self._visible)
+        return Ensemble(points, visible, self._map.target, source)
+
+
+def _choose(bag: BagFile, name: str) -> Topic:
+    """Return the topic called `name`, or the only one of a supported type."""
+    listing = ", ".join(f"{t.name} [{t.input_type}]" for t in bag.topics) or "no topics"
+    found = [t for t in bag.topics if t.name == name or not name and t.input_type in INPUT_TYPES]
+    if len(found) != 1:
+        wanted = f"{len(found)} topics called {name}" if name else f"{len(found)} keypoint topics"
+        raise BagError(f"bag {bag.path} has {wanted}; name one of: {listing}")
+    if found[0].input_type not in INPUT_TYPES:
+        raise BagError(
+            f"topic {name} of bag {bag.path} has type {found[0].input_type}; "
+            f"it must be one of {', '.join(INPUT_TYPES)}"
+        )
+    return found[0]
+
+
+def _text(error: Exception) -> str:
+    """Return why a message is unreadable."""
+    return str(error) if isinstance(error, MessageError) else f"cannot be decoded: {error!r}"
+
+
+class Frame(NamedTuple):
+    """One message to write: n objects of q keypoints.
+
+    stamp: ns. points: (n, q, 2). confidence: (n, q), 0 where missing. frame_id: the camera.
+    """
+
+    stamp: int
+    points: NDArray[np.floating]
+    confidence: NDArray[np.floating]
+    frame_id: str = "camera"
+
+
+def frames(
+    points: NDArray[np.floating],
+    confidence: NDArray[np.floating],
+    rate: float = 30.0,
+    frame_id: str = "camera",
+    start: int = 0,
+) -> Iterator[Frame]:
+    """Yield one frame each of points (f, q, 2) and confidence (f, q), `rate` a second.
+
+    start: stamp of the first frame in ns. An `Ensemble` gives `points` and, as confidence,
+    `visible`.
+    """
+    for i in range(len(points)):
+        yield Frame(
+            start + round(i * 1e9 / rate), points[i : i + 1], confidence[i : i + 1], frame_id
+        )
+
+
+def write_bag(
+    path: Path,
+    topic: str,
+    frames: Iterable[Frame],
+    storage: str = "sqlite3",
+    input_type: str = POINT_CLOUD,
+) -> int:
+    """Write the frames as messages of `input_type` into a new bag; return how many.
+
+    storage: "sqlite3" or "mcap". A missing keypoint is written as NaN with confidence 0.
+    Raises BagError if `path` exists.
+    """
+    if path.exists():
+        raise BagError(f"bag {path} exists already; choose another name or remove it")
+    kind, count = input_type.replace("/", "/msg/"), 0
+    with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
+        connection = writer.add_connection(topic, kind, typestore=_STORE)
+        for frame in frames:
+            message = _ENCODERS[input_type](frame)
+            writer.write(connection, frame.stamp, _STORE.serialize_cdr(message, kind))
+            count += 1
+    return count
+
+
+def _make(kind: str, *values: Any) -> Any:
+    """Return a message of the type `kind`, fields in order."""
+    return _STORE.types[kind](*values)
+
+
+def _header(frame: Frame) -> Any:
+    """Return the header of a frame."""
+    stamp = _make("builtin_interfaces/msg/Time", *divmod(frame.stamp, 1_000_000_000))
+    return _make("std_msgs/msg/Header", stamp, frame.frame_id)
+
+
+def _triples(frame: Frame) -> NDArray[np.float32]:
+    """Return (n, q, 3) rows of x, y, confidence, NaN where missing."""
+    points = np.where(frame.confidence[..., None] > 0, frame.points, np.nan)
+    return np.concatenate([points, frame.confidence[..., None]], -1).astype(np.float32)
+
+
+def _point_cloud(frame: Frame) -> Any:
+    """Return the frame as a PointCloud2."""
+    values = _triples(frame)
+    n, q = frame.confidence.shape
+    fields = [_make("sensor_msgs/msg/PointField", name, at, 7, 1) for name, at in POINT_FIELDS]
+    data = np.frombuffer(pack_points(values[..., :2], values[..., 2]), np.uint8)
+    size = (POINT_STEP, POINT_STEP * q)
+    header = _header(frame)
+    return _make("sensor_msgs/msg/PointCloud2", header, n, q, fields, False, *size, data, False)
+
+
+def _multi_array(frame: Frame) -> Any:
+    """Return the frame as a Float32MultiArray of n x q x 3."""
+    values = _triples(frame)
+    labels = zip(("objects", "keypoints", "x y confidence"), values.shape, strict=True)
+    dimensions = [
+        _make("std_msgs/msg/MultiArrayDimension", label, size, int(np.prod(values.shape[i:])))
+        for i, (label, size) in enumerate(labels)
+    ]
+    layout = _make("std_msgs/msg/MultiArrayLayout", dimensions, 0)
+    return _make("std_msgs/msg/Float32MultiArray", layout, values.ravel())
+
+
+def _polygon(frame: Frame) -> Any:
+    """Return the frame, of one object, as a PolygonStamped."""
+    (triples,) = _triples(frame).tolist()
+    points = [_make("geometry_msgs/msg/Point32", *triple) for triple in triples]
+    polygon = _make("geometry_msgs/msg/Polygon", points)
+    return _make("geometry_msgs/msg/PolygonStamped", _header(frame), polygon)
+
+
+_ENCODERS: dict[str, Callable[[Frame], Any]] = {
+    POINT_CLOUD: _point_cloud,
+    MULTI_ARRAY: _multi_array,
+    POLYGON: _polygon,
+}

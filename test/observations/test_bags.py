@@ -1,0 +1,211 @@
+"""Real bags in both storages: round trips, several at once, and everything that can be wrong."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from deep_nrsfm_ros.nrsfm.keypoints import BODY25, COCO17, HUMAN17, KeypointLayout, KeypointMap
+from deep_nrsfm_ros.observations.bag_files import BagError
+from deep_nrsfm_ros.observations.bags import STORAGES, Frame, frames, read_bags, write_bag
+from deep_nrsfm_ros.observations.messages import INPUT_TYPES, MULTI_ARRAY
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TOPIC = "/keypoints"
+
+
+def detections(f: int, layout: KeypointLayout = BODY25, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Return points (f, q, 2) and confidence (f, q), a fifth of them missing."""
+    random = np.random.default_rng(seed)
+    points = random.uniform(1, 1000, (f, len(layout), 2)).astype(np.float32)
+    confidence = random.uniform(0.1, 1, points.shape[:2]).astype(np.float32)
+    missing = random.random(confidence.shape) < 0.2
+    points[missing] = confidence[missing] = 0
+    return points, confidence
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("input_type", INPUT_TYPES)
+def test_round_trip(tmp_path: Path, storage: str, input_type: str) -> None:
+    points, confidence = detections(50)
+    bag = tmp_path / "bag"
+    assert write_bag(bag, TOPIC, frames(points, confidence), storage, input_type) == len(points)
+    (file,) = (f for f in bag.iterdir() if f.suffix != ".yaml")
+    for path, topic in ((bag, TOPIC), (bag, ""), (file, TOPIC)):
+        reading = read_bags([path], topic, BODY25, BODY25)
+        np.testing.assert_array_equal(reading.ensemble.points, points)
+        np.testing.assert_array_equal(reading.ensemble.visible, confidence > 0)
+        assert reading[1:] == (len(points), 0, "", ())
+
+
+def test_points_come_in_the_layout_of_the_model(tmp_path: Path) -> None:
+    points, confidence = detections(20)
+    write_bag(tmp_path / "bag", TOPIC, frames(points, confidence))
+    ensemble = read_bags([tmp_path / "bag"], TOPIC, BODY25, HUMAN17).ensemble
+    mapped, sure = KeypointMap(BODY25, HUMAN17)(points, confidence)
+    np.testing.assert_array_equal(ensemble.points, mapped)
+    np.testing.assert_array_equal(ensemble.visible, sure > 0)
+    assert ensemble.layout is HUMAN17
+
+
+def test_several_bags_and_several_objects(tmp_path: Path) -> None:
+    points, confidence = detections(12)
+    pairs = (Frame(i, points[2 * i : 2 * i + 2], confidence[2 * i : 2 * i + 2]) for i in range(6))
+    write_bag(tmp_path / "a", TOPIC, pairs, "mcap")
+    write_bag(tmp_path / "b", TOPIC, frames(points, confidence), "sqlite3")
+    seen: list[tuple[int, int]] = []
+    reading = read_bags(
+        [tmp_path / "a", tmp_path / "b"],
+        TOPIC,
+        BODY25,
+        BODY25,
+        on_progress=lambda *p: seen.append(p),
+    )
+    np.testing.assert_array_equal(reading.ensemble.points, np.concatenate([points, points]))
+    assert reading.messages == 18
+    assert "a, b" in reading.ensemble.source
+    assert all(done <= total for done, total in seen)
+
+
+def test_many_blocks_of_frames_keep_their_order(tmp_path: Path) -> None:
+    points, confidence = detections(5000, COCO17)
+    write_bag(tmp_path / "bag", TOPIC, frames(points, confidence), "mcap", MULTI_ARRAY)
+    ensemble = read_bags([tmp_path / "bag"], TOPIC, COCO17, COCO17).ensemble
+    np.testing.assert_array_equal(ensemble.points, points)
+
+
+def test_progress_counts_to_the_total(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", TOPIC, frames(*detections(600)))
+    seen: list[tuple[int, int]] = []
+    read_bags([tmp_path / "bag"], "", BODY25, BODY25, on_progress=lambda *p: seen.append(p))
+    assert seen == [(256, 600), (512, 600)]
+
+
+def test_low_confidence_is_missing(tmp_path: Path) -> None:
+    points, confidence = detections(10)
+    write_bag(tmp_path / "bag", TOPIC, frames(points, confidence))
+    ensemble = read_bags([tmp_path / "bag"], TOPIC, BODY25, BODY25, min_confidence=0.5).ensemble
+    np.testing.assert_array_equal(ensemble.visible, confidence >= 0.5)
+
+
+def write_raw(path: Path, topics: dict[str, tuple[str, list[bytes]]]) -> None:
+    """Write a bag of serialised messages: topic -> (type, messages)."""
+    with Writer(path, version=9) as writer:
+        for topic, (kind, messages) in topics.items():
+            connection = writer.add_connection(topic, kind, typestore=STORE)
+            for i, raw in enumerate(messages):
+                writer.write(connection, i, raw)
+
+
+def raw_messages(count: int) -> list[bytes]:
+    """Return serialised PointCloud2 messages of BODY25 keypoints."""
+    with TemporaryDirectory() as folder:
+        write_bag(Path(folder) / "bag", TOPIC, frames(*detections(count)))
+        with Reader(Path(folder) / "bag") as reader:
+            return [raw for _, _, raw in reader.messages()]
+
+
+def test_unreadable_messages_are_counted_not_fatal(tmp_path: Path) -> None:
+    good, random = raw_messages(10), np.random.default_rng(0)
+    bad = [b"", good[0][:40], random.bytes(300), good[0][:-8], b"\0\1\0\0" + b"\xff" * 200]
+    mixed = [m for pair in zip(good[:5], bad, strict=True) for m in pair] + good[5:]
+    write_raw(tmp_path / "bag", {TOPIC: ("sensor_msgs/msg/PointCloud2", mixed)})
+    reading = read_bags([tmp_path / "bag"], TOPIC, BODY25, BODY25)
+    assert (len(reading.ensemble), reading.messages, reading.unreadable) == (10, 15, 5)
+    assert "cannot be decoded" in reading.reason
+    np.testing.assert_array_equal(reading.ensemble.points, detections(10)[0])
+
+
+def test_wrong_layout_says_why_nothing_is_readable(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", TOPIC, frames(*detections(3)))
+    with pytest.raises(BagError, match=r"bag \(3 found\).*25 keypoints.*has 17"):
+        read_bags([tmp_path / "bag"], TOPIC, COCO17, HUMAN17)
+
+
+def test_wrong_topics_list_what_is_there(tmp_path: Path) -> None:
+    cloud, text = "sensor_msgs/msg/PointCloud2", "std_msgs/msg/String"
+    topics = {"/a": (cloud, raw_messages(1)), "/b": (cloud, []), "/c": (text, [])}
+    write_raw(tmp_path / "bag", topics)
+    listing = r"/a \[sensor_msgs/PointCloud2\], /b .*, /c \[std_msgs/String\]"
+    for topic, expected in (
+        ("/d", f"0 topics called /d; name one of: {listing}"),
+        ("", f"2 keypoint topics; name one of: {listing}"),
+        ("/c", "topic /c of bag .* has type std_msgs/String; it must be one of sensor_msgs"),
+        ("/b", r"no readable message in bag \(0 found\)"),
+    ):
+        with pytest.raises(BagError, match=expected):
+            read_bags([tmp_path / "bag"], topic, BODY25, BODY25)
+
+
+def test_missing_and_foreign_bags_are_named(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="bag .*nowhere does not exist"):
+        read_bags([tmp_path / "nowhere"], TOPIC, BODY25, BODY25)
+    (tmp_path / "empty").mkdir()
+    for name in ("text.txt", "text.db3", "text.mcap"):
+        (tmp_path / name).write_text("no bag\n" * 100)
+    for name in ("empty", "text.txt", "text.db3", "text.mcap"):
+        with pytest.raises(BagError, match=f"bag .*{name} cannot be read"):
+            read_bags([tmp_path / name], TOPIC, BODY25, BODY25)
+    with pytest.raises(BagError, match="at least one"):
+        read_bags([], TOPIC, BODY25, BODY25)
+
+
+@pytest.mark.parametrize("metadata", [True, False], ids=["metadata", "no metadata"])
+@pytest.mark.parametrize("storage", STORAGES)
+def test_cut_off_bag_gives_its_readable_part(tmp_path: Path, storage: str, metadata: bool) -> None:
+    count = 1000 if storage == "sqlite3" else 8000  # an mcap file is lost by chunks of 1 MiB
+    points, confidence = detections(count)
+    bag = tmp_path / "bag"
+    write_bag(bag, TOPIC, frames(points, confidence), storage)
+    (file,) = (f for f in bag.iterdir() if f.suffix != ".yaml")
+    if not metadata:
+        (bag / "metadata.yaml").unlink()
+    whole = file.read_bytes()
+    for share in (0.9, 0.6, 0.3):
+        file.write_bytes(whole[: int(share * len(whole))])
+        ensemble, messages, unreadable, _, warnings = read_bags([bag], TOPIC, BODY25, BODY25)
+        assert (share - 0.3) * count < len(ensemble) < count
+        assert unreadable == 0 and messages == len(ensemble)
+        np.testing.assert_array_equal(ensemble.points, points[:messages])
+        (warning,) = warnings
+        lost = f"{count - messages} of {count} messages are lost" if metadata else "may be lost"
+        assert str(bag) in warning and f"read {messages} messages" in warning and lost in warning
+    for share in (0.001, 0):
+        file.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(BagError, match="bag"):
+            read_bags([bag], TOPIC, BODY25, BODY25)
+
+
+def test_bag_without_metadata_only_is_read_in_full(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", TOPIC, frames(*detections(30)))
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    assert len(read_bags([tmp_path / "bag"], TOPIC, BODY25, BODY25).ensemble) == 30
+
+
+def test_write_bag_never_overwrites(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="exists already"):
+        write_bag(tmp_path, TOPIC, frames(*detections(1)))
+
+
+def test_stamps_and_cameras_are_kept(tmp_path: Path) -> None:
+    points, confidence = detections(3)
+    write_bag(tmp_path / "bag", TOPIC, frames(points, confidence, 10, "cam02", start=10**9))
+    with Reader(tmp_path / "bag") as reader:
+        for i, (connection, stamp, raw) in enumerate(reader.messages()):
+            header = STORE.deserialize_cdr(raw, connection.msgtype).header
+            assert stamp == header.stamp.sec * 10**9 + header.stamp.nanosec == 10**9 + i * 10**8
+            assert header.frame_id == "cam02"
+        assert i == 2
+
+
+def test_float_array_bag_needs_no_layout_of_its_own(tmp_path: Path) -> None:
+    kind = MULTI_ARRAY.replace("/", "/msg/")
+    layout = STORE.types["std_msgs/msg/MultiArrayLayout"]([], 0)
+    flat = np.arange(1, 35, dtype=np.float32)
+    raw = STORE.serialize_cdr(STORE.types[kind](layout, flat), kind)
+    write_raw(tmp_path / "bag", {TOPIC: (kind, [bytes(raw)])})
+    ensemble = read_bags([tmp_path / "bag"], "", COCO17, COCO17).ensemble
+    np.testing.assert_array_equal(ensemble.points, flat.reshape(1, 17, 2))
