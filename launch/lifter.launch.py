@@ -1,0 +1,40 @@
+"""Start the lifter: ros2 launch deep_nrsfm_ros lifter.launch.py keypoints:=/detector/keypoints."""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the lifter with its arguments; `ros2 launch --show-args` prints them."""
+    share = FindPackageShare("deep_nrsfm_ros")
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                "keypoints",
+                default_value="keypoints",
+                description="Topic on which the detector publishes 2D keypoints, in pixels.",
+            ),
+            DeclareLaunchArgument(
+                "namespace",
+                default_value="",
+                description="Namespace of the node, e.g. the name of its camera.",
+            ),
+            DeclareLaunchArgument(
+                "config",
+                default_value=PathJoinSubstitution([share, "config", "lifter.yaml"]),
+                description="Parameter file: model, detector's layout, scale of the output.",
+            ),
+            Node(
+                package="deep_nrsfm_ros",
+                executable="lifter",
+                name="lifter",
+                namespace=LaunchConfiguration("namespace"),
+                parameters=[LaunchConfiguration("config")],
+                remappings=[("keypoints", LaunchConfiguration("keypoints"))],
+                output="screen",
+            ),
+        ]
+    )

@@ -1,0 +1,57 @@
+"""Install the package, its executables and what ROS 2 looks up in share/deep_nrsfm_ros."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "deep_nrsfm_ros"
+SHARE = f"share/{NAME}"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="3D shape and camera from 2D keypoints, learned from 2D alone, for ROS 2",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed"]},
+    # data_files, because `pip install` ignores setup.cfg's install_scripts and `ros2 run` needs
+    # the executables in lib/deep_nrsfm_ros.
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (SHARE, ["package.xml"]),
+        (f"{SHARE}/launch", glob("launch/*.launch.py")),
+        (f"{SHARE}/config", glob("config/*.yaml")),
+        (f"{SHARE}/models", glob("models/*.safetensors") + glob("models/*.md")),
+        (f"lib/{NAME}", glob("scripts/*")),
+    ],
+    zip_safe=False,
+    # The one place that declares what is needed; requirements.lock pins it for the Makefile.
+    install_requires=[
+        "numpy",  # the lifter's arithmetic
+        "safetensors",  # model files: weights and metadata, never pickle
+        "torch>=2.2",  # training only; the node lifts without it
+        "rosbags",  # reads and writes rosbag2 without a ROS installation
+        "pyyaml",  # parameter files and bag metadata
+        "tqdm",  # progress of training and evaluation
+        "ros-jazzy-rclpy",  # the node
+        "ros-jazzy-common-interfaces",  # the messages it hears and speaks
+        "ros-jazzy-rmw-fastrtps-cpp",  # the DDS under it
+    ],
+    extras_require={
+        "test": [
+            "pytest",  # runs the tests; colcon test needs its name here to run any
+            "pytest-timeout",  # a process that never answers fails its test instead of hanging all
+            "hypothesis",  # properties over generated input
+            "ruff",  # lint and format
+            "mypy",  # types
+            "types-PyYAML",  # types of pyyaml
+            "types-tqdm",  # types of tqdm
+            "colcon-common-extensions",  # the test that builds as a ROS workspace does
+            "setuptools<80",  # colcon calls setup.py in ways that setuptools 80 dropped
+        ],
+        "benchmarks": [
+            "matplotlib",  # the demo's picture and the benchmarks' plots
+        ],
+    },
+)
