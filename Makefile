@@ -1,0 +1,57 @@
+# make demo        from a fresh clone to the picture
+# make test        environment, lint, types and all tests
+# make lint        lint and types only
+# make lock        resolve requirements.lock anew
+# make clean       remove what building and testing left; .venv and downloads stay
+#
+# The environment .venv is made on first use: make PYTHON3=python3.12 chooses its Python.
+
+PYTHON3 ?= python3
+# Pins that exist for the oldest Python exist for the newer ones too.
+LOCK_PYTHON ?= python3.10
+LOCK_TORCH ?= torch==2.13.0
+
+PYTHON := .venv/bin/python
+READY := .venv/.ready
+
+.PHONY: demo test lint lock clean
+
+demo: $(READY)
+	$(PYTHON) -m deep_nrsfm_ros.commands.demo
+
+test: lint
+	$(PYTHON) -m pytest
+
+lint: $(READY)
+	$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
+	$(PYTHON) -m mypy
+
+# Editable, so that a stale copy never shadows the source; the tests install real copies elsewhere.
+$(READY): requirements.lock setup.py
+	@$(PYTHON3) -c 'import sys; (3, 10) <= sys.version_info < (3, 14) or sys.exit( \
+	    "Python 3.10 to 3.13 is needed and $(PYTHON3) is %d.%d; choose one: " \
+	    "make PYTHON3=python3.12" % sys.version_info[:2])'
+	$(PYTHON3) -m venv .venv
+	$(PYTHON) -m pip install --requirement requirements.lock
+	$(PYTHON) -m pip install --no-deps --no-build-isolation --editable .
+	touch $@
+
+# Left out: the CUDA wheels, which torch itself pins, on the machines that want them.
+lock:
+	rm -rf build/lock && $(LOCK_PYTHON) -m venv build/lock
+	build/lock/bin/pip install --quiet --dry-run --ignore-installed \
+	    --report build/lock/report.json '.[test,benchmarks]' '$(LOCK_TORCH)'
+	build/lock/bin/python -c 'import json; \
+	    found = [i["metadata"] for i in json.load(open("build/lock/report.json"))["install"]]; \
+	    pins = {m["name"]: m["version"].split("+")[0] for m in found}; \
+	    skip = ("deep_nrsfm_ros", "cuda-", "nvidia-", "triton"); \
+	    print("# Made by `make lock` from setup.py; do not edit."); \
+	    [print(f"{n}=={pins[n]}") for n in sorted(pins, key=str.lower) if not n.startswith(skip)]' \
+	    > build/lock/requirements.lock
+	mv build/lock/requirements.lock requirements.lock
+
+clean:
+	rm -rf build install log dist demo_output .hypothesis .pytest_cache .ruff_cache .mypy_cache
+	rm -rf *.egg-info
+	find deep_nrsfm_ros test launch -name __pycache__ -type d -prune -exec rm -rf {} +
