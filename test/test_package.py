@@ -1,0 +1,186 @@
+"""The package as others meet it: installed by pip, built by colcon, started by launch files."""
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+import yaml
+
+import deep_nrsfm_ros
+from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.node.pipeline import InputOptions
+from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+
+ROOT = Path(__file__).resolve().parents[1]
+NAME = "deep_nrsfm_ros"
+EXECUTABLES = sorted(path.name for path in (ROOT / "scripts").iterdir())
+LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
+DOES_NOT_REACH_OTHER_PYTHONS = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH")
+
+
+def run(*command, cwd, **variables):
+    """Return what `command` prints, run as from a fresh shell; fail with all of it if it fails."""
+    kept = {k: v for k, v in os.environ.items() if k not in DOES_NOT_REACH_OTHER_PYTHONS}
+    done = subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        env=kept | {key: str(value) for key, value in variables.items()},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        timeout=120,
+    )
+    assert done.returncode == 0, f"{command} in {cwd} returned {done.returncode}:\n{done.stdout}"
+    return done.stdout
+
+
+def colcon(verb, *arguments, workspace):
+    command = Path(sysconfig.get_path("scripts")) / "colcon"
+    return run(
+        *(sys.executable, command, "--log-base", workspace / "log", verb, *arguments), cwd=workspace
+    )
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    """A colcon workspace with a copy of this package that has one test, which passes."""
+    workspace = tmp_path_factory.mktemp("workspace")
+    source = workspace / "src" / NAME
+    left = shutil.ignore_patterns(
+        *(".*", "build", "install", "log", "runs", "*output", "*.egg-info", "__pycache__", "test")
+    )
+    shutil.copytree(ROOT, source, ignore=left)
+    (source / "test").mkdir()
+    (source / "test" / "test_probe.py").write_text("def test_probe():\n    pass\n")
+    return workspace
+
+
+@pytest.fixture(scope="module")
+def installed_by_pip(workspace, tmp_path_factory):
+    """The prefix of a fresh environment after `pip install .`; no network is used.
+
+    The build tool comes from this environment, and requirements stay out.
+    """
+    prefix = tmp_path_factory.mktemp("pip") / "environment"
+    run(sys.executable, "-m", "venv", "--without-pip", prefix, cwd=workspace)
+    run(
+        *(sys.executable, "-m", "pip", "--python", prefix / "bin" / "python", "install", "."),
+        *("--no-deps", "--no-build-isolation", "--no-index", "--ignore-installed"),
+        cwd=workspace / "src" / NAME,
+        PYTHONPATH=sysconfig.get_path("purelib"),
+    )
+    return prefix
+
+
+@pytest.fixture(scope="module")
+def built_by_colcon(workspace):
+    """The prefix of the package after `colcon build`."""
+    colcon("build", "--event-handlers", "console_direct+", workspace=workspace)
+    return workspace / "install" / NAME
+
+
+@pytest.fixture(params=["installed_by_pip", "built_by_colcon"])
+def prefix(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_executables_are_where_ros2_run_looks(prefix):
+    folder = prefix / "lib" / NAME
+    assert "lifter" in EXECUTABLES
+    assert sorted(path.name for path in folder.iterdir()) == EXECUTABLES
+    assert all(os.access(path, os.X_OK) for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("name", [name for name in EXECUTABLES if name != "lifter"])
+def test_executable_runs_from_an_installation(prefix, name, tmp_path):
+    here = next(prefix.glob("lib/python*/site-packages"))
+    there = sysconfig.get_path("purelib")  # what the package requires
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    shown = run(
+        *(prefix / "lib" / NAME / name, "--help"),
+        cwd=tmp_path,
+        PATH=path,
+        PYTHONPATH=f"{here}{os.pathsep}{there}",
+    )
+    assert "usage:" in shown
+
+
+def test_ament_index_knows_the_package(prefix):
+    assert (prefix / "share/ament_index/resource_index/packages" / NAME).is_file()
+
+
+def test_share_has_what_the_source_has(prefix):
+    share = prefix / "share" / NAME
+    assert (share / "package.xml").read_bytes() == (ROOT / "package.xml").read_bytes()
+    for folder, patterns in {
+        "launch": ["*.launch.py"],
+        "config": ["*.yaml"],
+        "models": ["*.safetensors", "*.md"],
+    }.items():
+        expected = sorted(p.name for pattern in patterns for p in (ROOT / folder).glob(pattern))
+        assert expected, f"{folder}/ has nothing to install"
+        assert sorted(path.name for path in (share / folder).iterdir()) == expected
+
+
+def test_colcon_sees_an_ament_python_package(workspace):
+    # colcon only warns of a package.xml that it cannot parse, and lists another type.
+    assert colcon("list", workspace=workspace).split() == [
+        *(NAME, f"src/{NAME}", "(ros.ament_python)")
+    ]
+
+
+def test_colcon_test_runs_pytest(workspace, built_by_colcon):
+    # Without an extra that names pytest, colcon runs 0 tests and calls it a success.
+    colcon("test", workspace=workspace)
+    assert "Summary: 1 test, 0 errors, 0 failures, 0 skipped" in colcon(
+        "test-result", "--all", workspace=workspace
+    )
+
+
+def test_versions_agree():
+    declared = ElementTree.parse(ROOT / "package.xml").findtext("version")
+    stated = run(sys.executable, "setup.py", "--version", cwd=ROOT).split()[-1]
+    assert declared == stated == deep_nrsfm_ros.__version__
+
+
+def calls(tree, name):
+    return [
+        {keyword.arg: keyword.value for keyword in node.keywords}
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", None) == name
+    ]
+
+
+@pytest.mark.parametrize("path", LAUNCH_FILES, ids=lambda path: path.name)
+def test_launch_file_starts_what_is_installed(path):
+    # launch is not on PyPI, so the file is read, not run.
+    tree = ast.parse(path.read_text(), path)
+    nodes = calls(tree, "Node")
+    assert nodes
+    for node in nodes:
+        assert node["package"].value == NAME
+        assert node["executable"].value in EXECUTABLES
+    for argument in calls(tree, "DeclareLaunchArgument"):
+        assert argument["description"].value
+
+
+def test_config_sets_parameters_that_the_lifter_has():
+    (namespace, content), *others = yaml.safe_load(
+        (ROOT / "config" / "lifter.yaml").read_text()
+    ).items()
+    assert (namespace, others) == ("/**", [])  # whatever the node's name and namespace
+    known = {
+        field.name: (field, opt)
+        for c in (InputOptions, LiftingOptions)
+        for field, _, opt in options(c)
+    }
+    for name, value in content["ros__parameters"].items():
+        field, option = known[name]
+        assert type(value) is type(field.default)
+        option.check(name, value)
