@@ -75,10 +75,13 @@ def check(config: Any) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
-    """Add `--name-of-field` to `parser` for every option of the dataclass `cls`."""
+    """Add `--name-of-field` to `parser` for every option of the dataclass `cls`.
+
+    What is not given leaves no trace in the parsed arguments: see `override`.
+    """
     group = parser.add_argument_group((cls.__doc__ or cls.__name__).splitlines()[0].rstrip("."))
     for field, kind, opt in options(cls):
-        settings: dict[str, Any] = {"help": opt.description, "default": field.default}
+        settings: dict[str, Any] = {"default": argparse.SUPPRESS}
         if kind is bool:
             settings["action"] = argparse.BooleanOptionalAction
         elif isinstance(field.default, tuple):
@@ -88,12 +91,17 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
             settings["type"] = kind
         if opt.choices:
             settings["choices"] = opt.choices
+        default: Any = field.default
+        shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
+        settings["help"] = f"{opt.description} (default: {shown})".replace("%", "%%")
         group.add_argument("--" + field.name.replace("_", "-"), **settings)
 
 
-def from_arguments(cls: type[Config], arguments: argparse.Namespace) -> Config:
-    """Return the dataclass `cls` filled from parsed arguments, ranges checked."""
-    values = {field.name: getattr(arguments, field.name) for field, _, _ in options(cls)}
-    config = cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+def override(base: Config, arguments: argparse.Namespace) -> Config:
+    """Return the dataclass `base` with the options that were given; ranges checked."""
+    given = vars(arguments)
+    values = {f.name: given[f.name] for f, _, _ in options(type(base)) if f.name in given}
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    config: Config = dataclasses.replace(base, **values)  # type: ignore[type-var]
     check(config)
     return config

@@ -1,0 +1,224 @@
+"""Train a model from recorded bags or motion capture: 2D keypoints in, one model file out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from deep_nrsfm_ros.configuration import add_arguments, override
+from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, layout
+from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, save_model
+from deep_nrsfm_ros.nrsfm.network import Architecture
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
+from deep_nrsfm_ros.observations.bags import read_bags
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.mocap import protocol_split, read_trials, trials
+
+CANCELLED = "cancelled; the model holds what was learned so far"
+
+
+def arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(prog="train", description=__doc__)
+    data = parser.add_argument_group("Data (bags or motion capture)")
+    data.add_argument("--bag", type=Path, action="append", default=[], help="bag; repeatable")
+    data.add_argument("--topic", default="", help="keypoint topic (default: the only one)")
+    data.add_argument(
+        "--keypoint-layout",
+        default="",
+        choices=list(LAYOUTS),
+        help="order of the keypoints in the bags (default: that of the object)",
+    )
+    data.add_argument(
+        "--min-confidence", type=float, default=0.1, help="keypoints below it count as missing"
+    )
+    data.add_argument("--cmu", type=Path, help="folder of the CMU database (NN/NN.asf, *.amc)")
+    data.add_argument("--subjects", nargs="*", default=["01"], help="CMU subjects")
+    data.add_argument(
+        "--all-trials",
+        action="store_true",
+        help="every trial of a subject instead of the paper's first floor(0.8 N)",
+    )
+    data.add_argument("--camera-seed", type=int, default=0, help="seed of the CMU cameras")
+    result = parser.add_argument_group("Result")
+    result.add_argument("--object", default="human17", choices=list(LAYOUTS), help="model's layout")
+    result.add_argument("--name", default="trained", help="name of the model")
+    result.add_argument("--output", type=Path, default=Path("models"), help="folder of the model")
+    run = parser.add_argument_group("Run")
+    run.add_argument("--preset", default="default", choices=list(PRESETS), help="see below")
+    run.add_argument("--threads", type=int, default=0, help="threads of torch (0: all cores)")
+    run.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+    run.add_argument("--json-progress", action="store_true", help="one JSON object a line")
+    for config in (Recipe, Architecture, Normaliser):
+        add_arguments(parser, config)
+    return parser
+
+
+def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
+    """Return the ensemble that the arguments name; raise ValueError if there is none."""
+    target = layout(given.object)
+    if bool(given.bag) == bool(given.cmu):
+        raise ValueError("name what to train on: --bag (repeatable), or --cmu with --subjects")
+    if given.bag:
+        source = layout(given.keypoint_layout or given.object)
+        reading = read_bags(
+            given.bag, given.topic, source, target, given.min_confidence, report.reading
+        )
+        for warning in reading.warnings:
+            report.say(warning)
+        if reading.unreadable:
+            count = f"{reading.unreadable} of {reading.messages}"
+            report.say(f"{count} messages could not be read: {reading.reason}")
+        return reading.ensemble
+    paths = []
+    for subject in given.subjects:
+        found = trials(given.cmu, subject)
+        paths += found if given.all_trials else protocol_split(found)[0]
+    return read_trials(paths, target, seed=given.camera_seed, on_progress=report.reading)
+
+
+class Reporter:
+    """Shows progress to people (a bar) or to a program (JSON lines)."""
+
+    def __init__(self, as_json: bool) -> None:
+        """Start silent; the bar appears with the first progress."""
+        self.as_json = as_json
+        self._bar: tqdm[Any] | None = None
+        self._state = ""
+        self._last = 0.0
+
+    def reading(self, done: int, total: int) -> None:
+        """Report that `done` of `total` messages or trials are read."""
+        if done == total or time.monotonic() - self._last > 0.2:
+            self._show("reading", done, total, {})
+
+    def training(self, progress: Any) -> None:
+        """Report a `nrsfm.training.Progress`."""
+        values = progress._asdict()
+        step, steps = values.pop("step"), values.pop("steps")
+        self._show("training", step, steps, values)
+
+    def say(self, message: str) -> None:
+        """Report something worth reading."""
+        if self.as_json:
+            self._print({"state": self._state or "reading", "message": message})
+        else:
+            tqdm.write(message, file=sys.stderr)
+
+    def end(self, state: str, message: str, **values: Any) -> None:
+        """Report how it ended."""
+        if self._bar is not None:
+            self._bar.close()
+        if self.as_json:
+            self._print({"state": state, "message": message, **values})
+        else:
+            print(f"{state}: {message}", file=sys.stderr if state == "failed" else sys.stdout)
+
+    def _show(self, state: str, done: int, total: int, values: dict[str, Any]) -> None:
+        self._last = time.monotonic()
+        if self.as_json:
+            self._state = state
+            self._print({"state": state, "step": done, "steps": total, **values})
+            return
+        if self._bar is None or self._state != state:
+            if self._bar is not None:
+                self._bar.close()
+            self._bar = tqdm(total=total, desc=state, dynamic_ncols=True)
+        self._state = state
+        self._bar.total = total
+        shown = {k: f"{v:.3f}" for k, v in values.items() if k not in ("seconds_left", "seed")}
+        self._bar.set_postfix(shown, refresh=False)
+        self._bar.update(done - self._bar.n)
+
+    @staticmethod
+    def _print(values: dict[str, Any]) -> None:
+        rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in values.items()}
+        print(json.dumps(rounded), flush=True)
+
+
+def stop_on_signals() -> Callable[[], bool]:
+    """Return a function that tells whether SIGINT or SIGTERM has come."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop.is_set
+
+
+def stop_with_parent(stopped: Callable[[], bool]) -> Callable[[], bool]:
+    """Return `stopped`, or standard input at its end: the program that started us is gone."""
+    orphaned = threading.Event()
+
+    def watch() -> None:
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+        orphaned.set()
+
+    threading.Thread(target=watch, daemon=True).start()
+    return lambda: stopped() or orphaned.is_set()
+
+
+def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], bool]) -> None:
+    """Read, train and save as the arguments say; raise ValueError for what cannot be done."""
+    preset = PRESETS[given.preset]
+    preset = Preset(
+        override(preset.architecture, given),
+        override(preset.normaliser, given),
+        override(preset.recipe, given),
+    )
+    ensemble = read_data(given, report)
+    report.say(f"{len(ensemble)} frames of {len(ensemble.layout)} keypoints ({ensemble.source})")
+    import torch  # seconds to import: bad arguments should not wait for it
+
+    from deep_nrsfm_ros.nrsfm.training import finish, train
+
+    if given.threads:
+        torch.set_num_threads(given.threads)
+    model_path = given.output / f"{given.name}{MODEL_SUFFIX}"
+    given.output.mkdir(parents=True, exist_ok=True)
+    checkpoint = given.output / f".{given.name}.checkpoint"
+    if not given.resume:
+        checkpoint.unlink(missing_ok=True)
+    trainer = train(
+        ensemble.points,
+        ensemble.visible,
+        preset,
+        on_progress=report.training,
+        should_stop=should_stop,
+        checkpoint=checkpoint,
+    )
+    model = finish(trainer, given.name, ensemble.layout, ensemble.source)
+    save_model(model_path, model)
+    checkpoint.unlink(missing_ok=True)
+    state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
+    if trainer.step < preset.recipe.steps:
+        state, message = "cancelled", CANCELLED
+    report.end(state, message, model=str(model_path), **model.quality)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command; exit code 2 says that the input was at fault."""
+    given = arguments().parse_args(argv)
+    report = Reporter(given.json_progress)
+    should_stop = stop_on_signals()
+    if given.json_progress:
+        should_stop = stop_with_parent(should_stop)
+    try:
+        run(given, report, should_stop)
+    except (ValueError, OSError) as error:
+        report.end("failed", str(error))
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

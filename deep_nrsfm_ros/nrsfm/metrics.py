@@ -1,0 +1,90 @@
+"""Errors of reconstructed shapes against ground truth, the flattering and the plain ones."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.nrsfm.geometry import align, centre
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+
+Floats = NDArray[Any]
+
+
+class ShapeErrors(NamedTuple):
+    """Means over frames; shape errors are ratios ||S - S*||_F / ||S*||_F."""
+
+    shape: float  # the paper's: rescaled to the norm of the truth, aligned in O(3) frame by frame
+    point: float  # mean point distance of the same alignment, in units of the truth
+    proper: float  # rescaled, proper rotations only, one global reflection for the whole set
+    mirrored: float  # share of frames whose O(3) alignment disagrees with that reflection
+    unscaled: float  # as `proper`, without rescaling each frame
+
+
+def shape_errors(S: Floats, truth: Floats) -> ShapeErrors:
+    """Compare shapes S (f, p, 3) with truth (f, p, 3), both up to rotation and translation."""
+    S, T = centre(S), centre(truth)
+    size = np.linalg.norm(T, axis=(1, 2))
+    ratio = (size / np.maximum(np.linalg.norm(S, axis=(1, 2)), 1e-12))[:, None, None]
+    free = align(ratio * S, T, allow_reflection=True)
+    mirrored = free.mirrored.mean()
+    if mirrored > 0.5:
+        S, mirrored = S * np.array([1, 1, -1], S.dtype), 1 - mirrored
+    proper = align(S, T).rotation
+
+    def error(X: Floats) -> float:
+        return float((np.linalg.norm(X - T, axis=(1, 2)) / size).mean())
+
+    return ShapeErrors(
+        error(free.aligned),
+        float(np.linalg.norm(free.aligned - T, axis=2).mean()),
+        error(ratio * S @ proper),
+        float(mirrored),
+        error(S @ proper),
+    )
+
+
+def procrustes_distances(S: Floats, truth: Floats) -> Floats:
+    """Return point distances (f, p) after similarity alignment by a proper rotation."""
+    S, T = centre(S), centre(truth)
+    S = align(S, T).aligned
+    scale = (S * T).sum((1, 2)) / np.maximum((S * S).sum((1, 2)), 1e-12)
+    distances: Floats = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
+    return distances
+
+
+def signed_volumes(S: Floats, layout: KeypointLayout) -> Floats:
+    """Return the signed volume (f,) of each shape's handedness tetrahedron.
+
+    Positive on the real object (`KeypointLayout.handedness`), negative where depth is mirrored.
+    Raises ValueError if the layout has none.
+    """
+    if layout.handedness is None:
+        raise ValueError(f"layout {layout.name!r} has no handedness; name its four keypoints")
+    left, right, up, front = (S[:, layout.index(name)] for name in layout.handedness)
+    volumes: Floats = np.linalg.det(np.stack((left - right, up - right, front - right), 1))
+    return volumes
+
+
+def object_frame(S: Floats, layout: KeypointLayout) -> NDArray[np.float32]:
+    """Return the orthonormal A (3, 3) that takes reconstructed axes to the object's: S A.
+
+    Reflects (det -1) where the shapes S (f, p, 3) are mirrored on the whole, and turns the mean
+    shape so that x points to the front, y to the left and z up (REP-103). Layouts without a
+    handedness keep the network's axes.
+    """
+    A = np.eye(3)
+    if layout.handedness is None:
+        return A.astype(np.float32)
+    if signed_volumes(S, layout).sum() < 0:
+        A[2, 2] = -1
+    mean = (S @ A).mean(0)
+    left, right, up, _ = (mean[layout.index(name)] for name in layout.handedness)
+    y = (left - right) / np.linalg.norm(left - right)
+    z = up - (left + right) / 2
+    z -= (z @ y) * y
+    z /= np.linalg.norm(z)
+    axes = np.stack((np.cross(y, z), y, z), 1)
+    return np.asarray(A @ axes, np.float32)

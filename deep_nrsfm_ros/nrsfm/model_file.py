@@ -1,0 +1,142 @@
+"""Model files: safetensors weights with everything that is needed to use them, never pickle."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.nrsfm.network import Architecture, Network, weight_shapes
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+
+MODEL_SUFFIX = ".safetensors"
+_FORMAT = "deep_nrsfm_ros model 1"
+_MAX_BYTES = 64 * 2**20
+
+
+class ModelFileError(ValueError):
+    """A model file that is missing, damaged or not one of ours; the text says which and what."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained network and what its input and output mean.
+
+    object_frame: (3, 3) orthonormal A that takes the network's axes to the object's (S A, A^T M).
+        det -1 undoes a mirrored depth; the axes are x front, y left, z up where the layout has
+        a handedness.
+    provenance: data, recipe and versions; quality: label-free figures.
+    """
+
+    name: str
+    network: Network
+    layout: KeypointLayout
+    normaliser: Normaliser
+    object_frame: NDArray[np.float32]
+    provenance: dict[str, Any] = field(default_factory=dict)
+    quality: dict[str, Any] = field(default_factory=dict)
+
+
+def save_model(path: Path, model: Model) -> None:
+    """Write `model` whole or not at all: to a temporary name first, then renamed."""
+    header = {
+        "name": model.name,
+        "architecture": dataclasses.asdict(model.network.architecture),
+        "layout": dataclasses.asdict(model.layout),
+        "normaliser": dataclasses.asdict(model.normaliser),
+        "object_frame": np.asarray(model.object_frame).tolist(),
+        "provenance": model.provenance,
+        "quality": model.quality,
+    }
+    weights = {k: np.ascontiguousarray(w, np.float32) for k, w in model.network.named()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        save_file(weights, partial, {"format": _FORMAT, "model": json.dumps(header)})
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_model(path: Path) -> Model:
+    """Read a model; raise ModelFileError that says what is wrong with the file."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ModelFileError(f"{path} is larger than {_MAX_BYTES >> 20} MiB: not a model")
+        with safe_open(path, "numpy") as file:
+            metadata = file.metadata() or {}
+            weights = {name: file.get_tensor(name) for name in file.keys()}
+    except OSError as error:
+        raise ModelFileError(f"cannot read model {path}: {error.strerror or error}") from error
+    except SafetensorError as error:
+        raise ModelFileError(f"{path} is damaged or no safetensors file: {error}") from error
+    if metadata.get("format") != _FORMAT:
+        raise ModelFileError(f"{path} is not a {_FORMAT!r} file; train or download one")
+    try:
+        return _build(json.loads(metadata["model"]), weights)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ModelFileError(f"{path} has a damaged header or weights: {error}") from error
+
+
+def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> Model:
+    """Return the model of a parsed header, every shape checked against the architecture."""
+    architecture = Architecture(**_tuples(header["architecture"]))
+    normaliser = Normaliser(**header["normaliser"])
+    check(architecture)
+    check(normaliser)
+    layout = KeypointLayout(**_tuples(header["layout"]))
+    for name, shape in weight_shapes(architecture, len(layout)).items():
+        found = weights[name].shape
+        if found != shape or not np.isfinite(weights[name]).all():
+            raise ValueError(f"weight {name} is {found}, needs {shape} and finite values")
+    frame = np.array(header["object_frame"], np.float32)
+    if frame.shape != (3, 3) or not np.abs(frame @ frame.T - np.eye(3)).max() < 1e-3:
+        raise ValueError("object_frame is not orthonormal (3, 3)")
+    return Model(
+        str(header["name"]),
+        Network.from_named(architecture, weights),
+        layout,
+        normaliser,
+        frame,
+        dict(header["provenance"]),
+        dict(header["quality"]),
+    )
+
+
+def _tuples(value: Any) -> Any:
+    """Return parsed JSON with its lists as tuples, as the dataclasses hold them."""
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return value
+
+
+def find_model(name_or_path: str, folders: Sequence[Path]) -> Path:
+    """Return the file of a model given by path or by name in the first folder that has it.
+
+    Raises ModelFileError that lists the models there are.
+    """
+    path = Path(name_or_path).expanduser()
+    if path.suffix == MODEL_SUFFIX and path.is_file():
+        return path
+    for folder in folders:
+        candidate = folder / f"{name_or_path}{MODEL_SUFFIX}"
+        if candidate.is_file():
+            return candidate
+    names = sorted({f.stem for folder in folders for f in folder.glob(f"*{MODEL_SUFFIX}")})
+    raise ModelFileError(
+        f"no model {name_or_path!r}; there are {', '.join(names) or 'none'} in "
+        f"{', '.join(map(str, folders))}"
+    )

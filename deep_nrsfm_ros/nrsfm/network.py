@@ -1,0 +1,199 @@
+"""The network: section "Deep Non-Rigid Structure from Motion" of the paper, top to bottom.
+
+Symbols are named in the legend of this package. Everything here is written on operations that
+NumPy and torch share: the trainer runs it on tensors, the lifter on arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.nrsfm.geometry import Array, polar
+
+PAPER_WIDTHS = (125, 114, 104, 93, 83, 72, 62, 51, 41, 30, 20, 10)
+"""The paper's 12 dictionaries, linspace(125, 10, 12)."""
+WIDE_WIDTHS = (256, 128, 64, 48)
+"""Four wide dictionaries: the default; they do not collapse under the cycle loss."""
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Network architecture."""
+
+    widths: tuple[int, ...] = option(
+        WIDE_WIDTHS, "atoms k_1 ... k_n of each dictionary, first to last", low=1, high=4096
+    )
+    threshold: str = option(
+        "relu",
+        "block threshold: its ReLU relaxation, or the exact soft threshold of each block's norm",
+        choices=("relu", "block"),
+    )
+    recovery: str = option(
+        "learned",
+        "code and camera from the last block code: learned linear maps, or the closed form",
+        choices=("learned", "closed_form"),
+    )
+    camera: str = option(
+        "orthonormal",
+        "camera of the network: its orthonormal factor, or free and held by the loss",
+        choices=("orthonormal", "free"),
+    )
+
+
+@dataclass(frozen=True)
+class Network:
+    """Weights of the multi-layer block-sparse dictionary; shapes in the package's legend."""
+
+    architecture: Architecture
+    D: tuple[Array, ...]
+    b: tuple[Array, ...]
+    b_: tuple[Array, ...]  # b_[0] (p, 3) is the bias of S itself, b_[i] (k_i) that of psi_i
+    code_head: Array  # (6 k_n, k_n): psi_n from the entries of Psi_n
+    camera_head: Array  # (k_n, 1): M as a linear combination of the blocks of Psi_n
+
+    @property
+    def p(self) -> int:
+        """Return the number of keypoints."""
+        return int(self.D[0].shape[0])
+
+    def named(self) -> Iterator[tuple[str, Array]]:
+        """Yield every weight under a stable name, e.g. ("D.1", ...)."""
+        for name, group in (("D", self.D), ("b", self.b), ("b_", self.b_)):
+            yield from ((f"{name}.{i}", weight) for i, weight in enumerate(group))
+        yield from (("code_head", self.code_head), ("camera_head", self.camera_head))
+
+    def map(self, function: Callable[[Array], Array]) -> Network:
+        """Return the network with `function` applied to every weight, e.g. torch.from_numpy."""
+        return self.from_named(self.architecture, {k: function(w) for k, w in self.named()})
+
+    @classmethod
+    def from_named(cls, architecture: Architecture, weights: dict[str, Array]) -> Network:
+        """Rebuild a network from what `named` yields; raise KeyError for a missing weight."""
+        layers = range(len(architecture.widths))
+        D, b, b_ = (tuple(weights[f"{k}.{i}"] for i in layers) for k in ("D", "b", "b_"))
+        return cls(architecture, D, b, b_, weights["code_head"], weights["camera_head"])
+
+
+def weight_shapes(architecture: Architecture, p: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every weight of a network for p keypoints."""
+    k = architecture.widths
+    shapes: dict[str, tuple[int, ...]] = {}
+    for i, width in enumerate(k):
+        shapes[f"D.{i}"] = (k[i - 1], width) if i else (p, 3, width)
+        shapes[f"b.{i}"] = (width,)
+        shapes[f"b_.{i}"] = (k[i - 1],) if i else (p, 3)
+    return shapes | {"code_head": (6 * k[-1], k[-1]), "camera_head": (k[-1], 1)}
+
+
+def initialise(
+    architecture: Architecture, p: int, rng: np.random.Generator, *, glorot_biases: bool = False
+) -> Network:
+    """Return a float32 network of Glorot-uniform dictionaries and heads.
+
+    Thresholds and biases start at zero; `glorot_biases` draws them as the authors' release does,
+    which silences 20-40 % of the narrowest layer from the start.
+    """
+    weights = {}
+    for name, shape in weight_shapes(architecture, p).items():
+        is_bias = name.startswith("b")
+        fan = sum(shape) if len(shape) < 3 else 3 * shape[0] + shape[2]
+        limit = 0.0 if is_bias and not glorot_biases else (6 / fan) ** 0.5
+        weights[name] = rng.uniform(-limit, limit, shape).astype(np.float32)
+    return Network.from_named(architecture, weights)
+
+
+def forward(net: Network, W: Array) -> tuple[Array, Array]:
+    """Return shape S (..., p, 3) and camera M (..., 3, 2) of the keypoints W (..., p, 2)."""
+    Psi = encode(net, W)
+    psi, M = recover(net, Psi)
+    return decode(net, psi), M
+
+
+def encode(net: Network, W: Array) -> Array:
+    """Return the last block code Psi_n (..., 2, 3, k_n): one block-ISTA step a layer.
+
+    "Encoder": Psi_1 = h((D_1#)^T W - b_1), Psi_i = h((D_i (x) I_3)^T Psi_i-1 - b_i).
+    """
+    threshold = _THRESHOLDS[net.architecture.threshold]
+    p, _, k = net.D[0].shape
+    V = (W.swapaxes(-1, -2) @ net.D[0].reshape(p, 3 * k)).reshape(*W.shape[:-2], 2, 3, k)
+    Psi = threshold(V, net.b[0])
+    for D, b in zip(net.D[1:], net.b[1:], strict=True):
+        Psi = threshold(Psi @ D, b)
+    return Psi
+
+
+def _relu(X: Array) -> Array:
+    """Return max(X, 0); torch's own relu, since the gradient of clip costs three times as much."""
+    return X.clip(min=0) if isinstance(X, np.ndarray) else X.relu()
+
+
+def _relu_threshold(V: Array, b: Array) -> Array:
+    """Return relu(V - b (x) 1_3x2), the paper's relaxation (eq. "singleBISTA")."""
+    return _relu(V - b)
+
+
+def _block_threshold(V: Array, b: Array) -> Array:
+    """Return h_b(||V_j||_F) / ||V_j||_F V_j for each block j, the exact proximal step."""
+    norm = ((V * V).sum((-3, -2))[..., None, None, :] + 1e-12) ** 0.5
+    return V * (_relu(norm - b) / norm)
+
+
+_THRESHOLDS = {"relu": _relu_threshold, "block": _block_threshold}
+
+
+def recover(net: Network, Psi: Array) -> tuple[Array, Array]:
+    """Return code psi_n (..., k_n) and camera M (..., 3, 2): "Code and camera recovery"."""
+    if net.architecture.recovery == "closed_form":
+        psi, rows = _leading_factors(Psi)
+    else:
+        psi = Psi.reshape(*Psi.shape[:-3], -1) @ net.code_head
+        rows = (Psi @ net.camera_head)[..., 0]
+    if net.architecture.camera == "orthonormal":
+        rows = polar(rows)
+    return psi, rows.swapaxes(-1, -2)
+
+
+def _leading_factors(Psi: Array, iterations: int = 6) -> tuple[Array, Array]:
+    """Return psi (..., k) and M^T (..., 2, 3) of the rank-one Psi = psi (x) M.
+
+    Power iteration on the k x 6 reshape. It starts at the sum of the blocks, which for a
+    non-negative code is the camera itself up to scale, and so settles the sign as well.
+    """
+    X = Psi.reshape(*Psi.shape[:-3], 6, Psi.shape[-1])
+    m = X.sum(-1)[..., None]
+    for _ in range(iterations):
+        m = X @ (X.swapaxes(-1, -2) @ m)
+        m = m / ((m * m).sum(-2)[..., None] + 1e-12) ** 0.5
+    # M^T M = I means ||M||_F^2 = 2: the unit factor m is M / sqrt(2).
+    psi = (X.swapaxes(-1, -2) @ m)[..., 0] * 0.5**0.5
+    return psi, (m * 2**0.5).reshape(*Psi.shape[:-3], 2, 3)
+
+
+def decode(net: Network, psi: Array) -> Array:
+    """Return S (..., p, 3) from the last code: "Decoder", with the encoder's dictionaries.
+
+    psi_i-1 = relu(D_i psi_i - b'_i-1), s = D_1 psi_1 - b'_0. The last bias is not in the paper
+    but in its authors' release; it is the mean shape.
+    """
+    for D, b in zip(net.D[:0:-1], net.b_[:0:-1], strict=True):
+        psi = _relu(psi @ D.swapaxes(-1, -2) - b)
+    p, _, k = net.D[0].shape
+    s = psi @ net.D[0].reshape(3 * p, k).swapaxes(-1, -2)
+    return s.reshape(*psi.shape[:-1], p, 3) - net.b_[0]
+
+
+def coherence(net: Network) -> float:
+    """Return the mutual coherence of the final dictionary: max |cos| between two atoms.
+
+    "Coherence as guide" in the paper. Atoms of norm zero count as orthogonal to all.
+    """
+    D = np.asarray(net.D[-1], np.float64).reshape(-1, net.D[-1].shape[-1])
+    D = D / np.maximum(np.linalg.norm(D, axis=0), 1e-12)
+    G = np.abs(D.T @ D)
+    np.fill_diagonal(G, 0)
+    return float(G.max())

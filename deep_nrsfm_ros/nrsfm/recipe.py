@@ -1,0 +1,64 @@
+"""What a training is told: the recipe, and the presets that go with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Training."""
+
+    steps: int = option(60000, "gradient steps", low=1, high=10_000_000)
+    batch: int = option(64, "frames a step", low=1, high=65536)
+    learning_rate: float = option(3e-3, "learning rate of Adam at the start", low=1e-7, high=1.0)
+    schedule: str = option(
+        "cosine",
+        "learning rate: cosine to zero, or the paper's release (x 0.95 every 10000 steps)",
+        choices=("cosine", "exponential"),
+    )
+    cycle: float = option(2.0, "weight of the cycle loss; 0 is the paper's loss", low=0, high=100)
+    spectral: float = option(
+        0.01, "weight of the camera's spectral norm, for a free camera only", low=0, high=100
+    )
+    noise: float = option(
+        0.0, "highest noise added to the input, relative to its size", low=0.0, high=1.0
+    )
+    mask: float = option(0.0, "highest share of points hidden in the input", low=0.0, high=0.9)
+    glorot_biases: bool = option(False, "random biases at the start, as in the paper's release")
+    seeds: int = option(
+        1, "initialisations tried for `screening` steps; the lowest cycle error goes on", low=1
+    )
+    screening: int = option(3000, "steps after which seeds are compared", low=1)
+    seed: int = option(0, "first seed of everything random", low=0, high=2**31)
+
+
+class Preset(NamedTuple):
+    """Everything that shapes a training but the data."""
+
+    architecture: Architecture
+    normaliser: Normaliser
+    recipe: Recipe
+
+
+PRESETS: dict[str, Preset] = {
+    "default": Preset(Architecture(), Normaliser(), Recipe()),
+    "paper": Preset(
+        Architecture(widths=PAPER_WIDTHS),
+        Normaliser(scale="none"),
+        Recipe(
+            steps=200_000,
+            batch=32,
+            learning_rate=1e-3,
+            schedule="exponential",
+            cycle=0.0,
+            glorot_biases=True,
+        ),
+    ),
+}
+"""The default, and the paper's network and schedule as its authors released them."""

@@ -1,0 +1,264 @@
+"""Training: seeds screened, the best trained on, from 2D keypoints alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from deep_nrsfm_ros import __version__
+from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
+from deep_nrsfm_ros.nrsfm.metrics import object_frame
+from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.nrsfm.network import coherence, forward, initialise
+from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
+
+
+class Progress(NamedTuple):
+    """State of a training, means over the steps since the last report."""
+
+    step: int
+    steps: int
+    seed: int
+    loss: float  # relative reprojection error
+    cycle_error: float  # relative error of shapes reconstructed again from another camera
+    coherence: float  # of the final dictionary
+    seconds_left: float
+
+
+class Trainer:
+    """One initialisation in training: network, optimiser and step, all of it resumable.
+
+    The randomness of a step depends on the seed and the step alone, so a training resumed from a
+    checkpoint goes on exactly as if it had not stopped.
+    """
+
+    def __init__(self, frames: Frames, preset: Preset, seed: int) -> None:
+        """Initialise the network from `seed`."""
+        architecture, normaliser, recipe = preset
+        self.frames, self.preset, self.seed, self.step = frames, preset, seed, 0
+        device = frames.points.device
+        initial = initialise(
+            architecture,
+            frames.points.shape[1],
+            np.random.default_rng(seed),
+            glorot_biases=recipe.glorot_biases,
+        )
+        self.net = initial.map(lambda w: torch.from_numpy(w).to(device).requires_grad_())
+        self.optimiser = torch.optim.Adam(
+            [w for _, w in self.net.named()], lr=recipe.learning_rate, fused=True
+        )
+        self.objective = Objective(normaliser, recipe)
+        plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
+        self.plain_objective = Objective(normaliser, plain)
+        self.generator = torch.Generator(device)
+        self.probe = self._batch(1024, -1)
+
+    def _batch(self, size: int, step: int) -> Frames:
+        """Return the random batch of a step; leaves the generator ready for its cameras."""
+        self.generator.manual_seed((self.seed << 32) + step + 1)
+        f = len(self.frames.points)
+        device = self.frames.points.device
+        chosen = torch.randint(f, (size,), generator=self.generator, device=device)
+        return Frames(self.frames.points[chosen], self.frames.mask[chosen])
+
+    def advance(self) -> None:
+        """Take one gradient step."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(self.preset.recipe, self.step)
+        losses = self.objective(
+            self.net, self._batch(self.preset.recipe.batch, self.step), self.generator
+        )
+        self.optimiser.zero_grad(set_to_none=True)
+        losses.total.backward()  # type: ignore[no-untyped-call]
+        self.optimiser.step()
+        self.step += 1
+
+    @torch.no_grad()
+    def measure(self) -> tuple[float, float]:
+        """Return (reprojection error, cycle error) on fixed frames without augmentation."""
+        self.generator.manual_seed(self.seed)
+        losses = self.plain_objective(self.net, self.probe, self.generator)
+        return float(losses.reprojection), float(losses.cycle)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return everything that `restore` needs, as named tensors."""
+        tensors = {"step": torch.tensor(self.step), "seed": torch.tensor(self.seed)}
+        for name, weight in self.net.named():
+            moments = self.optimiser.state.get(weight, {})
+            tensors[f"weight.{name}"] = weight.detach()
+            tensors |= {f"{key}.{name}": value for key, value in moments.items()}
+        return tensors
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take over a `state`; raise ValueError if it is not of this architecture."""
+        self.step, self.seed = int(tensors["step"]), int(tensors["seed"])
+        with torch.no_grad():
+            for name, weight in self.net.named():
+                saved = tensors.get(f"weight.{name}")
+                if saved is None or saved.shape != weight.shape:
+                    raise ValueError(f"the checkpoint has no weight {name} {tuple(weight.shape)}")
+                weight.copy_(saved)
+                keys = ("step", "exp_avg", "exp_avg_sq")
+                if f"exp_avg.{name}" in tensors:
+                    self.optimiser.state[weight] = {k: tensors[f"{k}.{name}"] for k in keys}
+        self.probe = self._batch(1024, -1)
+
+
+def learning_rate(recipe: Recipe, step: int) -> float:
+    """Return the learning rate of a step by the recipe's schedule."""
+    if recipe.schedule == "exponential":
+        return recipe.learning_rate * float(0.95 ** (step / 10000))
+    return recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * step / recipe.steps))
+
+
+def train(
+    points: NDArray[np.float32],
+    visible: NDArray[np.bool_],
+    preset: Preset,
+    *,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+    should_stop: Callable[[], bool] = lambda: False,
+    checkpoint: Path | None = None,
+    checkpoint_seconds: float = 30.0,
+) -> Trainer:
+    """Train on keypoints (f, p, 2) with visibility (f, p), any unit, x right and y down.
+
+    Returns the trainer at its last step, earlier if `should_stop`. With `checkpoint`, goes on
+    from that file if it exists and writes it every `checkpoint_seconds`.
+    Raises ValueError for data that cannot be trained on or a checkpoint that does not fit.
+    """
+    for config in preset:
+        check(config)
+    recipe = preset.recipe
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    frames = Frames(
+        torch.from_numpy(np.where(visible[..., None], points, 0)).to(device),
+        torch.from_numpy(visible[..., None].astype(np.float32)).to(device),
+    )
+
+    def trainer_of(seed: int) -> Trainer:
+        return Trainer(frames, preset, seed)
+
+    trainer = trainer_of(recipe.seed)
+    clock = _Clock(recipe)
+    if checkpoint is not None and checkpoint.exists():
+        trainer.restore(read_checkpoint(checkpoint))
+    elif recipe.seeds > 1:
+        trainer = _screen(trainer_of, recipe, clock, on_progress, should_stop)
+    clock.restart(trainer.step)
+    saved = time.monotonic()
+    while trainer.step < recipe.steps and not should_stop():
+        trainer.advance()
+        if clock.due(trainer.step):
+            on_progress(clock.progress(trainer))
+        if checkpoint is not None and time.monotonic() - saved > checkpoint_seconds:
+            write_checkpoint(checkpoint, trainer)
+            saved = time.monotonic()
+    on_progress(clock.progress(trainer))
+    return trainer
+
+
+def _screen(
+    trainer_of: Callable[[int], Trainer],
+    recipe: Recipe,
+    clock: _Clock,
+    on_progress: Callable[[Progress], None],
+    should_stop: Callable[[], bool],
+) -> Trainer:
+    """Train each seed for a short while and return the one with the lowest cycle error.
+
+    Half-mirrored solutions show a high cycle error within seconds, whatever their loss.
+    """
+    candidates = []
+    for seed in range(recipe.seed, recipe.seed + recipe.seeds):
+        trainer = trainer_of(seed)
+        clock.restart(0)
+        while trainer.step < min(recipe.screening, recipe.steps) and not should_stop():
+            trainer.advance()
+            if clock.due(trainer.step):
+                on_progress(clock.progress(trainer))
+        candidates.append(trainer)
+        if should_stop():
+            break
+    return min(candidates, key=lambda trainer: trainer.measure()[1])
+
+
+class _Clock:
+    """When to report, and how long is left."""
+
+    def __init__(self, recipe: Recipe, every_seconds: float = 2.0) -> None:
+        self.steps, self.every = recipe.steps, every_seconds
+        self.restart(0)
+
+    def restart(self, step: int) -> None:
+        self.began = self.reported = time.monotonic()
+        self.first = step
+
+    def due(self, step: int) -> bool:
+        return time.monotonic() - self.reported >= self.every
+
+    def progress(self, trainer: Trainer) -> Progress:
+        self.reported = time.monotonic()
+        pace = (self.reported - self.began) / max(trainer.step - self.first, 1)
+        loss, cycle = trainer.measure()
+        sharpness = coherence(trainer.net.map(lambda w: w.detach().cpu().numpy()))
+        left = pace * (self.steps - trainer.step)
+        return Progress(trainer.step, self.steps, trainer.seed, loss, cycle, sharpness, left)
+
+
+def write_checkpoint(path: Path, trainer: Trainer) -> None:
+    """Write the trainer's state whole or not at all."""
+    partial = path.with_name(f"{path.name}.partial")
+    save_file({k: t.contiguous().cpu() for k, t in trainer.state().items()}, partial)
+    os.replace(partial, path)
+
+
+def read_checkpoint(path: Path) -> dict[str, Tensor]:
+    """Return a saved state; raise ValueError if the file is damaged."""
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"checkpoint {path} cannot be read ({error}); delete it") from error
+
+
+def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> Model:
+    """Return the trained model with its object frame, provenance and label-free quality."""
+    loss, cycle = trainer.measure()
+    net = trainer.net.map(lambda w: w.detach().cpu().numpy())
+    seen = trainer.preset.normaliser.encode(*trainer.probe)
+    S, _ = forward(net, (seen.W * seen.gain).cpu().numpy())
+    return Model(
+        name,
+        net,
+        layout,
+        trainer.preset.normaliser,
+        object_frame(S, layout),
+        provenance={
+            "data": source,
+            "frames": len(trainer.frames.points),
+            "recipe": dataclasses.asdict(trainer.preset.recipe),
+            "seed": trainer.seed,
+            "step": trainer.step,
+            "versions": {"deep_nrsfm_ros": __version__, "torch": torch.__version__},
+        },
+        quality={
+            "reprojection_error": round(loss, 5),
+            "cycle_error": round(cycle, 5),
+            "combined": round(math.hypot(loss, cycle), 5),
+            "coherence": round(coherence(net), 5),
+        },
+    )
