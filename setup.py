@@ -52,6 +52,7 @@ setup(
         ],
         "benchmarks": [
             "matplotlib",  # the demo's picture and the benchmarks' plots
+            "scipy",  # the demo's ground truth: triangulation from four calibrated cameras
         ],
     },
 )
