@@ -105,3 +105,15 @@ def override(base: Config, arguments: argparse.Namespace) -> Config:
     config: Config = dataclasses.replace(base, **values)  # type: ignore[type-var]
     check(config)
     return config
+
+
+def to_arguments(config: Any) -> list[str]:
+    """Return the command line that gives every option of `config`: the way back from `override`."""
+    words = []
+    for field, kind, _ in options(type(config)):
+        name, value = field.name.replace("_", "-"), getattr(config, field.name)
+        if kind is bool:
+            words.append(f"--{name}" if value else f"--no-{name}")
+        else:
+            words += [f"--{name}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return words

@@ -10,7 +10,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 Value = str | int | float | None
 
@@ -159,10 +159,20 @@ def parse_progress(line: str) -> Progress | None:
         return None
     if not isinstance(report, dict) or report.get("state") not in (*ACTIVE, *ENDED):
         return None
-    state, message = report.pop("state"), report.pop("message", "")
+    state = report.pop("state")
+    message = report.pop("message", "") or _in_words(state, report)
     values = {
         str(key): value
         for key, value in report.items()
         if value is None or isinstance(value, (str, int, float))
     }
-    return Progress(state, str(message) or state, values)
+    return Progress(state, str(message), values)
+
+
+def _in_words(state: str, report: dict[str, Any]) -> str:
+    """Return e.g. "training: 300 of 3000, 12 s left"."""
+    words = state
+    if "step" in report and "steps" in report:
+        words += f": {report['step']} of {report['steps']}"
+    left = report.get("seconds_left")
+    return words + (f", {left:.0f} s left" if isinstance(left, (int, float)) else "")

@@ -1,0 +1,94 @@
+"""What the lifter tells an operator: how it does, and what to mend. Knows nothing of ROS."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+OK, WARN, ERROR = range(3)
+
+_SILENCE = 3.0
+_POOR_FIT = 0.3
+
+
+class Report(NamedTuple):
+    """A level of `OK`, `WARN` or `ERROR`, one line that says why, and named figures."""
+
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+class Health:
+    """Counts what happens to messages and sums it up.
+
+    ERROR: messages came since the last report and none could be lifted.
+    WARN: some could not; none has come for 3 s; or half of the objects seen since the last
+    report fit the model worse than a reprojection error of 0.3.
+    OK: otherwise.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin to count; `clock` gives seconds."""
+        self._clock = clock
+        self._last_input = self._last_report = clock()
+        self._seconds: list[float] = []
+        self._errors: list[NDArray[np.float32]] = []
+        self._rejected = 0
+        self.total_lifted = 0
+        self.total_rejected = 0
+        self.last_problem = ""
+
+    def lifted(self, seconds: float, reprojection_error: NDArray[np.float32]) -> None:
+        """Count a message that took `seconds`.
+
+        reprojection_error: (n) of its objects, NaN of those that could not be lifted.
+        """
+        self._last_input = self._clock()
+        self._seconds.append(seconds)
+        self._errors.append(reprojection_error[~np.isnan(reprojection_error)])
+        self.total_lifted += 1
+
+    def rejected(self, reason: str) -> None:
+        """Count a message that could not be lifted, and remember why."""
+        self._last_input = self._clock()
+        self._rejected += 1
+        self.total_rejected += 1
+        self.last_problem = reason
+
+    def report(self) -> Report:
+        """Return how the time since the last report went, and begin anew."""
+        now = self._clock()
+        seconds = np.array(self._seconds or [np.nan])
+        errors = np.concatenate(self._errors or [np.array([np.nan])])
+        rate = len(self._seconds) / max(now - self._last_report, 1e-9)
+        level, message = self._judge(now - self._last_input, float(np.median(errors)))
+        values = {
+            "rate [Hz]": f"{rate:.1f}",
+            "processing time p50 [ms]": f"{np.median(seconds) * 1e3:.3f}",
+            "processing time max [ms]": f"{seconds.max() * 1e3:.3f}",
+            "reprojection error": f"{np.median(errors):.4f}",
+            "messages lifted": str(self.total_lifted),
+            "messages rejected": str(self.total_rejected),
+            "last problem": self.last_problem or "none",
+        }
+        self._last_report, self._rejected = now, 0
+        self._seconds.clear()
+        self._errors.clear()
+        return Report(level, message, values)
+
+    def _judge(self, silence: float, error: float) -> tuple[int, str]:
+        """Return level and message by the rules of the class."""
+        if self._rejected:
+            came = self._rejected + len(self._seconds)
+            level = WARN if self._seconds else ERROR
+            return level, f"{self._rejected} of {came} messages rejected: {self.last_problem}"
+        if silence > _SILENCE:
+            return WARN, f"no keypoints for {silence:.0f} s"
+        if error > _POOR_FIT:
+            return WARN, f"poor fit: half of the reprojection errors are above {error:.2f}"
+        return OK, "lifting" if self._seconds else "waiting for keypoints"

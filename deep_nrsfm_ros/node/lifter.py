@@ -1,0 +1,233 @@
+"""The node `lifter`: 2D keypoints in, 3D points and the camera's rotation out.
+
+It never imports torch: lifting is NumPy, and training is a process of its own.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PolygonStamped, QuaternionStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float32MultiArray, Header
+from visualization_msgs.msg import MarkerArray
+
+from deep_nrsfm_ros.node import parameters, publishing
+from deep_nrsfm_ros.node.health import Health
+from deep_nrsfm_ros.node.model_folders import model_folders
+from deep_nrsfm_ros.node.pipeline import InputOptions, Pipeline
+from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest
+from deep_nrsfm_ros.node.training_service import TrainingService
+from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
+from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.observations.messages import MULTI_ARRAY, POINT_CLOUD, POLYGON
+
+MESSAGES: dict[str, Any] = {
+    POINT_CLOUD: PointCloud2,
+    MULTI_ARRAY: Float32MultiArray,
+    POLYGON: PolygonStamped,
+}
+SENSOR_INPUT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+_TRAIN = "train."
+_LOG_PERIOD = 2.0
+_REPORT_PERIOD = 1.0
+_END_OF_TRAINING = 1.0  # seconds that a training has to save its model when the node ends
+
+
+class LifterNode(Node):
+    """Lifts every message on `keypoints` with the model that the parameters name."""
+
+    def __init__(self) -> None:
+        """Declare parameters, load the model and start to listen.
+
+        Raises ValueError or ParameterException if a parameter or the model is not usable.
+        """
+        super().__init__("lifter")
+        self._inputs = parameters.declare(self, InputOptions)
+        parameters.declare(self, LiftingOptions)
+        parameters.declare(self, TrainingOptions, _TRAIN)
+        parameters.declare(self, Recipe, _TRAIN)
+        self._models_dir = Path(self._inputs.models_dir).expanduser()
+        self._pipeline = self._proposed = self._prepare(())
+
+        self._health = Health()
+        self._cloud = publishing.PointCloud()
+        self._points = self.create_publisher(PointCloud2, "~/points", 10)
+        self._rotation = self.create_publisher(QuaternionStamped, "~/camera_rotation", 10)
+        self._markers = self.create_publisher(MarkerArray, "~/markers", 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._training = TrainingService(self, self._training_request, self._activate)
+        self.create_timer(_REPORT_PERIOD, self._report)
+        keypoints = self.create_subscription(
+            MESSAGES[self._inputs.input_type],
+            "keypoints",
+            self._lift,
+            SENSOR_INPUT,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._mend_qos),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        self._topic = keypoints.topic_name
+        self.add_on_set_parameters_callback(self._consider)
+        self.add_post_set_parameters_callback(self._adopt)
+        self.get_logger().info(
+            f"listening to {self._topic} ({self._inputs.input_type}, "
+            f"{len(self._pipeline.source)} keypoints in the order of "
+            f"{self._pipeline.source.name!r}), lifting with model {self._pipeline.model.name!r}"
+        )
+
+    def close(self) -> None:
+        """End a training that runs."""
+        self._training.close(_END_OF_TRAINING)
+
+    def _lift(self, message: Any) -> None:
+        """Lift one message and publish the result: the hot path."""
+        started = time.perf_counter()
+        try:
+            lifted = self._pipeline(message)
+        except Exception as problem:  # whatever it is, the next message may be fine
+            self._reject(problem)
+            return
+        header = getattr(message, "header", None) or self._header()
+        self._points.publish(self._cloud.fill(header, lifted))
+        if not np.isnan(lifted.residual[0]):
+            self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
+        if self._markers.get_subscription_count():
+            self._markers.publish(publishing.markers(header, lifted, self._pipeline.edges))
+        self._health.lifted(time.perf_counter() - started, lifted.residual)
+
+    def _reject(self, problem: Exception) -> None:
+        """Count a message that could not be lifted; say why, but not too often."""
+        reason = str(problem) if isinstance(problem, ValueError) else f"internal error: {problem!r}"
+        self._health.rejected(reason)
+        self.get_logger().warning(
+            f"message on {self._topic} dropped: {reason}", throttle_duration_sec=_LOG_PERIOD
+        )
+
+    def _header(self) -> Header:
+        """Return a header for input that has none: now, and no frame."""
+        return Header(stamp=self.get_clock().now().to_msg())
+
+    def _report(self) -> None:
+        """Publish diagnostics."""
+        level, message, values = self._health.report()
+        model = self._pipeline.model
+        values |= {"model": model.name, "topic": self._topic}
+        lifting = publishing.status(f"{self.get_name()}: lifting", level, message, values)
+        self._diagnostics.publish(
+            DiagnosticArray(header=self._header(), status=[lifting, self._training.status])
+        )
+
+    def _mend_qos(self, event: Any) -> None:
+        """Say how to hear a publisher whose quality of service does not fit."""
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        parameter = f"qos_overrides.{self._topic}.subscription.{policy.split('_')[0].lower()}"
+        reason = (
+            f"a publisher on {self._topic} offers a {policy} that does not fit: nothing comes from "
+            f"it; start the lifter without -p {parameter}, or change the publisher"
+        )
+        self._health.rejected(reason)
+        self.get_logger().error(reason)
+
+    def _prepare(self, changes: Sequence[Parameter]) -> Pipeline:
+        """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
+        inputs = parameters.read(self, InputOptions, changes=changes)
+        lifting = parameters.read(self, LiftingOptions, changes=changes)
+        for checked in (TrainingOptions, Recipe):
+            parameters.read(self, checked, _TRAIN, changes)
+        if changes and not any(change.name == "model" for change in changes):
+            model = self._pipeline.model
+        else:
+            model = load_model(find_model(inputs.model, model_folders(self._models_dir)))
+        return Pipeline(model, inputs, lifting)
+
+    def _consider(self, changes: list[Parameter]) -> SetParametersResult:
+        """Prepare for changed parameters, or refuse them with the reason."""
+        try:
+            self._proposed = self._prepare(changes)
+        except (ValueError, OSError) as problem:
+            return SetParametersResult(successful=False, reason=str(problem))
+        return SetParametersResult(successful=True)
+
+    def _adopt(self, changes: list[Parameter]) -> None:
+        """Lift the next message as the accepted parameters say."""
+        if self._proposed.model is not self._pipeline.model:
+            self.get_logger().info(f"lifting with model {self._proposed.model.name!r}")
+        self._pipeline = self._proposed
+
+    def _training_request(self) -> TrainingRequest:
+        """Return what ~/train is to do, as the parameters stand."""
+        wanted = parameters.read(self, TrainingOptions, _TRAIN)
+        return TrainingRequest(
+            wanted,
+            parameters.read(self, Recipe, _TRAIN),
+            topic=wanted.topic or self._topic,
+            source_layout=self._pipeline.source.name,
+            target_layout=wanted.object or self._pipeline.model.layout.name,
+            min_confidence=parameters.read(self, InputOptions).min_confidence,
+            output=self._models_dir,
+        )
+
+    def _activate(self, path: str) -> None:
+        """Switch to the model in a file of the models folder; raise ValueError if refused."""
+        (result,) = self.set_parameters([Parameter("model", value=Path(path).stem)])
+        if not result.successful:
+            raise ValueError(result.reason)
+
+
+def main() -> None:
+    """Run the node until SIGINT or SIGTERM; the exit code is 0 then, 1 if it cannot start."""
+    # rclpy's handlers come on top of these and shut the context down, which ends `spin`. The
+    # flag serves a signal that comes before, or amid a call to ROS, which then fails for it.
+    signals: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: signals.append(number))
+    rclpy.init()
+    try:
+        if not signals:
+            _run()
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        if not signals:
+            raise
+    finally:
+        rclpy.try_shutdown()
+
+
+def _run() -> None:
+    """Lift until the context is shut down."""
+    try:
+        node = LifterNode()
+    except (ParameterException, ValueError, OSError) as problem:
+        rclpy.logging.get_logger("lifter").fatal(f"cannot start: {problem}")
+        sys.exit(1)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin()
+    finally:
+        node.close()
+        executor.shutdown()
+        node.destroy_node()
+
+
+if __name__ == "__main__":
+    main()

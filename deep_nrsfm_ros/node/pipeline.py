@@ -1,0 +1,72 @@
+"""From one keypoint message to lifted shapes: all that a change of parameters replaces at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.node.model_folders import default_models_dir
+from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointMap, layout
+from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
+from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, MessageError, read
+
+MODEL_ORDER = "model"
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """Model and input of the lifter."""
+
+    model: str = option("human", "model to lift with: a name in the model folders, or a path")
+    models_dir: str = option(
+        str(default_models_dir()),
+        "folder for trained models, looked through before those that come with the package",
+        read_only=True,
+    )
+    input_type: str = option(
+        POINT_CLOUD, "type of the keypoint messages", choices=tuple(INPUT_TYPES), read_only=True
+    )
+    keypoint_layout: str = option(
+        MODEL_ORDER,
+        "order of the detector's keypoints: a preset, or 'model' for the order of the model's own",
+        choices=(MODEL_ORDER, *LAYOUTS),
+    )
+    min_confidence: float = option(
+        0.1, "a keypoint with less confidence counts as missing", low=0, high=1
+    )
+
+
+class Pipeline:
+    """One model, one detector layout, one set of options, ready for messages."""
+
+    def __init__(self, model: Model, inputs: InputOptions, lifting: LiftingOptions) -> None:
+        """Raise ValueError if the model and the detector's layout do not fit each other."""
+        own_order = inputs.keypoint_layout == MODEL_ORDER
+        self.model = model
+        self.source = model.layout if own_order else layout(inputs.keypoint_layout)
+        self.edges = model.layout.edge_indices()
+        self._map = KeypointMap(self.source, model.layout)
+        self._lifter = Lifter(model, lifting)
+        self._input_type, self._min_confidence = inputs.input_type, inputs.min_confidence
+        self._min_visible = lifting.min_visible
+
+    def __call__(self, message: Any) -> Lifted:
+        """Return the shapes of the objects in `message`; raise ValueError if there is none.
+
+        Objects with too few visible keypoints are NaN, unless all are: that is an error too.
+        """
+        seen = read(message, self._input_type, len(self.source), self._min_confidence)
+        if not len(seen.confidence):
+            raise MessageError("message has no object; expected at least one")
+        points, confidence = self._map(*seen)
+        lifted = self._lifter(points, confidence)
+        if np.isnan(lifted.residual).all():
+            raise MessageError(
+                f"message has at most {(confidence > 0).sum(1).max()} visible keypoints of the "
+                f"model's {len(self.model.layout)} in an object; min_visible is {self._min_visible}"
+            )
+        return lifted

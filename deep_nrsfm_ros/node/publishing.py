@@ -1,0 +1,108 @@
+"""Messages of the lifter from arrays. Reused messages spare the hot path their construction."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Vector3
+from numpy.typing import NDArray
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from deep_nrsfm_ros.nrsfm.geometry import quaternion
+from deep_nrsfm_ros.nrsfm.lifting import Lifted
+from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP
+
+_LIFETIME = Duration(nanosec=300_000_000)
+_BONES = ColorRGBA(r=0.2, g=0.6, b=1.0, a=1.0)
+_JOINTS = ColorRGBA(r=1.0, g=0.7, b=0.1, a=1.0)
+_JOINT_SIZE = 0.08  # of the shape's RMS radius
+_BONE_SIZE = 0.03
+
+
+class PointCloud:
+    """A PointCloud2 of x, y, z and confidence that is filled again for every message.
+
+    Publishing serialises at once, so one message object serves them all.
+    """
+
+    def __init__(self) -> None:
+        """Make an empty cloud."""
+        self._message = PointCloud2(
+            fields=[
+                PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
+                for name, offset in POINT_FIELDS
+            ],
+            point_step=POINT_STEP,
+        )
+        self._values = np.empty((0, 0, 4), np.float32)
+
+    def fill(self, header: Header, lifted: Lifted) -> PointCloud2:
+        """Return the cloud of n objects (its height) of p keypoints (its width)."""
+        n, p = lifted.confidence.shape
+        if self._values.shape[:2] != (n, p):
+            self._resize(n, p)
+        self._values[..., :3] = lifted.shapes
+        self._values[..., 3] = lifted.confidence
+        self._message.header = header
+        self._message.is_dense = not np.isnan(lifted.residual).any()
+        return self._message
+
+    def _resize(self, n: int, p: int) -> None:
+        """Give the message room for n objects of p keypoints."""
+        message = self._message
+        message.height, message.width, message.row_step = n, p, p * POINT_STEP
+        message.data = array("B", bytes(n * p * POINT_STEP))
+        # A view of the message's own array: what is written to it needs no copying.
+        self._values = np.frombuffer(message.data, "<f4").reshape(n, p, 4)
+
+
+def camera_rotation(header: Header, rotation: NDArray[np.float32]) -> QuaternionStamped:
+    """Return the rotation (3, 3) of an object as a quaternion."""
+    x, y, z, w = quaternion(rotation).tolist()
+    return QuaternionStamped(header=header, quaternion=Quaternion(x=x, y=y, z=z, w=w))
+
+
+def markers(header: Header, lifted: Lifted, edges: Sequence[tuple[int, int]]) -> MarkerArray:
+    """Return each object as a list of lines, one an edge, and a list of spheres.
+
+    The first object is at the origin, as in the point cloud; the others stand beside it as they
+    do in the image. Objects that are NaN are left out.
+    """
+    array_of_markers = MarkerArray()
+    lifted = Lifted(*(part[~np.isnan(lifted.residual)] for part in lifted))
+    sizes = np.sqrt((lifted.shapes**2).sum(-1).mean(-1)).tolist()
+    places = ((lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]).tolist()
+    for i, (shape, size, (x, y)) in enumerate(
+        zip(lifted.shapes.tolist(), sizes, places, strict=True)
+    ):
+        points = [Point(x=px, y=py, z=pz) for px, py, pz in shape]
+        bones, joints = Marker(ns="bones", type=Marker.LINE_LIST), Marker(ns="joints")
+        joints.type, joints.points, joints.color = Marker.SPHERE_LIST, points, _JOINTS
+        bones.points, bones.color = [points[end] for edge in edges for end in edge], _BONES
+        joint, bone = _JOINT_SIZE * size, _BONE_SIZE * size
+        joints.scale, bones.scale = Vector3(x=joint, y=joint, z=joint), Vector3(x=bone)
+        for marker in (bones, joints):
+            marker.header, marker.id, marker.lifetime = header, i, _LIFETIME
+            marker.pose.position = Point(x=x, y=y)
+        array_of_markers.markers += [bones, joints]
+    return array_of_markers
+
+
+def status(
+    name: str, level: int, message: str, values: Mapping[str, Any], hardware_id: str = ""
+) -> DiagnosticStatus:
+    """Return a diagnostic status with its values as text."""
+    return DiagnosticStatus(
+        level=bytes([level]),
+        name=name,
+        message=message,
+        hardware_id=hardware_id,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+    )

@@ -1,0 +1,126 @@
+"""The services ~/train and ~/cancel_training and the topic ~/training_status."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
+
+from deep_nrsfm_ros.node import publishing
+from deep_nrsfm_ros.node.health import ERROR, OK
+from deep_nrsfm_ros.node.training_job import Progress, TrainingJob
+from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest
+
+_LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class TrainingService:
+    """Trains on request, one job at a time, and tells how it goes.
+
+    Everything that is ROS happens on the executor's thread: the thread that listens to the
+    job only queues what it hears.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        request: Callable[[], TrainingRequest],
+        activate: Callable[[str], None],
+    ) -> None:
+        """Offer the services on `node`.
+
+        request: gives the request as the parameters stand; ValueError says what is wrong.
+        activate: switches to the model in the file named; ValueError says why it cannot.
+        """
+        self._node, self._request, self._activate = node, request, activate
+        self._job: TrainingJob | None = None
+        self._wanted = TrainingOptions()
+        self._state = "idle"
+        self._heard: SimpleQueue[Progress] = SimpleQueue()
+        self._wake = node.create_guard_condition(self._report)
+        self._publisher = node.create_publisher(DiagnosticStatus, "~/training_status", _LATCHED)
+        node.create_service(Trigger, "~/train", self._train)
+        node.create_service(Trigger, "~/cancel_training", self._cancel)
+        self._tell(Progress("idle", "no training since the lifter started", {}))
+
+    def close(self, timeout: float) -> None:
+        """End a training that runs, by force after `timeout` seconds."""
+        if self._job:
+            self._job.close(timeout)
+
+    def _train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Start a training and answer at once."""
+        try:
+            if self._job:
+                raise ValueError(
+                    f"training of {self._wanted.name!r} is under way; wait, or call "
+                    "~/cancel_training"
+                )
+            request = self._request()
+            request.check()
+            self._job = TrainingJob(
+                request.arguments(), self._hear, threads=request.options.threads
+            )
+        except (ValueError, OSError) as problem:
+            response.success, response.message = False, str(problem)
+            return response
+        self._wanted = request.options
+        bags = ", ".join(request.options.bags)
+        response.success = True
+        response.message = f"training {self._wanted.name!r} on {request.topic} of {bags}"
+        self._tell(Progress("starting", response.message, {}))
+        return response
+
+    def _cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Ask the training to end."""
+        response.success = self._job is not None
+        response.message = "no training is under way"
+        if self._job:
+            self._job.cancel()
+            response.message = f"cancelling the training of {self._wanted.name!r}"
+        return response
+
+    def _hear(self, progress: Progress) -> None:
+        """Take progress from the job's thread to the executor's."""
+        self._heard.put(progress)
+        self._wake.trigger()
+
+    def _report(self) -> None:
+        """Publish what the job has said since the last time."""
+        while True:
+            try:
+                progress = self._heard.get_nowait()
+            except Empty:
+                return
+            if progress.ended:
+                self._job = None
+            if progress.state == "finished" and self._wanted.activate:
+                progress = self._switch(progress)
+            self._tell(progress)
+
+    def _switch(self, progress: Progress) -> Progress:
+        """Activate the model of a finished training and say so."""
+        try:
+            self._activate(str(progress.values.get("model", "")))
+        except ValueError as problem:
+            return progress._replace(message=f"{progress.message}; not in use: {problem}")
+        return progress._replace(message=f"{progress.message}; in use from now on")
+
+    def _tell(self, progress: Progress) -> None:
+        """Publish progress; log it where the state changes."""
+        failed = progress.state == "failed"
+        news = f"training {progress.state}: {progress.message}"
+        if failed:
+            self._node.get_logger().error(news)
+        elif progress.state != self._state:
+            self._node.get_logger().info(news)
+        self._state = progress.state
+        name = f"{self._node.get_name()}: training"
+        values = {"state": progress.state, **progress.values}
+        level = ERROR if failed else OK
+        self.status = publishing.status(name, level, progress.message, values)
+        self._publisher.publish(self.status)

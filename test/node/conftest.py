@@ -1,0 +1,275 @@
+"""The lifter as a process of its own, and a client that talks to it over DDS."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import QuaternionStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+import deep_nrsfm_ros
+from deep_nrsfm_ros.nrsfm.keypoints import CMU31, HUMAN17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+
+DEADLINE = 60.0
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Give the test a DDS domain that no other test on this machine has."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    for number in random.sample(range(1, 102), 101):
+        path = Path(tempfile.gettempdir()) / f"ros_domain_{number}_in_test.lock"
+        with path.open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+            yield number
+            return
+    pytest.fail("all DDS domains are taken by other tests")
+
+
+def save_random_model(folder: Path, name: str, layout: KeypointLayout) -> Path:
+    """Write a small untrained model and return its file."""
+    architecture = Architecture(widths=(16, 8))
+    network = initialise(architecture, len(layout), np.random.default_rng(0))
+    path = folder / f"{name}.safetensors"
+    save_model(path, Model(name, network, layout, Normaliser(), np.eye(3, dtype=np.float32)))
+    return path
+
+
+@pytest.fixture
+def models(tmp_path: Path) -> Path:
+    """Return a folder of models: `person` of human17, `joints` of cmu31, a damaged `broken`."""
+    folder = tmp_path / "models"
+    save_random_model(folder, "person", HUMAN17)
+    save_random_model(folder, "joints", CMU31)
+    (folder / "broken.safetensors").write_bytes(b"\x00" * 100)
+    return folder
+
+
+class LifterProcess:
+    """A lifter that runs, its log in a file."""
+
+    def __init__(self, program: list[str], parameters: dict[str, Any], folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        settings = folder / "parameters.yaml"
+        settings.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+        self._log = folder / "log"
+        with self._log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, *program, "--ros-args", "--params-file", str(settings)],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                env=os.environ | {"PYTHONPATH": str(Path(deep_nrsfm_ros.__file__).parents[1])},
+            )
+
+    @property
+    def log(self) -> str:
+        return self._log.read_text()
+
+    def wait_for_log(self, text: str) -> None:
+        deadline = time.monotonic() + DEADLINE
+        while text not in self.log:
+            assert self.process.poll() is None, f"lifter ended: {self.log}"
+            assert time.monotonic() < deadline, f"no {text!r} in the log: {self.log}"
+            time.sleep(0.02)
+
+    def stop(self, number: signal.Signals) -> tuple[int, float]:
+        """Send a signal; return exit code and the seconds it took to end."""
+        before = time.monotonic()
+        self.process.send_signal(number)
+        return self.process.wait(DEADLINE), time.monotonic() - before
+
+
+@pytest.fixture
+def start_lifter(
+    domain: int, models: Path, tmp_path: Path
+) -> Iterator[Callable[..., LifterProcess]]:
+    """Start a lifter with the model `person` and the parameters given; it must end cleanly."""
+    started: list[LifterProcess] = []
+
+    def start(
+        program: tuple[str, ...] = ("-m", "deep_nrsfm_ros.node.lifter"),
+        listens: bool = True,
+        **parameters: Any,
+    ) -> LifterProcess:
+        parameters = {"model": "person", "models_dir": str(models)} | parameters
+        lifter = LifterProcess([*program], parameters, tmp_path / f"lifter{len(started)}")
+        started.append(lifter)
+        if listens:
+            lifter.wait_for_log("listening to")
+        return lifter
+
+    yield start
+    for lifter in started:
+        if lifter.process.poll() is None:
+            try:
+                assert lifter.stop(signal.SIGINT)[0] == 0, lifter.log
+            finally:
+                lifter.process.kill()
+                lifter.process.wait()
+
+
+class Client:
+    """A node of the test: publishes keypoints, collects all that the lifter says."""
+
+    TOPICS: dict[str, tuple[Any, Any]] = {
+        "/lifter/points": (PointCloud2, 100),
+        "/lifter/camera_rotation": (QuaternionStamped, 100),
+        "/lifter/training_status": (DiagnosticStatus, LATCHED),
+        "/diagnostics": (DiagnosticArray, 100),
+    }
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = rclpy.create_node("test_client", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.heard: dict[str, list[Any]] = defaultdict(list)
+        for topic, (kind, qos) in self.TOPICS.items():
+            self.listen(topic, kind, qos)
+        self._parameters = AsyncParameterClient(self.node, "/lifter")
+        self._publishers: dict[str, Any] = {}
+
+    def listen(self, topic: str, kind: Any, qos: Any = 100) -> None:
+        self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
+
+    def listen_to_markers(self) -> None:
+        self.listen("/lifter/markers", MarkerArray)
+
+    def publisher(self, kind: type, qos: QoSProfile | int = 100, topic: str = "keypoints") -> Any:
+        """Return a publisher that the lifter has found."""
+        publisher = self.node.create_publisher(kind, topic, qos)
+        self.wait(publisher.get_subscription_count, "the lifter to find the publisher")
+        return publisher
+
+    def wait(self, condition: Callable[[], Any], what: str) -> Any:
+        """Spin until the condition holds and return its value; fail at the deadline."""
+        deadline = time.monotonic() + DEADLINE
+        while not (value := condition()):
+            assert time.monotonic() < deadline, f"waited in vain for {what}"
+            self._executor.spin_once(timeout_sec=0.05)
+        return value
+
+    def exchange(self, publisher: Any, message: Any) -> PointCloud2:
+        """Publish until the lifter answers; return its next points.
+
+        Best effort may lose a message, so it is repeated now and then.
+        """
+        points = self.heard["/lifter/points"]
+        before, sent = len(points), 0.0
+
+        def answered() -> bool:
+            nonlocal sent
+            if time.monotonic() - sent > 0.5:
+                publisher.publish(message)
+                sent = time.monotonic()
+            return len(points) > before
+
+        self.wait(answered, "points")
+        return points[before]
+
+    def set_parameters(self, **values: Any) -> str:
+        """Set parameters of the lifter at once; return the reason of a refusal, or ""."""
+        assert self._parameters.wait_for_services(DEADLINE)
+        wanted = [Parameter(name.replace("__", "."), value=v) for name, v in values.items()]
+        future = self._parameters.set_parameters_atomically(wanted)
+        self.wait(future.done, "parameters to be set")
+        result = future.result().result
+        assert result.successful != bool(result.reason)
+        return str(result.reason)
+
+    def describe_parameters(self, *names: str) -> list[Any]:
+        assert self._parameters.wait_for_services(DEADLINE)
+        future = self._parameters.describe_parameters(list(names))
+        self.wait(future.done, "parameters to be described")
+        return list(future.result().descriptors)
+
+    def call(self, service: str) -> Trigger.Response:
+        client = self.node.create_client(Trigger, service)
+        self.wait(client.service_is_ready, service)
+        future = client.call_async(Trigger.Request())
+        self.wait(future.done, f"an answer of {service}")
+        self.node.destroy_client(client)
+        return future.result()
+
+    def wait_for_training(self, state: str) -> DiagnosticStatus:
+        """Wait for the newest training status to say `state`."""
+        heard = self.heard["/lifter/training_status"]
+        self.wait(lambda: heard and values(heard[-1])["state"] == state, f"training {state}")
+        return heard[-1]
+
+    def wait_for_health(
+        self, condition: Callable[[DiagnosticStatus, dict[str, str]], bool]
+    ) -> DiagnosticStatus:
+        """Wait for a new diagnostic status of lifting that fulfils the condition."""
+        heard = self.heard["/diagnostics"]
+        heard.clear()
+
+        def found() -> DiagnosticStatus | None:
+            for status in (s for message in heard for s in message.status):
+                if status.name == "lifter: lifting" and condition(status, values(status)):
+                    return status
+            return None
+
+        status = self.wait(found, "a diagnosis")
+        assert isinstance(status, DiagnosticStatus)
+        return status
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+def values(status: DiagnosticStatus) -> dict[str, str]:
+    """Return the values of a status by key."""
+    return {pair.key: pair.value for pair in status.values}
+
+
+@pytest.fixture
+def connect(domain: int) -> Iterator[Callable[[], Client]]:
+    """Make a client on the test's domain; call it once the lifter listens.
+
+    Two participants find each other within 0.2 s if the waiting one is the lifter, and within
+    3 s if it is the client.
+    """
+    clients: list[Client] = []
+
+    def make() -> Client:
+        clients.append(Client(domain))
+        return clients[-1]
+
+    yield make
+    for client in clients:
+        client.close()

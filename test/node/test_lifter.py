@@ -1,0 +1,283 @@
+"""The lifter as a user meets it: a process of its own, over real DDS."""
+
+from __future__ import annotations
+
+import signal
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Point32, PolygonStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension
+
+from deep_nrsfm_ros.nrsfm.keypoints import COCO17, HUMAN17
+from deep_nrsfm_ros.observations.messages import (
+    MULTI_ARRAY,
+    POINT_CLOUD,
+    POINT_FIELDS,
+    POINT_STEP,
+    POLYGON,
+    pack_points,
+)
+
+P = len(HUMAN17)
+
+
+def pixels(n: int, p: int = P, seed: int = 0) -> np.ndarray:
+    """Return keypoints (n, p, 2) somewhere in an image."""
+    return np.random.default_rng(seed).uniform(50, 600, (n, p, 2)).astype(np.float32)
+
+
+def header() -> Header:
+    message = Header(frame_id="camera_optical")
+    message.stamp.sec, message.stamp.nanosec = 1234, 567
+    return message
+
+
+def cloud(points: np.ndarray, confidence: np.ndarray | None = None) -> PointCloud2:
+    n, p, _ = points.shape
+    return PointCloud2(
+        header=header(),
+        height=n,
+        width=p,
+        fields=[
+            PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
+            for name, offset in POINT_FIELDS
+        ],
+        point_step=POINT_STEP,
+        row_step=p * POINT_STEP,
+        data=array("B", pack_points(points, np.ones((n, p)) if confidence is None else confidence)),
+    )
+
+
+def multi_array(points: np.ndarray) -> Float32MultiArray:
+    message = Float32MultiArray(data=array("f", points.astype(np.float32).ravel()))
+    message.layout.dim = [MultiArrayDimension(size=size) for size in points.shape]
+    return message
+
+
+def polygon(points: np.ndarray) -> PolygonStamped:
+    message = PolygonStamped(header=header())
+    message.polygon.points = [Point32(x=x, y=y, z=1.0) for x, y in points[0].tolist()]
+    return message
+
+
+def unpack(message: PointCloud2) -> np.ndarray:
+    """Return (n, p, 4): x, y, z, confidence."""
+    assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
+        (name, offset, PointField.FLOAT32) for name, offset in POINT_FIELDS
+    ]
+    assert message.row_step == message.width * message.point_step
+    return np.frombuffer(message.data, np.float32).reshape(message.height, message.width, 4)
+
+
+@pytest.mark.parametrize(
+    ("input_type", "message", "n"),
+    [
+        (POINT_CLOUD, cloud(pixels(2)), 2),
+        (MULTI_ARRAY, multi_array(pixels(2)), 2),
+        (POLYGON, polygon(pixels(1)), 1),
+    ],
+    ids=["cloud", "multi_array", "polygon"],
+)
+def test_keypoints_of_every_type_are_lifted(start_lifter, connect, input_type, message, n):
+    lifter = start_lifter(input_type=input_type)
+    client = connect()
+    points = client.exchange(client.publisher(type(message)), message)
+    xyzc = unpack(points)
+    assert xyzc.shape == (n, P, 4)
+    assert np.isfinite(xyzc).all() and points.is_dense
+    np.testing.assert_allclose(xyzc[..., :3].mean(1), 0, atol=1e-4)
+    # With full back-projection x and y are the keypoints themselves, up to scale and place.
+    for shape, seen in zip(xyzc[..., :2], pixels(n), strict=True):
+        seen = seen - seen.mean(0)
+        scale = (shape * seen).sum() / (seen * seen).sum()
+        np.testing.assert_allclose(shape, scale * seen, atol=1e-3 * np.abs(shape).max())
+    rotation = client.wait(lambda: client.heard["/lifter/camera_rotation"], "rotation")[0]
+    q = rotation.quaternion
+    assert np.linalg.norm([q.x, q.y, q.z, q.w]) == pytest.approx(1)
+    if input_type == MULTI_ARRAY:  # it has no header
+        assert points.header.frame_id == "" and points.header.stamp.sec > 1234
+    else:
+        assert points.header == rotation.header == header()
+    libraries = Path(f"/proc/{lifter.process.pid}/maps").read_text()
+    assert "numpy" in libraries and "torch" not in libraries
+
+
+def bad_clouds() -> dict[str, PointCloud2]:
+    wrong_field, short, strange_type = (cloud(pixels(1)) for _ in range(3))
+    wrong_field.fields[0].name = "u"
+    short.data = short.data[:-1]
+    strange_type.fields[1].datatype = PointField.INT16
+    return {
+        "too long": cloud(pixels(1, P + 1)),
+        "too short": cloud(pixels(1, P - 1)),
+        "nothing": PointCloud2(),
+        "no object": cloud(pixels(0)),
+        "field missing": wrong_field,
+        "data missing": short,
+        "wrong datatype": strange_type,
+        "all NaN": cloud(np.full((1, P, 2), np.nan, np.float32)),
+        "all at zero": cloud(np.zeros((1, P, 2), np.float32)),
+        "unsure": cloud(pixels(1), np.full((1, P), 0.01)),
+        "too few": cloud(pixels(1), np.arange(P)[None] < 3),
+    }
+
+
+def test_bad_input_is_counted_and_the_next_message_lifted(start_lifter, connect):
+    reliable = {"reliability": "reliable", "history": "keep_all"}
+    lifter = start_lifter(qos_overrides={"/keypoints": {"subscription": reliable}})
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    bad = bad_clouds()
+    expected = unpack(client.exchange(publisher, cloud(pixels(1)))).copy()
+    for message in bad.values():
+        publisher.publish(message)
+        client.heard["/lifter/points"].clear()
+        after = client.exchange(publisher, cloud(pixels(1)))
+        np.testing.assert_array_equal(unpack(after), expected)
+    status = client.wait_for_health(lambda _, v: v["messages rejected"] == str(len(bad)))
+    assert "min_visible" in status.message or status.level == b"\x00"
+    last = {pair.key: pair.value for pair in status.values}["last problem"]
+    assert "3 visible keypoints" in last
+    assert "dropped" in lifter.log
+
+
+def test_nothing_but_bad_input_is_an_error_and_silence_a_warning(start_lifter, connect):
+    start_lifter()
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    sender = client.node.create_timer(0.1, lambda: publisher.publish(cloud(pixels(1, 5))))
+    status = client.wait_for_health(lambda status, _: status.level == b"\x02")
+    assert "5 keypoints" in status.message and "17" in status.message
+    client.node.destroy_timer(sender)
+    status = client.wait_for_health(lambda status, _: status.level == b"\x01")
+    assert "no keypoints for" in status.message
+    client.exchange(publisher, cloud(pixels(1)))
+    sender = client.node.create_timer(0.1, lambda: publisher.publish(cloud(pixels(1))))
+    client.wait_for_health(lambda status, v: v["model"] == "person" and float(v["rate [Hz]"]) > 0)
+
+
+def test_an_object_with_too_few_keypoints_is_nan_beside_the_others(start_lifter, connect):
+    start_lifter()
+    client = connect()
+    confidence = np.ones((2, P))
+    confidence[0, 3:] = 0
+    publisher = client.publisher(PointCloud2)
+    points = client.exchange(publisher, cloud(pixels(2), confidence))
+    xyzc = unpack(points)
+    assert np.isnan(xyzc[0, :, :3]).all() and (xyzc[0, :, 3] == 0).all()
+    assert np.isfinite(xyzc[1]).all() and not points.is_dense
+
+
+def test_markers_come_when_someone_listens(start_lifter, connect):
+    start_lifter()
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    client.exchange(publisher, cloud(pixels(2)))
+    client.listen_to_markers()
+    client.wait(lambda: client.node.count_publishers("/lifter/markers"), "markers' publisher")
+    heard = client.heard["/lifter/markers"]
+
+    def sent_and_heard() -> Any:
+        client.exchange(publisher, cloud(pixels(2)))
+        return heard
+
+    markers = client.wait(sent_and_heard, "markers")[0].markers
+    assert [m.id for m in markers] == [0, 0, 1, 1]
+    assert {m.ns for m in markers} == {"bones", "joints"}
+    assert all(m.header == header() and m.lifetime.nanosec == 300_000_000 for m in markers)
+    assert [len(m.points) for m in markers] == [2 * len(HUMAN17.edges), P] * 2
+    assert all(m.scale.x > 0 for m in markers)
+
+
+def test_parameters_change_what_the_next_message_gets(start_lifter, connect):
+    lifter = start_lifter()
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    human, cmu = cloud(pixels(1)), cloud(pixels(1, 31))
+    first = unpack(client.exchange(publisher, human)).copy()
+
+    assert client.set_parameters(reference_length=3) == ""
+    np.testing.assert_allclose(
+        unpack(client.exchange(publisher, human))[..., :3], 3 * first[..., :3], rtol=1e-4
+    )
+    for refused, reason in {
+        "broken": "damaged",
+        "nowhere": "joints, person",
+        "/etc/passwd": "no model",
+    }.items():
+        assert reason in client.set_parameters(model=refused)
+    assert "share" in client.set_parameters(model="joints", keypoint_layout="coco17")
+    assert "one of" in client.set_parameters(keypoint_layout="martian")
+    assert "read-only" in client.set_parameters(models_dir="/tmp")
+    assert "read-only" in client.set_parameters(input_type=POLYGON)
+    assert "at most 1" in client.set_parameters(min_confidence=2)
+    assert unpack(client.exchange(publisher, human)).shape == (1, P, 4)
+
+    assert client.set_parameters(model="joints") == ""
+    assert unpack(client.exchange(publisher, cmu)).shape == (1, 31, 4)
+    client.wait_for_health(lambda _, v: v["model"] == "joints")
+    assert client.set_parameters(model="person", keypoint_layout="coco17") == ""
+    coco = unpack(client.exchange(publisher, cloud(pixels(1))))
+    # A detector without toes: the model guesses them, with less confidence.
+    certain = coco[0, :, 3]
+    toe = HUMAN17.index("left_big_toe")
+    assert 0 < certain[toe] < certain[HUMAN17.index("left_hip")]
+    assert len(COCO17) == P  # the same number in another order
+    assert lifter.process.poll() is None
+
+
+def test_parameters_describe_themselves(start_lifter, connect):
+    start_lifter()
+    client = connect()
+    model, share, layout, bags = client.describe_parameters(
+        "model", "back_projection", "keypoint_layout", "train.bags"
+    )
+    assert all(d.description for d in (model, share, layout, bags))
+    assert (share.floating_point_range[0].from_value, share.floating_point_range[0].to_value) == (
+        0.0,
+        1.0,
+    )
+    assert "mediapipe33" in layout.additional_constraints
+    assert not model.read_only
+
+
+def test_a_publisher_that_cannot_be_heard_is_reported_with_the_mend(start_lifter, connect):
+    lifter = start_lifter(
+        qos_overrides={"/keypoints": {"subscription": {"reliability": "reliable"}}}
+    )
+    client = connect()
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    client.node.create_publisher(PointCloud2, "keypoints", best_effort)
+    lifter.wait_for_log("qos_overrides./keypoints.subscription.reliability")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reason"),
+    [
+        ({"model": "nowhere"}, "there are broken, joints, person"),
+        ({"model": "broken"}, "damaged"),
+        ({"min_confidence": 7}, "min_confidence is 7"),
+    ],
+)
+def test_a_lifter_that_cannot_start_says_why(start_lifter, parameters, reason):
+    lifter = start_lifter(listens=False, **parameters)
+    assert lifter.process.wait(60) == 1
+    assert reason in lifter.log and "Traceback" not in lifter.log
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_cleanly(start_lifter, connect, number):
+    lifter = start_lifter()
+    client = connect()
+    client.exchange(client.publisher(PointCloud2), cloud(pixels(1)))
+    lifter.process.send_signal(number)  # a launcher and the terminal both send one
+    code, seconds = lifter.stop(number)
+    assert code == 0, lifter.log
+    assert "Traceback" not in lifter.log
+    assert seconds < 10  # about 0.1 s on an idle machine

@@ -1,0 +1,158 @@
+"""Training through the services of a lifter that goes on lifting."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
+from std_msgs.msg import Float32MultiArray
+
+from deep_nrsfm_ros.nrsfm.model_file import load_model
+
+P = 17
+STAND_IN = (str(Path(__file__).with_name("lifter_with_stand_in_training.py")),)
+
+
+def values(status: Any) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
+
+
+def keypoints(seed: int = 0) -> Float32MultiArray:
+    points = np.random.default_rng(seed).uniform(50, 600, P * 2)
+    return Float32MultiArray(data=array("f", points.astype(np.float32)))
+
+
+def assert_ends(pid: int) -> None:
+    """Assert that the process `pid` ends before long."""
+    deadline = time.monotonic() + 60
+    while Path(f"/proc/{pid}").exists():
+        assert time.monotonic() < deadline, f"process {pid} is left behind"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def lifter(start_lifter):
+    return start_lifter(STAND_IN, input_type="std_msgs/Float32MultiArray")
+
+
+def test_a_training_from_request_to_use(lifter, connect, models):
+    client = connect()
+    publisher = client.publisher(Float32MultiArray)
+    assert values(client.wait_for_training("idle"))["state"] == "idle"
+    refused = client.call("/lifter/train")
+    assert not refused.success and "train.bags" in refused.message
+    client.set_parameters(train__bags=[str(models / "nowhere")])
+    assert "does not exist" in client.call("/lifter/train").message
+    bag = models / "joints.safetensors"
+    assert client.set_parameters(train__bags=[str(bag)], train__name="../evil") == ""
+    assert "../evil" in client.call("/lifter/train").message
+    assert "Min: 1" in client.set_parameters(train__steps=0)
+    assert not client.call("/lifter/cancel_training").success
+
+    client.set_parameters(train__name="wait")
+    accepted = client.call("/lifter/train")
+    assert accepted.success, accepted.message
+    training = values(client.wait_for_training("training"))
+    assert (training["step"], training["steps"], training["loss"]) == ("1", "2", "0.5")
+    second = client.call("/lifter/train")
+    assert not second.success and "under way" in second.message
+    assert client.exchange(publisher, keypoints()).width == P
+    late = connect()
+    assert values(late.wait_for_training("training"))["step"] == "1"
+    assert client.call("/lifter/cancel_training").success
+    assert "kept the best" in client.wait_for_training("cancelled").message
+
+    client.set_parameters(train__name="finish")
+    assert client.call("/lifter/train").success
+    finished = client.wait_for_training("finished")
+    assert "in use" in finished.message and (models / "finish.safetensors").exists()
+    client.wait_for_health(lambda _, v: v["model"] == "joints")
+
+
+def test_a_training_that_fails_leaves_the_lifter_as_it_was(lifter, connect, models):
+    client = connect()
+    publisher = client.publisher(Float32MultiArray)
+    client.set_parameters(train__bags=[str(models / "broken.safetensors")])
+    for name, state, reason in [
+        ("crash", "failed", "the dictionary caught fire"),
+        ("refuse", "failed", "/nowhere is not in the bag"),
+        ("finish", "finished", "not in use: "),  # a damaged model
+    ]:
+        client.set_parameters(train__name=name)
+        client.heard["/lifter/training_status"].clear()
+        assert client.call("/lifter/train").success
+        status = client.wait_for_training(state)
+        assert reason in status.message
+        assert status.level == (b"\x02" if state == "failed" else b"\x00")
+        assert client.exchange(publisher, keypoints()).width == P
+    client.wait_for_health(lambda _, v: v["model"] == "person")
+
+
+@pytest.mark.parametrize(
+    ("number", "behaviour"), [(signal.SIGINT, "wait"), (signal.SIGTERM, "deaf")]
+)
+def test_signals_end_lifter_and_training(lifter, connect, models, number, behaviour):
+    client = connect()
+    bag = str(models / "joints.safetensors")
+    client.set_parameters(train__bags=[bag], train__name=behaviour)
+    assert client.call("/lifter/train").success
+    training = int(values(client.wait_for_training("training"))["session"])
+    code, seconds = lifter.stop(number)
+    assert code == 0 and "Traceback" not in lifter.log, lifter.log
+    assert seconds < 10  # the grace of 1 s and a little
+    assert_ends(training)
+
+
+def test_a_killed_lifter_leaves_no_training_behind(lifter, connect, models):
+    client = connect()
+    client.set_parameters(train__bags=[str(models / "joints.safetensors")], train__name="wait")
+    assert client.call("/lifter/train").success
+    training = int(values(client.wait_for_training("training"))["session"])
+    os.kill(lifter.process.pid, signal.SIGKILL)
+    lifter.process.wait()
+    assert_ends(training)
+
+
+def write_bag(path: Path, frames: int) -> None:
+    """Write a bag of 2D keypoints of a deforming object seen by random cameras."""
+    types, rng = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(0)
+    array_type = types.types["std_msgs/msg/Float32MultiArray"]
+    layout_type = types.types["std_msgs/msg/MultiArrayLayout"]
+    basis = rng.standard_normal((3, P, 3))
+    with Writer(path, version=9) as bag:
+        topic = bag.add_connection("/keypoints", array_type.__msgtype__, typestore=types)
+        for i in range(frames):
+            shape = np.tensordot(rng.uniform(0.5, 1, 3), basis, 1)
+            camera = np.linalg.qr(rng.standard_normal((3, 3)))[0][:, :2]
+            data = (300 + 100 * shape @ camera).astype(np.float32).ravel()
+            message = array_type(layout_type([], 0), data)
+            bag.write(topic, i * 10**7, types.serialize_cdr(message, array_type.__msgtype__))
+
+
+def test_the_real_training_turns_a_bag_into_the_model_in_use(
+    start_lifter, connect, models, tmp_path
+):
+    write_bag(tmp_path / "bag", 200)
+    lifter = start_lifter(
+        input_type="std_msgs/Float32MultiArray",
+        train={"bags": [str(tmp_path / "bag")], "name": "fresh", "steps": 20, "seeds": 1},
+    )
+    client = connect()
+    publisher = client.publisher(Float32MultiArray)
+    before = client.exchange(publisher, keypoints()).data
+    accepted = client.call("/lifter/train")
+    assert accepted.success, accepted.message
+    finished = client.wait_for_training("finished")
+    assert "in use" in finished.message
+    assert load_model(models / "fresh.safetensors").name == "fresh"
+    client.wait_for_health(lambda _, v: v["model"] == "fresh")
+    assert client.exchange(publisher, keypoints()).data != before
+    assert "torch" not in Path(f"/proc/{lifter.process.pid}/maps").read_text()
