@@ -26,9 +26,10 @@ class Report(NamedTuple):
 class Health:
     """Counts what happens to messages and sums it up.
 
-    ERROR: messages came since the last report and none could be lifted.
-    WARN: some could not; none has come for 3 s; or half of the objects seen since the last
-    report fit the model worse than a reprojection error of 0.3.
+    ERROR: messages came since the last report and none could be lifted, or there is a publisher
+    that cannot be heard and nothing else to lift.
+    WARN: some messages could not be lifted; none has come for 3 s; or half of the objects seen
+    since the last report fit the model worse than a reprojection error of 0.3.
     OK: otherwise.
     """
 
@@ -39,9 +40,15 @@ class Health:
         self._seconds: list[float] = []
         self._errors: list[NDArray[np.float32]] = []
         self._rejected = 0
+        self._unheard = ""
         self.total_lifted = 0
         self.total_rejected = 0
         self.last_problem = ""
+
+    @property
+    def idle(self) -> bool:
+        """Tell whether no message has come since the last report."""
+        return not self._seconds and not self._rejected
 
     def lifted(self, seconds: float, reprojection_error: NDArray[np.float32]) -> None:
         """Count a message that took `seconds`.
@@ -51,6 +58,7 @@ class Health:
         self._last_input = self._clock()
         self._seconds.append(seconds)
         self._errors.append(reprojection_error[~np.isnan(reprojection_error)])
+        self._unheard = ""
         self.total_lifted += 1
 
     def rejected(self, reason: str) -> None:
@@ -60,18 +68,23 @@ class Health:
         self.total_rejected += 1
         self.last_problem = reason
 
+    def unheard(self, reason: str) -> None:
+        """Remember that there is a publisher whose messages do not arrive, and why."""
+        self._unheard = self.last_problem = reason
+
     def report(self) -> Report:
         """Return how the time since the last report went, and begin anew."""
         now = self._clock()
         seconds = np.array(self._seconds or [np.nan])
-        errors = np.concatenate(self._errors or [np.array([np.nan])])
+        errors = np.concatenate([np.empty(0), *self._errors])
+        error = float(np.median(errors)) if len(errors) else np.nan
         rate = len(self._seconds) / max(now - self._last_report, 1e-9)
-        level, message = self._judge(now - self._last_input, float(np.median(errors)))
+        level, message = self._judge(now - self._last_input, error)
         values = {
             "rate [Hz]": f"{rate:.1f}",
             "processing time p50 [ms]": f"{np.median(seconds) * 1e3:.3f}",
             "processing time max [ms]": f"{seconds.max() * 1e3:.3f}",
-            "reprojection error": f"{np.median(errors):.4f}",
+            "reprojection error": f"{error:.4f}",
             "messages lifted": str(self.total_lifted),
             "messages rejected": str(self.total_rejected),
             "last problem": self.last_problem or "none",
@@ -87,6 +100,8 @@ class Health:
             came = self._rejected + len(self._seconds)
             level = WARN if self._seconds else ERROR
             return level, f"{self._rejected} of {came} messages rejected: {self.last_problem}"
+        if self._unheard:
+            return ERROR, self._unheard
         if silence > _SILENCE:
             return WARN, f"no keypoints for {silence:.0f} s"
         if error > _POOR_FIT:

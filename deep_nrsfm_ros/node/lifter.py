@@ -127,6 +127,8 @@ class LifterNode(Node):
 
     def _report(self) -> None:
         """Publish diagnostics."""
+        if self._health.idle:
+            self._look_for_other_types()
         level, message, values = self._health.report()
         model = self._pipeline.model
         values |= {"model": model.name, "topic": self._topic}
@@ -143,8 +145,24 @@ class LifterNode(Node):
             f"a publisher on {self._topic} offers a {policy} that does not fit: nothing comes from "
             f"it; start the lifter without -p {parameter}, or change the publisher"
         )
-        self._health.rejected(reason)
+        self._health.unheard(reason)
         self.get_logger().error(reason)
+
+    def _look_for_other_types(self) -> None:
+        """Say so if messages of another type are published where the lifter listens.
+
+        DDS keeps such publishers apart and reports nothing.
+        """
+        expected = self._inputs.input_type
+        publishers = self.get_publishers_info_by_topic(self._topic)
+        types = {info.topic_type.replace("/msg/", "/") for info in publishers} - {expected}
+        if types:
+            reason = (
+                f"{self._topic} carries {', '.join(sorted(types))}; expected {expected}: change "
+                "the publisher, or start the lifter with another input_type"
+            )
+            self._health.unheard(reason)
+            self.get_logger().error(reason, throttle_duration_sec=_LOG_PERIOD)
 
     def _prepare(self, changes: Sequence[Parameter]) -> Pipeline:
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""

@@ -141,7 +141,6 @@ def test_bad_input_is_counted_and_the_next_message_lifted(start_lifter, connect)
         after = client.exchange(publisher, cloud(pixels(1)))
         np.testing.assert_array_equal(unpack(after), expected)
     status = client.wait_for_health(lambda _, v: v["messages rejected"] == str(len(bad)))
-    assert "min_visible" in status.message or status.level == b"\x00"
     last = {pair.key: pair.value for pair in status.values}["last problem"]
     assert "3 visible keypoints" in last
     assert "dropped" in lifter.log
@@ -255,6 +254,19 @@ def test_a_publisher_that_cannot_be_heard_is_reported_with_the_mend(start_lifter
     best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     client.node.create_publisher(PointCloud2, "keypoints", best_effort)
     lifter.wait_for_log("qos_overrides./keypoints.subscription.reliability")
+
+
+def test_a_publisher_of_another_type_is_reported(start_lifter, connect):
+    lifter = start_lifter()
+    client = connect()
+    connect().node.create_publisher(PolygonStamped, "keypoints", 1)
+    status = client.wait_for_health(lambda status, _: status.level == b"\x02")
+    assert POLYGON in status.message and POINT_CLOUD in status.message
+    lifter.wait_for_log("another input_type")
+    publisher = client.publisher(PointCloud2)
+    sender = client.node.create_timer(0.1, lambda: publisher.publish(cloud(pixels(1))))
+    client.wait_for_health(lambda status, _: "carries" not in status.message)
+    client.node.destroy_timer(sender)
 
 
 @pytest.mark.parametrize(
