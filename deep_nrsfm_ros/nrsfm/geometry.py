@@ -21,7 +21,8 @@ def polar(A: Array) -> Array:
 
     "Loss function" in the paper: the singular values are set to one. Closed form (A A^T)^-1/2 A
     with the root of a 2 x 2 matrix; its determinant comes from the cross product of the rows,
-    because a d - b^2 cancels when they are nearly parallel.
+    because a d - b^2 cancels when they are nearly parallel. A of rank one or less gives a
+    result that is finite but not orthonormal.
     """
     G = A @ A.swapaxes(-1, -2)
     trace = (G[..., 0, 0] + G[..., 1, 1])[..., None, None]
@@ -29,7 +30,9 @@ def polar(A: Array) -> Array:
     cx = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     cy = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
     cz = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    s = ((cx * cx + cy * cy + cz * cz + _TINY) ** 0.5)[..., None, None]
+    # Relative to the size of A, which in a deep narrow network is small.
+    floor = _TINY * (trace * trace)[..., 0, 0] + 1e-36
+    s = ((cx * cx + cy * cy + cz * cz + floor) ** 0.5)[..., None, None]
     return ((trace + s) * A - G @ A) / (s * (trace + 2 * s) ** 0.5)
 
 
