@@ -43,6 +43,11 @@ class Architecture:
         choices=("orthonormal", "free"),
     )
 
+    def __post_init__(self) -> None:
+        """Refuse a network without a dictionary."""
+        if not self.widths:
+            raise ValueError("widths is empty; give the width of at least one dictionary")
+
 
 @dataclass(frozen=True)
 class Network:

@@ -1,0 +1,290 @@
+"""The network against the paper's equations, written out with Kronecker products and loops."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deep_nrsfm_ros.nrsfm.network import (
+    PAPER_WIDTHS,
+    Architecture,
+    Network,
+    coherence,
+    decode,
+    encode,
+    forward,
+    initialise,
+    recover,
+    weight_shapes,
+)
+
+I3 = np.eye(3)
+EVERY_ARCHITECTURE = [
+    Architecture((12, 7, 5), threshold, recovery, camera)
+    for threshold, recovery, camera in itertools.product(
+        ("relu", "block"), ("learned", "closed_form"), ("orthonormal", "free")
+    )
+]
+some = settings(max_examples=25, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+widths = st.lists(st.integers(1, 6), min_size=1, max_size=4).map(tuple)
+points = st.integers(3, 7)
+
+
+def random_network(architecture: Architecture, p: int, seed: int = 0) -> Network:
+    """Return a float64 network of which every weight, biases included, is random."""
+    net = initialise(architecture, p, np.random.default_rng(seed), glorot_biases=True)
+    return net.map(lambda w: w.astype(float))
+
+
+def replace_camera(net: Network, camera: str) -> Network:
+    """Return `net` with another option for its camera."""
+    return dataclasses.replace(
+        net, architecture=dataclasses.replace(net.architecture, camera=camera)
+    )
+
+
+def tall(net: Network) -> np.ndarray:
+    """Return D_1 (3p, k_1)."""
+    D = np.empty((3 * net.p, net.D[0].shape[2]))
+    for i, r, j in np.ndindex(net.D[0].shape):
+        D[3 * i + r, j] = net.D[0][i, r, j]
+    return D
+
+
+def wide(net: Network) -> np.ndarray:
+    """Return D_1# (p, 3k_1)."""
+    D = np.empty((net.p, 3 * net.D[0].shape[2]))
+    for i, r, j in np.ndindex(net.D[0].shape):
+        D[i, 3 * j + r] = net.D[0][i, r, j]
+    return D
+
+
+def stacked(Psi: np.ndarray) -> np.ndarray:
+    """Return the paper's (3k, 2) form of a stored block code (2, 3, k)."""
+    k = Psi.shape[2]
+    rows = np.empty((3 * k, 2))
+    for c, r, j in np.ndindex(Psi.shape):
+        rows[3 * j + r, c] = Psi[c, r, j]
+    return rows
+
+
+def stored(rows: np.ndarray) -> np.ndarray:
+    """Return a block code (2, 3, k) of the paper's form (3k, 2)."""
+    return rows.reshape(-1, 3, 2).transpose(2, 1, 0)
+
+
+def relu_threshold(V: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.maximum(V - np.kron(b[:, None], np.ones((3, 2))), 0)
+
+
+def block_threshold(V: np.ndarray, b: np.ndarray) -> np.ndarray:
+    result = np.zeros_like(V)
+    for j, threshold in enumerate(b):
+        block = V[3 * j : 3 * j + 3]
+        norm = np.linalg.norm(block)
+        result[3 * j : 3 * j + 3] = max(norm - threshold, 0) / norm * block
+    return result
+
+
+def truncated(net: Network, layers: int) -> Network:
+    """Return the network of the first `layers` dictionaries, for its encoder."""
+    architecture = Architecture(net.architecture.widths[:layers], net.architecture.threshold)
+    parts = (net.D[:layers], net.b[:layers], net.b_[:layers])
+    return Network(architecture, *parts, net.code_head, net.camera_head)
+
+
+@some
+@given(widths, points, seeds, st.sampled_from(["relu", "block"]))
+def test_every_encoder_layer_is_the_papers(
+    widths: tuple[int, ...], p: int, seed: int, threshold: str
+) -> None:
+    net = random_network(Architecture(widths, threshold), p, seed)
+    W = np.random.default_rng(seed + 1).standard_normal((p, 2))
+    h = {"relu": relu_threshold, "block": block_threshold}[threshold]
+    Psi = h(wide(net).T @ W, net.b[0])
+    for layers in range(1, len(widths) + 1):
+        if layers > 1:
+            if np.linalg.norm(Psi) < 1e-6:
+                return  # all is silent from here on: 0 / 0 in the explicit form
+            Psi = h(np.kron(net.D[layers - 1], I3).T @ Psi, net.b[layers - 1])
+        np.testing.assert_allclose(stacked(encode(truncated(net, layers), W)), Psi, atol=1e-9)
+
+
+@some
+@given(widths, points, seeds)
+def test_every_decoder_layer_is_the_papers(widths: tuple[int, ...], p: int, seed: int) -> None:
+    net = random_network(Architecture(widths), p, seed)
+    psi = np.random.default_rng(seed + 1).uniform(-1, 1, widths[-1])
+    expected = psi
+    for i in range(len(widths) - 1, 0, -1):
+        expected = np.maximum(net.D[i] @ expected - net.b_[i], 0)
+    s = tall(net) @ expected - net.b_[0].ravel()
+    np.testing.assert_allclose(decode(net, psi).ravel(), s, atol=1e-9)
+
+
+@some
+@given(st.integers(1, 6), points, seeds)
+def test_both_forms_of_the_first_dictionary_are_one(k: int, p: int, seed: int) -> None:
+    net = random_network(Architecture((k,)), p, seed)
+    psi = np.random.default_rng(seed + 1).standard_normal(k)
+    S = wide(net) @ np.kron(psi[:, None], I3)
+    np.testing.assert_allclose(decode(net, psi) + net.b_[0], S, atol=1e-9)
+    np.testing.assert_allclose((tall(net) @ psi).reshape(p, 3), S, atol=1e-9)
+
+
+def test_a_batch_is_its_frames() -> None:
+    for architecture in EVERY_ARCHITECTURE:
+        net = random_network(architecture, 6)
+        W = np.random.default_rng(1).standard_normal((4, 3, 6, 2))
+        S, M = forward(net, W)
+        assert S.shape == (4, 3, 6, 3) and M.shape == (4, 3, 3, 2)
+        for place in np.ndindex(4, 3):
+            one_S, one_M = forward(net, W[place])
+            np.testing.assert_allclose(S[place], one_S, atol=1e-9)
+            np.testing.assert_allclose(M[place], one_M, atol=1e-9)
+
+
+@some
+@given(st.integers(1, 8), seeds, st.sampled_from(["orthonormal", "free"]))
+def test_closed_form_recovers_what_a_rank_one_code_is_made_of(
+    k: int, seed: int, camera: str
+) -> None:
+    rng = np.random.default_rng(seed)
+    psi, M = rng.uniform(0, 1, k), np.linalg.qr(rng.standard_normal((3, 2)))[0]
+    psi[rng.random(k) < 0.3] = 0
+    psi[0] += 0.1
+    net = random_network(Architecture((k,), recovery="closed_form", camera=camera), 4)
+    found_psi, found_M = recover(net, stored(np.kron(psi[:, None], M)))
+    np.testing.assert_allclose(found_psi, psi, atol=1e-6)
+    np.testing.assert_allclose(found_M, M, atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", ["orthonormal", "free"])
+def test_learned_recovery_is_two_linear_maps(camera: str) -> None:
+    k = 5
+    net = random_network(Architecture((k,), camera=camera), 4)
+    Psi = np.random.default_rng(1).uniform(0, 1, (2, 3, k))
+    psi, M = np.zeros(k), np.zeros((3, 2))
+    for c, r, j in np.ndindex(Psi.shape):
+        psi += Psi[c, r, j] * net.code_head[(3 * c + r) * k + j]
+        M[r, c] += Psi[c, r, j] * net.camera_head[j, 0]
+    if camera == "orthonormal":
+        U, _, Vt = np.linalg.svd(M, full_matrices=False)
+        M = U @ Vt
+    found_psi, found_M = recover(net, Psi)
+    np.testing.assert_allclose(found_psi, psi, atol=1e-9)
+    np.testing.assert_allclose(found_M, M, atol=1e-6)
+
+
+@pytest.mark.parametrize("architecture", EVERY_ARCHITECTURE, ids=str)
+def test_torch_and_numpy_agree(architecture: Architecture) -> None:
+    net = initialise(architecture, 17, np.random.default_rng(0))
+    W = np.random.default_rng(1).standard_normal((100, 17, 2)).astype(np.float32) / 2
+    S, M = forward(net, W)
+    torch_S, torch_M = forward(net.map(torch.from_numpy), torch.from_numpy(W))
+    assert S.dtype == M.dtype == np.float32 and torch_S.dtype == torch_M.dtype == torch.float32
+    assert np.abs(S).max() > 0.01
+    np.testing.assert_allclose(torch_S.numpy(), S, atol=1e-5)
+    # Where the rows of the raw camera are nearly parallel, its polar factor magnifies rounding.
+    _, raw = recover(replace_camera(net, "free"), encode(net, W))
+    sound = np.linalg.cond(raw) < 10
+    assert sound.mean() > 0.5
+    np.testing.assert_allclose(torch_M.numpy()[sound], M[sound], atol=1e-5)
+
+    double = net.map(lambda w: w.astype(float))
+    S, M = forward(double, W.astype(float))
+    torch_S, torch_M = forward(double.map(torch.from_numpy), torch.from_numpy(W.astype(float)))
+    np.testing.assert_allclose(torch_S.numpy(), S, atol=1e-9)
+    np.testing.assert_allclose(torch_M.numpy(), M, atol=1e-9)
+
+
+def test_the_net_of_the_paper_gives_an_orthonormal_camera_from_the_start() -> None:
+    for glorot_biases in (True, False):  # without them the raw camera is of size 0.01
+        rng = np.random.default_rng(1)
+        net = initialise(Architecture(PAPER_WIDTHS), 31, rng, glorot_biases=glorot_biases)
+        W = 0.3 * rng.standard_normal((500, 31, 2)).astype(np.float32)
+        _, M = forward(net, W)
+        np.testing.assert_allclose(M.swapaxes(1, 2) @ M, np.tile(np.eye(2), (500, 1, 1)), atol=1e-3)
+
+
+def turned_in_plane(architecture: Architecture, seed: int) -> tuple[float, float]:
+    """Return how far shape and camera are from (S, M Q) when the image W becomes W Q."""
+    rng = np.random.default_rng(seed)
+    net = initialise(architecture, 7, rng).map(lambda w: w.astype(float))
+    W, Q = rng.standard_normal((7, 2)), np.linalg.qr(rng.standard_normal((2, 2)))[0]
+    (S, M), (turned_S, turned_M) = forward(net, W), forward(net, W @ Q)
+    assert np.linalg.norm(S) > 1e-3
+    return np.linalg.norm(turned_S - S) / np.linalg.norm(S), np.linalg.norm(turned_M - M @ Q)
+
+
+@some
+@given(seeds)
+def test_exact_threshold_and_closed_form_follow_a_turn_of_the_image(seed: int) -> None:
+    shape, camera = turned_in_plane(Architecture((9, 6), "block", "closed_form"), seed)
+    assert shape < 1e-6 and camera < 1e-4
+
+
+def test_the_relaxations_do_not_follow_a_turn_of_the_image() -> None:
+    assert turned_in_plane(Architecture((9, 6), "relu", "closed_form"), 0)[0] > 0.01
+    assert turned_in_plane(Architecture((9, 6), "block", "learned"), 0)[0] > 0.01
+
+
+@some
+@given(widths, points, seeds)
+def test_coherence_is_the_largest_cosine_of_two_atoms(
+    widths: tuple[int, ...], p: int, seed: int
+) -> None:
+    net = random_network(Architecture(widths), p, seed)
+    net.D[-1][..., 0] *= seed % 3  # now and then an atom of norm zero
+    atoms = net.D[-1].reshape(-1, widths[-1]).T
+    largest = 0.0
+    for i, j in itertools.combinations(range(len(atoms)), 2):
+        norms = np.linalg.norm(atoms[i]) * np.linalg.norm(atoms[j])
+        largest = max(largest, abs(atoms[i] @ atoms[j]) / norms if norms else 0)
+    assert coherence(net) == pytest.approx(largest, abs=1e-9)
+
+
+@some
+@given(widths, points, st.booleans())
+def test_initialise_makes_every_weight(
+    widths: tuple[int, ...], p: int, glorot_biases: bool
+) -> None:
+    architecture = Architecture(widths)
+    rng = np.random.default_rng(0)
+    weights = dict(initialise(architecture, p, rng, glorot_biases=glorot_biases).named())
+    assert {name: w.shape for name, w in weights.items()} == weight_shapes(architecture, p)
+    for name, weight in weights.items():
+        assert weight.dtype == np.float32
+        assert np.any(weight) != (name.startswith("b") and not glorot_biases)
+    again = initialise(architecture, p, np.random.default_rng(0), glorot_biases=glorot_biases)
+    assert all(np.array_equal(w, weights[name]) for name, w in again.named())
+
+
+def test_glorot_takes_the_fans_of_the_matrix_that_the_paper_multiplies_with() -> None:
+    net = initialise(Architecture((50, 40)), 30, np.random.default_rng(0), glorot_biases=True)
+    for weight, fans in ((net.D[0], 90 + 50), (net.D[1], 50 + 40), (net.code_head, 240 + 40)):
+        limit = (6 / fans) ** 0.5
+        assert 0.98 * limit < np.abs(weight).max() <= limit
+        assert np.std(weight) == pytest.approx(limit / 3**0.5, rel=0.05)
+
+
+def test_a_network_survives_its_names() -> None:
+    net = random_network(Architecture((4, 3)), 5)
+    again = Network.from_named(net.architecture, dict(net.named()))
+    assert all(a is b for (_, a), (_, b) in zip(net.named(), again.named(), strict=True))
+    weights = dict(net.named())
+    del weights["b_.1"]
+    with pytest.raises(KeyError, match=r"b_\.1"):
+        Network.from_named(net.architecture, weights)
+
+
+def test_a_network_has_a_dictionary() -> None:
+    with pytest.raises(ValueError, match="widths is empty"):
+        Architecture(widths=())
