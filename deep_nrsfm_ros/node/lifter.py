@@ -1,5 +1,14 @@
 """The node `lifter`: 2D keypoints in, 3D points and the camera's rotation out.
 
+Every message on `keypoints` is answered, with its own header, on
+
+- ~/points: n objects (rows) of p keypoints: x right, y down, z forward, and confidence; centred
+  on each object's keypoints, in units of the parameter reference_length; NaN where too few
+  keypoints are visible,
+- ~/camera_rotation: from the axes of the first object (x front, y left, z up, where its layout
+  says which is which) to those of the camera; left out when the first object is NaN,
+- ~/markers: the same for RViz, made only when someone listens.
+
 It never imports torch: lifting is NumPy, and training is a process of its own.
 """
 

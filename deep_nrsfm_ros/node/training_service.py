@@ -69,10 +69,10 @@ class TrainingService:
             response.success, response.message = False, str(problem)
             return response
         self._wanted = request.options
-        bags = ", ".join(request.options.bags)
+        data = f"{request.topic} of {', '.join(request.options.bags)}"
         response.success = True
-        response.message = f"training {self._wanted.name!r} on {request.topic} of {bags}"
-        self._tell(Progress("starting", response.message, {}))
+        response.message = f"training {self._wanted.name!r} on {data}"
+        self._tell(Progress("starting", f"starting on {data}", {}))
         return response
 
     def _cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -113,7 +113,7 @@ class TrainingService:
     def _tell(self, progress: Progress) -> None:
         """Publish progress; log it where the state changes."""
         failed = progress.state == "failed"
-        news = f"training {progress.state}: {progress.message}"
+        news = f"training of {self._wanted.name!r}: {progress.message}"
         if failed:
             self._node.get_logger().error(news)
         elif progress.state != self._state:
