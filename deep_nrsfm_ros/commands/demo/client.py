@@ -1,0 +1,227 @@
+"""What the demo does over DDS: start the lifter, play keypoints to it, record what it answers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import QuaternionStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+_DEADLINE = 60.0  # seconds after which an answer is no longer waited for
+_LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+class DemoError(RuntimeError):
+    """The demo cannot go on; says why."""
+
+
+@contextmanager
+def lifter(parameters: Mapping[str, Any], log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run the lifter as a process of its own, its output in the file `log`; end it at the end."""
+    command = [sys.executable, "-m", "deep_nrsfm_ros.node.lifter", "--ros-args"]
+    for name, value in parameters.items():
+        command += ["-p", f"{name}:={value}"]
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            # A session of its own: Ctrl-C reaches the demo alone, which then ends the lifter.
+            command,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+class Played(NamedTuple):
+    """How the lifter answered one camera's messages.
+
+    stamps: ns, of those sent. latencies: seconds from publishing to receiving, of those answered.
+    rate: answers a second. error: median of the reprojection errors in the diagnostics meanwhile.
+    """
+
+    stamps: list[int]
+    latencies: list[float]
+    rate: float
+    error: float
+
+    def latency(self, percent: float) -> float:
+        """Return a percentile of the latencies in milliseconds."""
+        return float(np.percentile(self.latencies, percent)) * 1e3
+
+
+class Client:
+    """Plays a bag of keypoints to the lifter and records the answers in another bag.
+
+    health, training: values of the newest diagnostics and training status.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], source: Path, bag: Path) -> None:
+        """Connect to the lifter that runs as `process`.
+
+        source: bag to play, PointCloud2 messages on one topic. bag: must not exist yet.
+        """
+        self._process = process
+        self._messages = _by_camera(source)
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("demo", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer.open()
+        self.health: dict[str, str] = {}
+        self.training: dict[str, str] = {}
+        self._received: dict[int, float] = {}
+        self._errors: list[float] = []
+        self._publisher = self._node.create_publisher(PointCloud2, "keypoints", 10)
+        self._record(PointCloud2, "/lifter/points", self._take_points)
+        self._record(QuaternionStamped, "/lifter/camera_rotation", lambda message: None)
+        self._record(DiagnosticArray, "/diagnostics", self._take_report)
+        self._record(DiagnosticStatus, "/lifter/training_status", self._take_training, _LATCHED)
+
+    def __enter__(self) -> Client:
+        """Return the client."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave the domain and close the bag."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+        self._writer.close()
+
+    def meet(self) -> None:
+        """Wait until the lifter and this client have found each other."""
+        self.wait(self._publisher.get_subscription_count, "the lifter to listen")
+        self.wait(lambda: self.health and self.training, "the lifter to be heard")
+
+    def play(self, camera: str) -> Played:
+        """Publish a camera's messages at the pace of their stamps; hear the next diagnostics.
+
+        Raises DemoError if none of them is answered.
+        """
+        messages, sent = self._messages[camera], {}
+        self._received.clear()
+        self._errors.clear()
+        begin = time.perf_counter() - messages[0][0] / 1e9
+        for stamp, raw in messages:
+            self._spin_until(begin + stamp / 1e9)
+            sent[stamp] = time.perf_counter()
+            self._publisher.publish(raw)
+        reports = len(self._errors)
+        self.wait(lambda: len(self._errors) > reports, "diagnostics")
+        received = {stamp: at for stamp, at in self._received.items() if stamp in sent}
+        if not received:
+            raise DemoError(f"the lifter answered nothing: {self.health['last problem']}")
+        span = max(received.values()) - min(received.values())
+        return Played(
+            list(sent),
+            [at - sent[stamp] for stamp, at in received.items()],
+            (len(received) - 1) / span if span else 0.0,
+            float(np.nanmedian(self._errors)),
+        )
+
+    def train(self) -> str:
+        """Ask the lifter to train and return its answer; raise DemoError if it refuses."""
+        client = self._node.create_client(Trigger, "/lifter/train")
+        self.wait(client.service_is_ready, "the training service")
+        future = client.call_async(Trigger.Request())
+        self.wait(future.done, "an answer of the training service")
+        answer = future.result()
+        if not answer.success:
+            raise DemoError(f"the lifter refused to train: {answer.message}")
+        return str(answer.message)
+
+    def wait(self, condition: Callable[[], Any], what: str) -> None:
+        """Spin until the condition holds; raise DemoError at the deadline or with the lifter."""
+        deadline = time.perf_counter() + _DEADLINE
+        while not condition():
+            if self._process.poll() is not None:
+                raise DemoError("the lifter has ended")
+            if time.perf_counter() > deadline:
+                raise DemoError(f"waited in vain for {what}")
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def _spin_until(self, end: float) -> None:
+        """Receive until `end` on the performance counter."""
+        while (left := end - time.perf_counter()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def _record(
+        self, kind: Any, topic: str, take: Callable[[Any], None], qos: QoSProfile | int = 100
+    ) -> None:
+        """Write every message of a topic into the bag, as it comes, and hand it to `take`."""
+        package, name = kind.__module__.split(".")[0], kind.__name__
+        connection = self._writer.add_connection(topic, f"{package}/msg/{name}", typestore=_STORE)
+
+        def receive(raw: bytes) -> None:
+            take(deserialize_message(raw, kind))
+            self._writer.write(connection, time.time_ns(), raw)
+
+        self._node.create_subscription(kind, topic, receive, qos, raw=True)
+
+    def _take_points(self, message: PointCloud2) -> None:
+        """Note when the answer to a message came."""
+        self._received[_stamp(message.header)] = time.perf_counter()
+
+    def _take_report(self, message: DiagnosticArray) -> None:
+        """Keep what the newest diagnostics say about lifting."""
+        for status in message.status:
+            if status.name == "lifter: lifting":
+                self.health = {pair.key: pair.value for pair in status.values}
+                self._errors.append(float(self.health["reprojection error"]))
+
+    def _take_training(self, message: DiagnosticStatus) -> None:
+        """Keep the newest training status."""
+        values = {pair.key: pair.value for pair in message.values}
+        self.training = values | {"message": message.message}
+
+
+def _by_camera(bag: Path) -> dict[str, list[tuple[int, bytes]]]:
+    """Return stamp in ns and serialised message of all that a bag holds, by frame_id."""
+    messages: dict[str, list[tuple[int, bytes]]] = defaultdict(list)
+    with Reader(bag) as reader:
+        for _, _, raw in reader.messages():
+            header = deserialize_message(raw, PointCloud2).header
+            messages[header.frame_id].append((_stamp(header), raw))
+    return messages
+
+
+def _stamp(header: Header) -> int:
+    """Return the stamp in ns."""
+    return int(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)

@@ -1,0 +1,105 @@
+"""The lifter's answers, read from the recorded bag, against the ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from deep_nrsfm_ros.commands.demo.client import Played
+from deep_nrsfm_ros.nrsfm.geometry import align, centre
+from deep_nrsfm_ros.nrsfm.metrics import procrustes_distances
+from deep_nrsfm_ros.observations.pose2sim import Session
+
+Floats = NDArray[Any]
+
+_COLUMNS = {
+    "frames": ".0f",
+    "answered": ".0f",
+    "Hz": ".1f",
+    "p50 ms": ".2f",
+    "p99 ms": ".2f",
+    "reprojection": ".3f",
+    "PA mm": ".1f",
+    "camera mm": ".1f",
+    "rotation deg": ".1f",
+    "mirrored %": ".0f",
+}
+
+
+class Errors(NamedTuple):
+    """Errors of lifted shapes, means over frames and points but for the rotation."""
+
+    aligned: float  # mm after the best similarity with a proper rotation
+    in_camera: float  # mm after the best scale and translation: the camera's view must fit too
+    rotation: float  # degrees between the two, median
+    mirrored: float  # share of frames that a reflection fits better
+
+
+def errors(shapes: Floats, truth: Floats) -> Errors:
+    """Compare shapes (f, p, 3) with truth (f, p, 3) in mm, both in the camera's frame.
+
+    Frames of which the truth is not wholly known are left out.
+    """
+    known = np.isfinite(truth).all((1, 2))
+    S, T = centre(shapes[known].astype(float)), centre(truth[known])
+    scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
+    apart = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
+    turn = align(S, T).rotation
+    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    return Errors(
+        float(procrustes_distances(S, T).mean()),
+        float(apart.mean()),
+        float(np.degrees(np.median(angle))),
+        float(align(S, T, allow_reflection=True).mirrored.mean()),
+    )
+
+
+def read_points(bag: Path, topic: str = "/lifter/points") -> dict[int, Floats]:
+    """Return the first object's points (p, 3) of every message, by header stamp in ns."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    points: dict[int, Floats] = {}
+    with Reader(bag) as reader:
+        wanted = [c for c in reader.connections if c.topic == topic]
+        for connection, _, raw in reader.messages(wanted):
+            message: Any = store.deserialize_cdr(raw, connection.msgtype)
+            stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            values = message.data.view("<f4").reshape(message.height, message.width, -1)
+            points[stamp] = values[0, :, :3]
+    return points
+
+
+def table(
+    session: Session, played: Sequence[Played], points: Mapping[int, Floats], limbs: Sequence[int]
+) -> str:
+    """Return, as text, how the lifter answered each camera, and how well; last, the means.
+
+    points: what was lifted, by stamp. limbs: places of the ground truth's joints in it.
+    """
+    rows = []
+    for view, run in zip(session.views, played, strict=True):
+        frames = [i for i, stamp in enumerate(run.stamps) if stamp in points]
+        shapes = np.stack([points[run.stamps[i]][limbs] for i in frames])
+        error = errors(shapes, view.truth[frames])
+        rows.append(
+            [
+                *(len(run.stamps), len(frames), run.rate, run.latency(50), run.latency(99)),
+                *(run.error, error.aligned, error.in_camera, error.rotation),
+                100 * error.mirrored,
+            ]
+        )
+    names = [*(view.camera.name for view in session.views), "mean"]
+    lines = [["camera", *_COLUMNS]]
+    for name, row in zip(names, [*rows, np.mean(rows, 0)], strict=True):
+        formats = zip(_COLUMNS.values(), row, strict=True)
+        lines.append([name, *(f"{value:{form}}" for form, value in formats)])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True))
+        for line in lines
+    )

@@ -1,0 +1,153 @@
+"""The demo from wheel to picture and trained model, in real processes over real DDS."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import deep_nrsfm_ros
+from deep_nrsfm_ros.commands.demo.__main__ import WHEEL, fetch_wheel
+from deep_nrsfm_ros.commands.demo.evaluation import errors, read_points
+from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
+from deep_nrsfm_ros.nrsfm.model_file import Model, load_model, save_model
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.observations.cameras import Camera
+
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+def shapes(frames: int = 20) -> np.ndarray:
+    """Return (frames, 12, 3) random shapes in mm, away from the origin."""
+    return np.random.default_rng(0).normal([0, 0, 3000], 300, (frames, 12, 3))
+
+
+def test_errors_of_a_perfect_shape_at_any_scale_and_place() -> None:
+    truth = shapes()
+    truth[3, 5] = np.nan  # a frame that is not wholly known
+    S = np.nan_to_num(truth) * 0.001 + [1, 2, 3]
+    np.testing.assert_allclose(errors(S, truth), 0, atol=1e-4)
+
+
+def test_a_turned_shape_is_wrong_in_the_camera_only() -> None:
+    turn = Rotation.from_rotvec(np.radians([0, 30, 0])).as_matrix()
+    error = errors(shapes() @ turn, shapes())
+    assert error.aligned < 1e-6 and error.in_camera > 100
+    assert error.rotation == pytest.approx(30) and error.mirrored == 0
+
+
+def test_a_mirrored_shape_is_found_out() -> None:
+    half = shapes()
+    half[:10, :, 2] *= -1
+    error = errors(half, shapes())
+    assert error.mirrored == 0.5 and error.aligned > 50
+
+
+def test_the_wheel_is_fetched_only_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(command: list[str], check: bool) -> None:
+        assert command[1:4] == ["-m", "pip", "download"] and command[-1] == "pose2sim==0.6.0"
+        folder = Path(command[command.index("--dest") + 1])
+        folder.mkdir(parents=True)
+        (folder / WHEEL).write_bytes(b"wheel")
+        monkeypatch.setattr(subprocess, "run", None)
+
+    monkeypatch.setattr(subprocess, "run", download)
+    for _ in range(2):
+        assert fetch_wheel(tmp_path / "cache") == tmp_path / "cache" / WHEEL
+    assert (tmp_path / "cache" / WHEEL).read_bytes() == b"wheel"
+
+
+def test_a_download_that_fails_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(OSError, match=f"put {WHEEL} into {tmp_path}"):
+        fetch_wheel(tmp_path)
+
+
+@pytest.fixture
+def start(tmp_path: Path, ring: list[Camera], write_session: Any) -> Start:
+    """Return a function that starts the demo on a made-up session with an untrained model."""
+    write_session(tmp_path / WHEEL, ring, ring, [0.0] * 4)
+    network = initialise(Architecture(widths=(16, 8)), len(HUMAN17), np.random.default_rng(0))
+    model = Model("untrained", network, HUMAN17, Normaliser(), np.eye(3, dtype=np.float32))
+    save_model(tmp_path / "untrained.safetensors", model)
+
+    def run(**options: Any) -> subprocess.Popen[str]:
+        options = {
+            "cache": tmp_path,
+            "output": tmp_path / "output",
+            "model": tmp_path / "untrained.safetensors",
+        } | options
+        words = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
+        return subprocess.Popen(
+            [sys.executable, "-m", "deep_nrsfm_ros.commands.demo", *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(Path(deep_nrsfm_ros.__file__).parents[1])},
+        )
+
+    return run
+
+
+def descendants(folder: Path) -> list[str]:
+    """Return the command lines of all processes that name `folder`."""
+    lines = []
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = process.read_bytes().replace(b"\0", b" ").decode()
+        except OSError:
+            continue  # it has ended
+        lines += [line] if str(folder) in line else []
+    return lines
+
+
+def test_demo_from_wheel_to_trained_model(start: Start, tmp_path: Path) -> None:
+    process = start(train_steps=20)
+    said, _ = process.communicate(timeout=170)
+    assert process.returncode == 0, said
+    output = tmp_path / "output"
+    table = [line.split() for line in said.splitlines() if line.lstrip().startswith(("cam", "mea"))]
+    assert [row[0] for row in table] == ["camera", "cam01", "cam02", "cam03", "cam04", "mean"]
+    assert all(row[1] == "30" and 15 <= float(row[2]) <= 30 for row in table[1:])
+    assert len(read_points(output / "lifted")) >= 60
+    assert (output / "demo.png").read_bytes().startswith(b"\x89PNG")
+    assert load_model(output / "models" / "demo.safetensors").layout == HUMAN17
+    assert "went from model 'untrained' to 'demo' and lifted" in said
+    assert not descendants(output)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("moment", ["playing", "training 'demo'"])
+def test_stopped_demo_leaves_nothing_behind(
+    start: Start, tmp_path: Path, number: signal.Signals, moment: str
+) -> None:
+    process = start(train_steps=1_000_000)
+    assert process.stdout is not None
+    said = ""
+    while moment not in said:
+        line = process.stdout.readline()
+        assert line, said
+        said += line
+    time.sleep(2)
+    process.send_signal(number)
+    said += process.communicate(timeout=20)[0]
+    assert process.returncode == 130 and "Traceback" not in said, said
+    assert not descendants(tmp_path / "output")
+
+
+def test_unknown_model_is_a_message(start: Start) -> None:
+    process = start(model="nobody")
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 1 and "demo: no model 'nobody'" in said and "Traceback" not in said
