@@ -50,6 +50,7 @@ def arguments() -> argparse.ArgumentParser:
         action="store_true",
         help="every trial of a subject instead of the paper's first floor(0.8 N)",
     )
+    data.add_argument("--stride", type=int, default=1, help="take every n-th CMU frame")
     data.add_argument("--camera-seed", type=int, default=0, help="seed of the CMU cameras")
     result = parser.add_argument_group("Result")
     result.add_argument("--object", default="human17", choices=list(LAYOUTS), help="model's layout")
@@ -85,7 +86,9 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
     for subject in given.subjects:
         found = trials(given.cmu, subject)
         paths += found if given.all_trials else protocol_split(found)[0]
-    return read_trials(paths, target, seed=given.camera_seed, on_progress=report.reading)
+    return read_trials(
+        paths, target, seed=given.camera_seed, stride=given.stride, on_progress=report.reading
+    )
 
 
 class Reporter:

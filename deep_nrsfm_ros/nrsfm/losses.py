@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
-from deep_nrsfm_ros.nrsfm.network import Network, forward
+from deep_nrsfm_ros.nrsfm.network import Network, forward, whiten
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
@@ -47,9 +47,12 @@ def visible_centre(X: Tensor, mask: Tensor) -> Tensor:
 class Objective:
     """The loss of a network on a batch, with its augmentation and its random cameras."""
 
-    def __init__(self, normaliser: Normaliser, recipe: Recipe) -> None:
-        """Take what the loss depends on besides network and data."""
-        self.normaliser, self.recipe = normaliser, recipe
+    def __init__(self, normaliser: Normaliser, recipe: Recipe, *, whitened: bool = True) -> None:
+        """Take what the loss depends on besides network and data.
+
+        Differences are weighed by the network's whitening, or by plain distance if not `whitened`.
+        """
+        self.normaliser, self.recipe, self.whitened = normaliser, recipe, whitened
 
     def __call__(self, net: Network, frames: Frames, generator: torch.Generator) -> Losses:
         """Return the losses; all randomness comes from `generator`."""
@@ -57,7 +60,7 @@ class Objective:
         S, M = forward(net, x)
         W = visible_centre(W, frames.mask)
         residual = W - visible_centre(S @ M, frames.mask)
-        reprojection = (frobenius(residual) / frobenius(W)).mean()
+        reprojection = self._relative(net, residual, W)
         total = reprojection
         if net.architecture.camera == "free":
             total = total + self.recipe.spectral * spectral_norm(M.swapaxes(-1, -2)).mean()
@@ -79,7 +82,13 @@ class Objective:
             T = T / unit
         again, _ = forward(net, x)
         again = again - again.mean(-2, keepdim=True)
-        return (frobenius(again - T) / frobenius(T)).mean()
+        return self._relative(net, again - T, T)
+
+    def _relative(self, net: Network, error: Tensor, X: Tensor) -> Tensor:
+        """Return the mean of ||error|| / ||X|| over a batch, both whitened."""
+        if self.whitened:
+            error, X = whiten(net, error), whiten(net, X)
+        return (frobenius(error) / frobenius(X)).mean()
 
     def _observe(self, frames: Frames, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Return the network's input, what it should reproject to, and the unit (b, 1, 1).

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.nrsfm.geometry import Array, polar
@@ -42,6 +43,19 @@ class Architecture:
         "camera of the network: its orthonormal factor, or free and held by the loss",
         choices=("orthonormal", "free"),
     )
+    whitening: float = option(
+        0.75,
+        "exponent of the keypoints' whitening: 1 makes the network care as much for the small "
+        "ways in which the points vary as for the large ones, 0 is the paper's network",
+        low=0.0,
+        high=1.0,
+    )
+    whitening_floor: float = option(
+        1e-4,
+        "variance below which a direction counts as noise, relative to the largest",
+        low=1e-8,
+        high=1.0,
+    )
 
     def __post_init__(self) -> None:
         """Refuse a network without a dictionary."""
@@ -59,6 +73,8 @@ class Network:
     b_: tuple[Array, ...]  # b_[0] (p, 3) is the bias of S itself, b_[i] (k_i) that of psi_i
     code_head: Array  # (6 k_n, k_n): psi_n from the entries of Psi_n
     camera_head: Array  # (k_n, 1): M as a linear combination of the blocks of Psi_n
+    L: Array  # (p, p) whitening of the points, fixed before training; see `whitening`
+    L_inverse: Array  # (p, p)
 
     @property
     def p(self) -> int:
@@ -66,10 +82,15 @@ class Network:
         return int(self.D[0].shape[0])
 
     def named(self) -> Iterator[tuple[str, Array]]:
-        """Yield every weight under a stable name, e.g. ("D.1", ...)."""
+        """Yield every array under a stable name, e.g. ("D.1", ...)."""
         for name, group in (("D", self.D), ("b", self.b), ("b_", self.b_)):
             yield from ((f"{name}.{i}", weight) for i, weight in enumerate(group))
-        yield from (("code_head", self.code_head), ("camera_head", self.camera_head))
+        for name in _SINGLE:
+            yield name, getattr(self, name)
+
+    def learned(self) -> Iterator[tuple[str, Array]]:
+        """Yield what training changes: everything but the whitening."""
+        return ((name, weight) for name, weight in self.named() if not name.startswith("L"))
 
     def map(self, function: Callable[[Array], Array]) -> Network:
         """Return the network with `function` applied to every weight, e.g. torch.from_numpy."""
@@ -80,24 +101,28 @@ class Network:
         """Rebuild a network from what `named` yields; raise KeyError for a missing weight."""
         layers = range(len(architecture.widths))
         D, b, b_ = (tuple(weights[f"{k}.{i}"] for i in layers) for k in ("D", "b", "b_"))
-        return cls(architecture, D, b, b_, weights["code_head"], weights["camera_head"])
+        return cls(architecture, D, b, b_, *(weights[name] for name in _SINGLE))
+
+
+_SINGLE = ("code_head", "camera_head", "L", "L_inverse")
 
 
 def weight_shapes(architecture: Architecture, p: int) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every weight of a network for p keypoints."""
+    """Return the shape of every array of a network for p keypoints."""
     k = architecture.widths
     shapes: dict[str, tuple[int, ...]] = {}
     for i, width in enumerate(k):
         shapes[f"D.{i}"] = (k[i - 1], width) if i else (p, 3, width)
         shapes[f"b.{i}"] = (width,)
         shapes[f"b_.{i}"] = (k[i - 1],) if i else (p, 3)
-    return shapes | {"code_head": (6 * k[-1], k[-1]), "camera_head": (k[-1], 1)}
+    shapes |= {"code_head": (6 * k[-1], k[-1]), "camera_head": (k[-1], 1)}
+    return shapes | {"L": (p, p), "L_inverse": (p, p)}
 
 
 def initialise(
     architecture: Architecture, p: int, rng: np.random.Generator, *, glorot_biases: bool = False
 ) -> Network:
-    """Return a float32 network of Glorot-uniform dictionaries and heads.
+    """Return a float32 network of Glorot-uniform dictionaries and heads, not yet whitened.
 
     Thresholds and biases start at zero; `glorot_biases` draws them as the authors' release does,
     which silences 20-40 % of the narrowest layer from the start.
@@ -108,7 +133,29 @@ def initialise(
         fan = sum(shape) if len(shape) < 3 else 3 * shape[0] + shape[2]
         limit = 0.0 if is_bias and not glorot_biases else (6 / fan) ** 0.5
         weights[name] = rng.uniform(-limit, limit, shape).astype(np.float32)
+    weights["L"] = weights["L_inverse"] = np.eye(p, dtype=np.float32)
     return Network.from_named(architecture, weights)
+
+
+def whitening(
+    moment: NDArray[np.float64], exponent: float, floor: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return L and its inverse (p, p) for the second moment E[W W^T] (p, p) of the points.
+
+    W = S M implies L W = (L S) M for any L, so a network may learn the shapes L S instead. With
+    L = moment^(-1/2) no keypoint's motion drowns another's: toes and nose, which tell the front
+    of a body from its back, weigh as much as the limbs. That is what keeps depth from coming out
+    mirrored in the poses whose mirror image looks like another pose. Scaled to keep the RMS.
+    """
+    variance, U = np.linalg.eigh(moment)
+    root = np.maximum(variance, floor * variance[-1]) ** (-exponent / 2)
+    root *= np.sqrt(variance.clip(0).sum() / (root * root * variance.clip(0)).sum())
+    return ((U * root) @ U.T).astype(np.float32), ((U / root) @ U.T).astype(np.float32)
+
+
+def whiten(net: Network, X: Array) -> Array:
+    """Return L X for points X (..., p, d): differences as the network weighs them."""
+    return net.L @ X if net.architecture.whitening else X
 
 
 def forward(net: Network, W: Array) -> tuple[Array, Array]:
@@ -125,6 +172,7 @@ def encode(net: Network, W: Array) -> Array:
     """
     threshold = _THRESHOLDS[net.architecture.threshold]
     p, _, k = net.D[0].shape
+    W = whiten(net, W)
     V = (W.swapaxes(-1, -2) @ net.D[0].reshape(p, 3 * k)).reshape(*W.shape[:-2], 2, 3, k)
     Psi = threshold(V, net.b[0])
     for D, b in zip(net.D[1:], net.b[1:], strict=True):
@@ -156,7 +204,7 @@ def recover(net: Network, Psi: Array) -> tuple[Array, Array]:
     if net.architecture.recovery == "closed_form":
         psi, rows = _leading_factors(Psi)
     else:
-        psi = Psi.reshape(*Psi.shape[:-3], -1) @ net.code_head
+        psi = Psi.reshape(*Psi.shape[:-3], 6 * Psi.shape[-1]) @ net.code_head
         rows = (Psi @ net.camera_head)[..., 0]
     if net.architecture.camera == "orthonormal":
         rows = polar(rows)
@@ -189,7 +237,8 @@ def decode(net: Network, psi: Array) -> Array:
         psi = _relu(psi @ D.swapaxes(-1, -2) - b)
     p, _, k = net.D[0].shape
     s = psi @ net.D[0].reshape(3 * p, k).swapaxes(-1, -2)
-    return s.reshape(*psi.shape[:-1], p, 3) - net.b_[0]
+    S = s.reshape(*psi.shape[:-1], p, 3) - net.b_[0]
+    return net.L_inverse @ S if net.architecture.whitening else S
 
 
 def coherence(net: Network) -> float:

@@ -49,7 +49,7 @@ class Preset(NamedTuple):
 PRESETS: dict[str, Preset] = {
     "default": Preset(Architecture(), Normaliser(), Recipe()),
     "paper": Preset(
-        Architecture(widths=PAPER_WIDTHS),
+        Architecture(widths=PAPER_WIDTHS, whitening=0.0),
         Normaliser(scale="none"),
         Recipe(
             steps=200_000,

@@ -20,10 +20,11 @@ from torch import Tensor
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
+from deep_nrsfm_ros.nrsfm.losses import Frames, Objective, visible_centre
 from deep_nrsfm_ros.nrsfm.metrics import object_frame
 from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.nrsfm.network import coherence, forward, initialise
+from deep_nrsfm_ros.nrsfm.network import coherence, forward, initialise, whitening
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 
 
@@ -57,13 +58,17 @@ class Trainer:
             np.random.default_rng(seed),
             glorot_biases=recipe.glorot_biases,
         )
-        self.net = initial.map(lambda w: torch.from_numpy(w).to(device).requires_grad_())
-        self.optimiser = torch.optim.Adam(
-            [w for _, w in self.net.named()], lr=recipe.learning_rate, fused=True
-        )
+        if architecture.whitening:
+            moment = second_moment(frames, normaliser)
+            exponent, floor = architecture.whitening, architecture.whitening_floor
+            L, L_inverse = whitening(moment, exponent, floor)
+            initial = dataclasses.replace(initial, L=L, L_inverse=L_inverse)
+        self.net = initial.map(lambda w: torch.from_numpy(w).to(device))
+        learned = [w.requires_grad_() for _, w in self.net.learned()]
+        self.optimiser = torch.optim.Adam(learned, lr=recipe.learning_rate, fused=True)
         self.objective = Objective(normaliser, recipe)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
-        self.plain_objective = Objective(normaliser, plain)
+        self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)
         self.probe = self._batch(1024, -1)
 
@@ -105,6 +110,8 @@ class Trainer:
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take over a `state`; raise ValueError if it is not of this architecture."""
+        if not {"step", "seed"} <= tensors.keys():
+            raise ValueError("the checkpoint is none of a training; delete it")
         self.step, self.seed = int(tensors["step"]), int(tensors["seed"])
         with torch.no_grad():
             for name, weight in self.net.named():
@@ -116,6 +123,18 @@ class Trainer:
                 if f"exp_avg.{name}" in tensors:
                     self.optimiser.state[weight] = {k: tensors[f"{k}.{name}"] for k in keys}
         self.probe = self._batch(1024, -1)
+
+
+def second_moment(frames: Frames, normaliser: Normaliser) -> NDArray[np.float64]:
+    """Return E[W W^T] (p, p), each entry over the frames in which both points are visible."""
+    total = seen = torch.zeros(())
+    for start in range(0, len(frames.points), 16384):
+        points, mask = (tensor[start : start + 16384] for tensor in frames)
+        W = normaliser.encode(points, mask).W.double()
+        total = total + (W @ W.swapaxes(-1, -2)).sum(0)
+        seen = seen + (mask @ mask.swapaxes(-1, -2)).double().sum(0)
+    moment = (total / seen.clamp(min=1)).cpu().numpy()
+    return np.asarray(moment, np.float64)
 
 
 def learning_rate(recipe: Recipe, step: int) -> float:
@@ -138,17 +157,14 @@ def train(
     """Train on keypoints (f, p, 2) with visibility (f, p), any unit, x right and y down.
 
     Returns the trainer at its last step, earlier if `should_stop`. With `checkpoint`, goes on
-    from that file if it exists and writes it every `checkpoint_seconds`.
+    from that file if it exists and writes it every `checkpoint_seconds` and when it stops early.
     Raises ValueError for data that cannot be trained on or a checkpoint that does not fit.
     """
     for config in preset:
         check(config)
     recipe = preset.recipe
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    frames = Frames(
-        torch.from_numpy(np.where(visible[..., None], points, 0)).to(device),
-        torch.from_numpy(visible[..., None].astype(np.float32)).to(device),
-    )
+    frames = Frames(*(tensor.to(device) for tensor in _usable(points, visible)))
 
     def trainer_of(seed: int) -> Trainer:
         return Trainer(frames, preset, seed)
@@ -159,6 +175,8 @@ def train(
         trainer.restore(read_checkpoint(checkpoint))
     elif recipe.seeds > 1:
         trainer = _screen(trainer_of, recipe, clock, on_progress, should_stop)
+        if should_stop():  # no checkpoint: going on from here would skip seeds
+            checkpoint = None
     clock.restart(trainer.step)
     saved = time.monotonic()
     while trainer.step < recipe.steps and not should_stop():
@@ -168,8 +186,24 @@ def train(
         if checkpoint is not None and time.monotonic() - saved > checkpoint_seconds:
             write_checkpoint(checkpoint, trainer)
             saved = time.monotonic()
+    if checkpoint is not None and trainer.step < recipe.steps:
+        write_checkpoint(checkpoint, trainer)
     on_progress(clock.progress(trainer))
     return trainer
+
+
+def _usable(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> Frames:
+    """Return the frames that have an extent; raise ValueError if there are none.
+
+    The error of a frame is relative to its extent: a few without one would drown all others.
+    """
+    mask = torch.from_numpy(visible[..., None].astype(np.float32))
+    tensor = torch.from_numpy(np.where(visible[..., None], points, np.float32(0)))
+    extent = visible_centre(tensor, mask).norm(dim=(-2, -1)).numpy()
+    usable = torch.from_numpy(extent > 1e-4 * extent.max(initial=0))
+    if not usable.any():
+        raise ValueError(f"none of the {len(points)} frames shows two keypoints apart")
+    return Frames(tensor[usable], mask[usable])
 
 
 def _screen(

@@ -179,9 +179,10 @@ def read_trials(
     layout: KeypointLayout = CMU31,
     *,
     seed: int = 0,
+    stride: int = 1,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Ensemble:
-    """Project every frame of the trials by one random orthonormal camera, fixed by `seed`.
+    """Project every `stride`-th frame of the trials by one random orthonormal camera, fixed by `seed`.
 
     Points and ground-truth shapes are centred and in metres. Trials of one subject share the
     skeleton beside them. Raises ValueError for a layout that motion capture cannot give.
@@ -194,7 +195,7 @@ def read_trials(
     for done, path in enumerate(paths):
         asf = path.parent / f"{path.parent.name}.asf"
         skeleton = skeletons.setdefault(asf, skeletons.get(asf) or read_asf(asf))
-        S = centre(KEYPOINTS_OF[layout.name](read_amc(path, skeleton)))
+        S = centre(KEYPOINTS_OF[layout.name](read_amc(path, skeleton))[::stride])
         W = S @ random_cameras(len(S), rng)
         source = f"CMU motion capture, subject {path.parent.name}"
         parts.append(Ensemble(W, np.ones(W.shape[:2], bool), layout, source, S))
