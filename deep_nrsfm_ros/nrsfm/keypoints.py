@@ -111,6 +111,7 @@ class KeypointMap:
         for t, parts in self._derived:
             mapped[:, t] = points[:, parts].mean(1)
             sure[:, t] = confidence[:, parts].min(1)
+        mapped[sure == 0] = 0
         return mapped, sure
 
 
