@@ -12,6 +12,7 @@ from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.nrsfm.geometry import (
     back_project,
     centre,
+    polar,
     reprojection_error,
     rotation_from_camera,
     weak_perspective,
@@ -49,7 +50,10 @@ class LiftingOptions:
 
 
 class Lifted(NamedTuple):
-    """n lifted objects; those with too few visible points are NaN with confidence 0."""
+    """n lifted objects; NaN with confidence 0 where there is nothing to lift.
+
+    That is: too few visible points, or points on one line, which say nothing about the camera.
+    """
 
     shapes: Float32  # (n, p, 3) camera axes (x right, y down, z forward), centred, output units
     rotations: Float32  # (n, 3, 3) object to camera: p_camera = R p_object, det +1
@@ -91,8 +95,9 @@ class Lifter:
         S = S @ R.swapaxes(1, 2)
         scale, translation = weak_perspective(points, S[..., :2], visible)
         lifted = Lifted(S, R, scale, translation, residual, self._sure(confidence, residual))
-        enough = visible.sum(1) >= self.options.min_visible
-        return lifted if enough.all() else _blank(lifted, ~enough)
+        lost = np.abs(M.swapaxes(1, 2) @ M - np.eye(2, dtype=M.dtype)).max((1, 2)) > 0.01
+        lost |= visible.sum(1) < self.options.min_visible
+        return _blank(lifted, lost) if lost.any() else lifted
 
     def _reconstruct(
         self, points: Float32, visible: NDArray[np.bool_]
@@ -101,7 +106,7 @@ class Lifter:
         mask = visible[..., None].astype(np.float32)
         encode = self.model.normaliser.encode
         seen = encode(points, mask)
-        S, M = forward(self.model.network, seen.W * seen.gain)
+        S, M = self._forward(seen.W * seen.gain)
         if visible.all():
             return S, M, seen.W
         for _ in range(self.options.refill):
@@ -109,8 +114,16 @@ class Lifter:
             scale, shift = weak_perspective(points, P, visible)
             filled = np.where(mask > 0, points, scale[:, None, None] * P + shift[:, None])
             seen = encode(filled, np.ones_like(mask))
-            S, M = forward(self.model.network, seen.W)
+            S, M = self._forward(seen.W)
         return S, M, np.where(mask > 0, seen.W, S @ M)
+
+    def _forward(self, W: Float32) -> tuple[Float32, Float32]:
+        """Return the network's S and an orthonormal M; S takes over the size of a free camera."""
+        S, M = forward(self.model.network, W)
+        if self.model.network.architecture.camera == "free":
+            S = S * ((M * M).sum((1, 2), keepdims=True) / 2) ** 0.5
+            M = polar(M.swapaxes(1, 2)).swapaxes(1, 2)
+        return S, M
 
     def _reference_size(self, S: Float32) -> Float32:
         """Return the size (n, 1, 1) of each shape that the reference length stands for."""

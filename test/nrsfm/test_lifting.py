@@ -1,0 +1,231 @@
+"""Lifting: what goes in comes out by scale and translation, and nothing else matters."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
+from deep_nrsfm_ros.nrsfm.metrics import shape_errors
+from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.training import Trainer, finish
+
+N = 12
+EVERY_MODEL = [
+    (Architecture((12, 6), *options), scale)
+    for *options, scale in itertools.product(
+        ("relu", "block"), ("learned", "closed_form"), ("orthonormal", "free"), ("rms", "none")
+    )
+]
+every_model = pytest.mark.parametrize(("architecture", "scale"), EVERY_MODEL, ids=str)
+
+
+def random_model(
+    architecture: Architecture | None = None,
+    scale: str = "rms",
+    layout: KeypointLayout = HUMAN17,
+    mirrored: bool = False,
+) -> Model:
+    architecture = architecture or Architecture((12, 6))
+    network = initialise(architecture, len(layout), np.random.default_rng(0))
+    frame = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
+    frame *= np.linalg.det(frame) * (-1 if mirrored else 1)
+    return Model("random", network, layout, Normaliser(scale), frame.astype(np.float32))
+
+
+def pixels(n: int = N, p: int = 17, missing: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return keypoints in pixels and their confidence; at least 5 are visible."""
+    rng = np.random.default_rng(2)
+    points = rng.uniform(100, 600, (n, p, 2)).astype(np.float32)
+    confidence = rng.uniform(0.3, 1, (n, p)).astype(np.float32)
+    hidden = rng.random((n, p)) < missing
+    hidden[:, :5] = False
+    points[hidden] = confidence[hidden] = 0
+    return points, confidence
+
+
+def reprojected(lifted: Lifted) -> np.ndarray:
+    return lifted.scale[:, None, None] * lifted.shapes[..., :2] + lifted.translation[:, None]
+
+
+@pytest.fixture(scope="module")
+def figure_model(trained: Trainer, figure: Any) -> Model:
+    return finish(trained, "figure", figure.layout, "test")
+
+
+@every_model
+@pytest.mark.parametrize("missing", [0.0, 0.4])
+def test_the_visible_points_are_reproduced(
+    architecture: Architecture, scale: str, missing: float
+) -> None:
+    points, confidence = pixels(missing=missing)
+    if scale == "none":
+        points /= 500  # the unit of the data is the network's
+    lifted = Lifter(random_model(architecture, scale))(points, confidence)
+    seen = confidence > 0
+    size = np.ptp(points[seen])
+    np.testing.assert_allclose(reprojected(lifted)[seen] / size, points[seen] / size, atol=2e-4)
+    assert (lifted.scale > 0).all()
+
+
+@every_model
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_rotations_are_proper_and_shapes_stand_in_camera_axes(
+    architecture: Architecture, scale: str, mirrored: bool
+) -> None:
+    points, confidence = pixels(missing=0.3)
+    lifted = Lifter(random_model(architecture, scale, mirrored=mirrored))(points / 500, confidence)
+    R = lifted.rotations
+    np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.tile(np.eye(3), (N, 1, 1)), atol=1e-3)
+    np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-3)
+    np.testing.assert_allclose(lifted.shapes.mean(1), 0, atol=1e-4)
+
+
+def test_types_and_shapes() -> None:
+    lifted = Lifter(random_model())(*pixels())
+    expected = Lifted((N, 17, 3), (N, 3, 3), (N,), (N, 2), (N,), (N, 17))  # type: ignore[arg-type]
+    assert tuple(array.shape for array in lifted) == tuple(expected)
+    assert all(array.dtype == np.float32 for array in lifted)
+    assert all(len(array) == 0 for array in Lifter(random_model())(*pixels(0)))
+
+
+def test_shares_of_back_projection() -> None:
+    points, confidence = pixels()
+    residuals = []
+    for share in (0.0, 0.5, 1.0):
+        lifted = Lifter(random_model(), LiftingOptions(back_projection=share))(points, confidence)
+        residuals.append(np.linalg.norm(reprojected(lifted) - points))
+    assert residuals[0] > 1.2 * residuals[1] > 100 * residuals[2]
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3])
+def test_place_and_size_in_the_image_do_not_change_the_shape(
+    figure_model: Model, figure: Any, missing: float
+) -> None:
+    points = figure.points[:N]
+    confidence = (np.random.default_rng(0).random((N, 12)) >= missing).astype(np.float32)
+    confidence[:, :5] = 1
+    lift = Lifter(figure_model)
+    here, there = lift(points, confidence), lift(200 * points + np.float32([800, 300]), confidence)
+    np.testing.assert_allclose(there.shapes, here.shapes, atol=2e-3)
+    np.testing.assert_allclose(there.rotations, here.rotations, atol=2e-3)
+    np.testing.assert_allclose(there.residual, here.residual, atol=1e-3)
+    np.testing.assert_allclose(there.scale, 200 * here.scale, rtol=2e-3)
+    moved = 200 * here.translation + [800, 300]
+    np.testing.assert_allclose(there.translation, moved, atol=0.5)
+
+
+def test_what_a_missing_point_holds_does_not_matter() -> None:
+    points, confidence = pixels(missing=0.4)
+    garbage = np.where(confidence[..., None] > 0, points, np.float32(-5000))
+    lift = Lifter(random_model())
+    for a, b in zip(lift(points, confidence), lift(garbage, confidence), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_refilling_brings_the_missing_points_closer(figure_model: Model, figure: Any) -> None:
+    points, shapes = figure.points[:500], figure.shapes[:500]
+    confidence = np.ones((500, 12), np.float32)
+    confidence[np.arange(500), np.arange(500) % 12] = 0
+    errors = [
+        shape_errors(Lifter(figure_model, LiftingOptions(refill=n))(points, confidence)[0], shapes)
+        for n in (0, 1, 5)
+    ]
+    assert errors[0].proper > errors[1].proper > errors[2].proper
+    assert errors[2].proper < 0.8 * errors[0].proper
+
+
+@pytest.mark.parametrize("min_visible", [3, 4, 7])
+def test_too_few_visible_points_are_not_lifted_and_disturb_nobody(min_visible: int) -> None:
+    points, confidence = pixels(missing=0.3)
+    for i, visible in enumerate((0, 1, min_visible - 1, min_visible)):
+        confidence[i] = np.arange(17) < visible
+        points[i, visible:] = 0
+    lift = Lifter(random_model(), LiftingOptions(min_visible=min_visible))
+    lifted = lift(points, confidence)
+    enough = (confidence > 0).sum(1) >= min_visible
+    assert not enough[:3].any() and enough[3:].any()
+    for array in lifted[:-1]:
+        assert np.isnan(array[~enough]).all() and np.isfinite(array[enough]).all()
+    assert (lifted.confidence[~enough] == 0).all() and (lifted.confidence[enough] > 0).any()
+    for array, alone in zip(lifted, lift(points[enough], confidence[enough]), strict=True):
+        np.testing.assert_allclose(array[enough], alone, rtol=1e-4, atol=1e-4)
+
+
+@every_model
+@pytest.mark.parametrize("kind", ["one place", "one line"])
+def test_points_that_say_nothing_of_the_camera_are_not_lifted(
+    architecture: Architecture, scale: str, kind: str
+) -> None:
+    points, confidence = pixels()
+    along = points[0, :, :1] if kind == "one line" else 0
+    points[0] = np.float32([300, 200]) + along * np.float32([1, 0.5])
+    lift = Lifter(random_model(architecture, scale))
+    lifted = lift(points / 500, confidence)
+    assert all(np.isnan(array[0]).all() for array in lifted[:-1])
+    assert (lifted.confidence[0] == 0).all()
+    assert all(np.isfinite(array[1:]).all() for array in lifted)
+
+
+def test_a_batch_is_its_objects_one_by_one() -> None:
+    points, confidence = pixels(missing=0.3)
+    confidence[1], confidence[2] = 1, 0
+    lift = Lifter(random_model())
+    together = lift(points, confidence)
+    for i in range(N):
+        alone = lift(points[i : i + 1], confidence[i : i + 1])
+        for a, b in zip(together, alone, strict=True):
+            np.testing.assert_allclose(a[i], b[0], rtol=2e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("length", [1.0, 0.5, 480.0])
+def test_reference_length(length: float) -> None:
+    options = LiftingOptions(reference_length=length)
+    shapes = Lifter(random_model(), options)(*pixels()).shapes
+    neck, hip = HUMAN17.index("neck"), HUMAN17.index("mid_hip")
+    found = np.linalg.norm(shapes[:, neck] - shapes[:, hip], axis=1)
+    np.testing.assert_allclose(found, length, rtol=1e-4)
+    nameless = random_model(layout=KeypointLayout.numbered(17))
+    shapes = Lifter(nameless, options)(*pixels()).shapes
+    np.testing.assert_allclose((shapes**2).sum(2).mean(1) ** 0.5, length, rtol=1e-4)
+
+
+def test_confidence_is_the_detectors_less_what_the_residual_takes(
+    figure_model: Model, figure: Any
+) -> None:
+    points = figure.points[:3].copy()
+    points[1] += 0.5 * np.random.default_rng(0).standard_normal(points[1].shape)
+    points[2] = points[0]
+    confidence = np.full((3, 12), 0.8, np.float32)
+    confidence[2, :2] = [0.4, 0]
+    lifted = Lifter(figure_model)(points, confidence)
+    assert lifted.residual[0] < 0.1 < lifted.residual[1]
+    for i in range(2):
+        np.testing.assert_allclose(lifted.confidence[i], 0.8 * (1 - lifted.residual[i]), rtol=1e-5)
+    trust = lifted.confidence[2]
+    assert trust[2] == pytest.approx(2 * trust[0]) and 0 < trust[1] < trust[2]
+    assert ((lifted.confidence >= 0) & (lifted.confidence <= 1)).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "confidence"), [((2, 16, 2), (2, 16)), ((2, 17, 3), (2, 17)), ((2, 17, 2), (1, 17))]
+)
+def test_arrays_that_do_not_fit_the_model_are_refused(
+    points: tuple[int, ...], confidence: tuple[int, ...]
+) -> None:
+    with pytest.raises(ValueError, match=r"'random' needs \(n, 17, 2\)") as caught:
+        Lifter(random_model())(np.ones(points, np.float32), np.ones(confidence, np.float32))
+    assert str(points) in str(caught.value)
+
+
+def test_lifting_does_not_import_torch() -> None:
+    code = "import sys, deep_nrsfm_ros.nrsfm.lifting; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
