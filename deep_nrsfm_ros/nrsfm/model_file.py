@@ -79,13 +79,13 @@ def load_model(path: Path) -> Model:
             weights = {name: file.get_tensor(name) for name in file.keys()}
     except OSError as error:
         raise ModelFileError(f"cannot read model {path}: {error.strerror or error}") from error
-    except SafetensorError as error:
+    except (SafetensorError, AttributeError, TypeError) as error:  # the last two: no NumPy type
         raise ModelFileError(f"{path} is damaged or no safetensors file: {error}") from error
     if metadata.get("format") != _FORMAT:
         raise ModelFileError(f"{path} is not a {_FORMAT!r} file; train or download one")
     try:
         return _build(json.loads(metadata["model"]), weights)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise ModelFileError(f"{path} has a damaged header or weights: {error}") from error
 
 
@@ -97,9 +97,11 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     check(normaliser)
     layout = KeypointLayout(**_tuples(header["layout"]))
     for name, shape in weight_shapes(architecture, len(layout)).items():
-        found = weights[name].shape
-        if found != shape or not np.isfinite(weights[name]).all():
-            raise ValueError(f"weight {name} is {found}, needs {shape} and finite values")
+        found = weights[name]
+        if found.shape != shape or found.dtype != np.float32 or not np.isfinite(found).all():
+            raise ValueError(
+                f"weight {name} is {found.dtype} {found.shape}; it must be float32 {shape}, finite"
+            )
     frame = np.array(header["object_frame"], np.float32)
     if frame.shape != (3, 3) or not np.abs(frame @ frame.T - np.eye(3)).max() < 1e-3:
         raise ValueError("object_frame is not orthonormal (3, 3)")
