@@ -6,7 +6,7 @@ the angles L of its degrees of freedom, so its world rotation is R_parent C L C^
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,10 +65,19 @@ def read_asf(path: Path) -> Skeleton:
 
     Raises ValueError naming the file when it is not an ASF skeleton.
     """
+    lines = path.read_text(errors="replace").splitlines()
+    try:
+        return _bones(line.split() for line in lines)
+    except (IndexError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is no ASF skeleton: {error}") from error
+
+
+def _bones(lines: Iterable[list[str]]) -> Skeleton:
+    """Return the bones of an ASF, given as the words of its lines."""
     fields: dict[str, dict[str, list[str]]] = {}
     parents: dict[str, str] = {}
     block: dict[str, list[str]] = {}
-    for words in (line.split() for line in path.read_text(errors="replace").splitlines()):
+    for words in lines:
         if not words:
             continue
         if words[0] == "begin":
@@ -80,13 +89,13 @@ def read_asf(path: Path) -> Skeleton:
         elif words[0] in fields or words[0] == "root":
             parents |= dict.fromkeys(words[1:], words[0])
     if not fields or not set(fields) <= set(parents):
-        raise ValueError(f"{path} is no ASF skeleton: it lacks bones or their hierarchy")
+        raise ValueError("it lacks bones or their hierarchy")
     return tuple(
         Bone(
             name,
             parents[name],
-            METRES * float(bone["length"][0]) * np.array(bone["direction"], float),
-            _euler(np.array(bone["axis"][:3], float), "xyz"),
+            METRES * float(bone["length"][0]) * np.array(bone["direction"], float).reshape(3),
+            _euler(np.array(bone["axis"][:3], float).reshape(3), "xyz"),
             tuple(bone.get("dof", [])),
         )
         for name, bone in fields.items()
@@ -103,17 +112,23 @@ def read_amc(path: Path, skeleton: Skeleton) -> Motion:
         name, *values = line.split() or [""]
         if values:
             columns.setdefault(name, []).append(values)
-    frames = len(columns.get("root", ()))
-    rows = {name: np.array(v, float) for name, v in columns.items() if len(v) == frames}
-    if not frames or any(b.dof and b.name not in rows for b in skeleton):
-        raise ValueError(f"{path} is no AMC motion of this skeleton: frames or bones are missing")
-    root = rows["root"]
+    try:
+        return _pose(skeleton, columns)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path} is no AMC motion of this skeleton: {error}") from error
+
+
+def _pose(skeleton: Skeleton, columns: dict[str, list[list[str]]]) -> Motion:
+    """Return the motion of a skeleton whose bones have the angles `columns`, a row a frame."""
+    frames = len(columns["root"])
+    root = np.array(columns["root"], float).reshape(frames, 6)
     position = {"root": METRES * root[:, :3]}
     turn = {"root": _euler(root[:, 3:], "xyz")}
     for bone in skeleton:
         turn[bone.name] = turn[bone.parent]
         if bone.dof:
-            local = _euler(rows[bone.name], "".join(d[1] for d in bone.dof))
+            angles = np.array(columns[bone.name], float).reshape(frames, len(bone.dof))
+            local = _euler(angles, "".join(d[1] for d in bone.dof))
             turn[bone.name] = turn[bone.parent] @ bone.axis @ local @ bone.axis.T
         position[bone.name] = position[bone.parent] + turn[bone.name] @ bone.offset
     joints = np.stack([position[name] for name in CMU31.keypoints], 1)
@@ -182,7 +197,7 @@ def read_trials(
     stride: int = 1,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Ensemble:
-    """Project every `stride`-th frame of the trials by one random orthonormal camera, fixed by `seed`.
+    """Project each `stride`-th frame by a random orthonormal camera of its own, fixed by `seed`.
 
     Points and ground-truth shapes are centred and in metres. Trials of one subject share the
     skeleton beside them. Raises ValueError for a layout that motion capture cannot give.
