@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -213,8 +215,8 @@ def half_turns(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.parametrize("make", [random_rotations, half_turns])
-def test_quaternion(make: object) -> None:
-    for R in make(200, np.random.default_rng(0)):  # type: ignore[operator]
+def test_quaternion(make: Callable[[int, np.random.Generator], np.ndarray]) -> None:
+    for R in make(200, np.random.default_rng(0)):
         q = quaternion(R)
         assert np.linalg.norm(q) == pytest.approx(1) and q[3] >= 0
         np.testing.assert_allclose(matrix(q), R, atol=1e-9)

@@ -22,6 +22,7 @@ from deep_nrsfm_ros.nrsfm.network import (
     initialise,
     recover,
     weight_shapes,
+    whitening,
 )
 
 I3 = np.eye(3)
@@ -35,12 +36,16 @@ some = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 widths = st.lists(st.integers(1, 6), min_size=1, max_size=4).map(tuple)
 points = st.integers(3, 7)
+whitened = st.sampled_from([0.0, 0.5, 1.0])
 
 
 def random_network(architecture: Architecture, p: int, seed: int = 0) -> Network:
-    """Return a float64 network of which every weight, biases included, is random."""
-    net = initialise(architecture, p, np.random.default_rng(seed), glorot_biases=True)
-    return net.map(lambda w: w.astype(float))
+    """Return a float64 network of which every array, biases and whitening included, is random."""
+    rng = np.random.default_rng(seed)
+    net = initialise(architecture, p, rng, glorot_biases=True).map(lambda w: w.astype(float))
+    Q, _ = np.linalg.qr(rng.standard_normal((p, p)))
+    variance = rng.uniform(0.2, 2, p)
+    return dataclasses.replace(net, L=(Q * variance) @ Q.T, L_inverse=(Q / variance) @ Q.T)
 
 
 def replace_camera(net: Network, camera: str) -> Network:
@@ -95,20 +100,20 @@ def block_threshold(V: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def truncated(net: Network, layers: int) -> Network:
     """Return the network of the first `layers` dictionaries, for its encoder."""
-    architecture = Architecture(net.architecture.widths[:layers], net.architecture.threshold)
-    parts = (net.D[:layers], net.b[:layers], net.b_[:layers])
-    return Network(architecture, *parts, net.code_head, net.camera_head)
+    architecture = dataclasses.replace(net.architecture, widths=net.architecture.widths[:layers])
+    parts = {"D": net.D[:layers], "b": net.b[:layers], "b_": net.b_[:layers]}
+    return dataclasses.replace(net, architecture=architecture, **parts)
 
 
 @some
-@given(widths, points, seeds, st.sampled_from(["relu", "block"]))
+@given(widths, points, seeds, st.sampled_from(["relu", "block"]), whitened)
 def test_every_encoder_layer_is_the_papers(
-    widths: tuple[int, ...], p: int, seed: int, threshold: str
+    widths: tuple[int, ...], p: int, seed: int, threshold: str, whitening: float
 ) -> None:
-    net = random_network(Architecture(widths, threshold), p, seed)
+    net = random_network(Architecture(widths, threshold, whitening=whitening), p, seed)
     W = np.random.default_rng(seed + 1).standard_normal((p, 2))
     h = {"relu": relu_threshold, "block": block_threshold}[threshold]
-    Psi = h(wide(net).T @ W, net.b[0])
+    Psi = h(wide(net).T @ (net.L @ W if whitening else W), net.b[0])
     for layers in range(1, len(widths) + 1):
         if layers > 1:
             if np.linalg.norm(Psi) < 1e-6:
@@ -118,21 +123,24 @@ def test_every_encoder_layer_is_the_papers(
 
 
 @some
-@given(widths, points, seeds)
-def test_every_decoder_layer_is_the_papers(widths: tuple[int, ...], p: int, seed: int) -> None:
-    net = random_network(Architecture(widths), p, seed)
+@given(widths, points, seeds, whitened)
+def test_every_decoder_layer_is_the_papers(
+    widths: tuple[int, ...], p: int, seed: int, whitening: float
+) -> None:
+    net = random_network(Architecture(widths, whitening=whitening), p, seed)
     psi = np.random.default_rng(seed + 1).uniform(-1, 1, widths[-1])
     expected = psi
     for i in range(len(widths) - 1, 0, -1):
         expected = np.maximum(net.D[i] @ expected - net.b_[i], 0)
     s = tall(net) @ expected - net.b_[0].ravel()
-    np.testing.assert_allclose(decode(net, psi).ravel(), s, atol=1e-9)
+    S = np.linalg.inv(net.L) @ s.reshape(p, 3) if whitening else s.reshape(p, 3)
+    np.testing.assert_allclose(decode(net, psi), S, atol=1e-9)
 
 
 @some
 @given(st.integers(1, 6), points, seeds)
 def test_both_forms_of_the_first_dictionary_are_one(k: int, p: int, seed: int) -> None:
-    net = random_network(Architecture((k,)), p, seed)
+    net = random_network(Architecture((k,), whitening=0.0), p, seed)
     psi = np.random.default_rng(seed + 1).standard_normal(k)
     S = wide(net) @ np.kron(psi[:, None], I3)
     np.testing.assert_allclose(decode(net, psi) + net.b_[0], S, atol=1e-9)
@@ -262,6 +270,9 @@ def test_initialise_makes_every_weight(
     assert {name: w.shape for name, w in weights.items()} == weight_shapes(architecture, p)
     for name, weight in weights.items():
         assert weight.dtype == np.float32
+        if name.startswith("L"):  # not whitened yet
+            np.testing.assert_array_equal(weight, np.eye(p))
+            continue
         assert np.any(weight) != (name.startswith("b") and not glorot_biases)
     again = initialise(architecture, p, np.random.default_rng(0), glorot_biases=glorot_biases)
     assert all(np.array_equal(w, weights[name]) for name, w in again.named())
@@ -288,3 +299,49 @@ def test_a_network_survives_its_names() -> None:
 def test_a_network_has_a_dictionary() -> None:
     with pytest.raises(ValueError, match="widths is empty"):
         Architecture(widths=())
+
+
+def moment_of(seed: int, p: int) -> np.ndarray:
+    A = np.random.default_rng(seed).standard_normal((p, 3 * p))
+    return A @ A.T * np.outer(*[np.geomspace(1, 10, p)] * 2)
+
+
+@some
+@given(seeds, points)
+def test_whitening_makes_all_directions_vary_alike(seed: int, p: int) -> None:
+    moment = moment_of(seed, p)
+    L, L_inverse = (array.astype(float) for array in whitening(moment, 1.0, 1e-8))
+    np.testing.assert_allclose(L @ L_inverse, np.eye(p), atol=1e-3)
+    size = np.trace(moment)
+    np.testing.assert_allclose(L @ moment @ L.T / size, np.eye(p) / p, atol=1e-3)
+
+
+@some
+@given(seeds, points, st.floats(0, 1), st.floats(1e-6, 1))
+def test_whitening_keeps_the_size_and_goes_part_of_the_way(
+    seed: int, p: int, exponent: float, floor: float
+) -> None:
+    moment = moment_of(seed, p)
+    L, L_inverse = whitening(moment, exponent, floor)
+    np.testing.assert_allclose(L @ L_inverse, np.eye(p), atol=1e-2)
+    assert np.trace(L @ moment @ L.T) == pytest.approx(np.trace(moment), rel=1e-4)
+    largest, smallest = np.linalg.eigvalsh(moment)[[-1, 0]]
+    ratio = largest / max(smallest, floor * largest)
+    assert np.linalg.cond(L) == pytest.approx(ratio ** (exponent / 2), rel=1e-3)
+
+
+def test_no_whitening_is_none() -> None:
+    np.testing.assert_allclose(whitening(moment_of(0, 5), 0.0, 1e-4)[0], np.eye(5), atol=1e-6)
+
+
+def test_whitening_of_centred_points_is_finite() -> None:
+    W = np.random.default_rng(0).standard_normal((100, 6, 2))
+    W -= W.mean(1, keepdims=True)
+    L, L_inverse = whitening(np.einsum("fic,fjc->ij", W, W) / 100, 1.0, 1e-4)
+    assert np.isfinite(L).all() and np.isfinite(L_inverse).all()
+    np.testing.assert_allclose(L @ L_inverse, np.eye(6), atol=1e-3)
+
+
+def test_training_learns_everything_but_the_whitening() -> None:
+    net = random_network(Architecture((4, 3)), 5)
+    assert {n for n, _ in net.named()} - {n for n, _ in net.learned()} == {"L", "L_inverse"}

@@ -1,0 +1,190 @@
+"""The training loss against explicit loops over frames and visible points."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective
+from deep_nrsfm_ros.nrsfm.network import Architecture, Network, forward, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.recipe import Recipe
+
+P, BATCH = 8, 6
+PLAIN = Recipe(cycle=0.0)
+both_scales = pytest.mark.parametrize("scale", ["rms", "none"])
+
+
+def network(camera: str = "orthonormal", whitening: float = 0.0) -> Network:
+    rng = np.random.default_rng(0)
+    architecture = Architecture((12, 9), camera=camera, whitening=whitening)
+    net = initialise(architecture, P, rng, glorot_biases=True).map(lambda w: w.astype(float))
+    L = np.eye(P) + 0.3 * rng.standard_normal((P, P))
+    return dataclasses.replace(net, L=L, L_inverse=np.linalg.inv(L))
+
+
+def batch(incomplete: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (b, p, 2) away from the origin and visibility (b, p)."""
+    rng = np.random.default_rng(1)
+    visible = rng.random((BATCH, P)) < (0.6 if incomplete else 1)
+    visible[:, :3] = True
+    points = np.where(visible[..., None], rng.standard_normal((BATCH, P, 2)) + [30, -20], 0)
+    return points, visible
+
+
+def losses(
+    net: Network,
+    data: tuple[np.ndarray, np.ndarray],
+    recipe: Recipe,
+    scale: str = "rms",
+    *,
+    whitened: bool = True,
+) -> Losses:
+    """Return the losses in float32, as training computes them."""
+    points, visible = (torch.from_numpy(array.astype(np.float32)) for array in data)
+    tensors = net.map(lambda w: torch.from_numpy(w.astype(np.float32)))
+    frames = Frames(points, visible[..., None])
+    objective = Objective(Normaliser(scale), recipe, whitened=whitened)
+    return objective(tensors, frames, torch.Generator().manual_seed(5))
+
+
+def only(net: Network, seen: np.ndarray) -> Network:
+    """Return the network of an object that has just the points `seen`."""
+    D, b_ = (net.D[0][seen], *net.D[1:]), (net.b_[0][seen], *net.b_[1:])
+    return dataclasses.replace(net, D=D, b_=b_)
+
+
+def normalised(points: np.ndarray, scale: str) -> np.ndarray:
+    W = points - points.mean(0)
+    return W / (2 * (W**2).sum(1).mean() ** 0.5) if scale == "rms" else W
+
+
+@both_scales
+@pytest.mark.parametrize("incomplete", [False, True])
+def test_reprojection_loss_is_that_of_the_visible_points_alone(
+    scale: str, incomplete: bool
+) -> None:
+    net, (points, visible) = network(), batch(incomplete)
+    expected = []
+    for frame, seen in zip(points, visible, strict=True):
+        W = normalised(frame[seen], scale)
+        S, M = forward(only(net, seen), W * P / seen.sum())
+        error = W - (S @ M - (S @ M).mean(0))
+        expected.append(np.linalg.norm(error) / np.linalg.norm(W))
+    found = losses(net, (points, visible), PLAIN, scale)
+    assert found.reprojection.item() == pytest.approx(np.mean(expected), rel=1e-4)
+    assert found.total.item() == found.reprojection.item() and found.cycle.item() == 0
+    assert np.mean(expected) > 0.1
+
+
+@both_scales
+def test_a_whitened_net_weighs_differences_by_its_whitening(scale: str) -> None:
+    net, (points, visible) = network(whitening=1.0), batch(incomplete=True)
+    whitened, plain = [], []
+    for frame, seen in zip(points, visible, strict=True):
+        W = np.zeros((P, 2))
+        W[seen] = normalised(frame[seen], scale)
+        S, M = forward(net, W * P / seen.sum())
+        error = np.zeros((P, 2))
+        error[seen] = W[seen] - ((S @ M)[seen] - (S @ M)[seen].mean(0))
+        whitened.append(np.linalg.norm(net.L @ error) / np.linalg.norm(net.L @ W))
+        plain.append(np.linalg.norm(error) / np.linalg.norm(W))
+    found = losses(net, (points, visible), PLAIN, scale).reprojection.item()
+    assert found == pytest.approx(np.mean(whitened), rel=1e-4)
+    found = losses(net, (points, visible), PLAIN, scale, whitened=False).reprojection.item()
+    assert found == pytest.approx(np.mean(plain), rel=1e-4)
+    assert abs(np.mean(plain) - np.mean(whitened)) > 1e-3
+
+
+def test_what_a_missing_point_holds_does_not_matter() -> None:
+    points, visible = batch(incomplete=True)
+    filled = np.where(visible[..., None], points, 123.0)
+    a, b = (losses(network(), (x, visible), Recipe(noise=0.1)) for x in (points, filled))
+    # The random numbers are the same, so noise, cameras and losses must be.
+    np.testing.assert_allclose([x.item() for x in a], [x.item() for x in b], rtol=1e-5)
+
+
+@both_scales
+def test_cycle_loss_sees_the_back_projected_shape_by_another_camera(scale: str) -> None:
+    net, (points, visible) = network(), batch(incomplete=False)
+    draws = torch.randn(BATCH, 2, 3, generator=torch.Generator().manual_seed(5))
+    expected = []
+    for frame, draw in zip(points, draws.numpy().astype(float), strict=True):
+        W = normalised(frame, scale)
+        S, M = forward(net, W)
+        T = S + (W - (S @ M - (S @ M).mean(0))) @ M.T
+        T -= T.mean(0)
+        U, _, Vt = np.linalg.svd(draw, full_matrices=False)
+        seen = T @ (U @ Vt).T
+        again, _ = forward(net, normalised(seen, scale))
+        T *= np.linalg.norm(normalised(seen, scale)) / np.linalg.norm(seen)
+        expected.append(np.linalg.norm(again - again.mean(0) - T) / np.linalg.norm(T))
+    found = losses(net, (points, visible), Recipe(cycle=0.7), scale)
+    assert found.cycle.item() == pytest.approx(np.mean(expected), rel=1e-4)
+    assert found.total.item() == pytest.approx((found.reprojection + 0.7 * found.cycle).item())
+    assert found.cycle.item() > 0.1
+
+
+def test_a_free_camera_is_held_by_its_spectral_norm() -> None:
+    net, (points, visible) = network("free"), batch(incomplete=False)
+    cameras = [forward(net, normalised(frame, "rms"))[1] for frame in points]
+    held = np.mean([np.linalg.norm(M, 2) for M in cameras])
+    found = losses(net, (points, visible), dataclasses.replace(PLAIN, spectral=3.0))
+    assert (found.total - found.reprojection).item() == pytest.approx(3 * held, rel=1e-4)
+    assert held > 0.01
+    orthonormal = losses(network(), (points, visible), dataclasses.replace(PLAIN, spectral=3.0))
+    assert orthonormal.total.item() == orthonormal.reprojection.item()
+
+
+@pytest.mark.parametrize("recovery", ["learned", "closed_form"])
+@pytest.mark.parametrize("threshold", ["relu", "block"])
+def test_the_gradient_reaches_every_weight(threshold: str, recovery: str) -> None:
+    architecture = Architecture((12, 9), threshold, recovery)
+    net = initialise(architecture, P, np.random.default_rng(0)).map(
+        lambda w: torch.from_numpy(w).requires_grad_()
+    )
+    points, visible = batch(incomplete=True)
+    frames = Frames(
+        torch.from_numpy(points.astype(np.float32)),
+        torch.from_numpy(visible[..., None].astype(np.float32)),
+    )
+    recipe = Recipe(noise=0.1, mask=0.3)
+    Objective(Normaliser(), recipe)(net, frames, torch.Generator()).total.backward()
+    heads = {"code_head", "camera_head"} if recovery == "closed_form" else set()
+    for name, weight in net.learned():
+        if name in heads:
+            assert weight.grad is None
+        else:
+            assert torch.isfinite(weight.grad).all() and weight.grad.any(), name
+
+
+def test_noise_and_hidden_points_spoil_the_input_not_the_target(trained: Any, figure: Any) -> None:
+    net, f = trained.net.map(torch.Tensor.detach), 500
+    points = torch.from_numpy(figure.points[:f])
+    frames = Frames(points, torch.ones(f, points.shape[1], 1))
+
+    def reprojection(**augmentation: float) -> float:
+        recipe = Recipe(cycle=0.0, **augmentation)
+        return Objective(Normaliser(), recipe)(net, frames, torch.Generator()).reprojection.item()
+
+    clean = reprojection()
+    assert clean < 0.1
+    assert clean < reprojection(noise=0.2) < reprojection(noise=0.8)
+    assert clean < reprojection(mask=0.2) < reprojection(mask=0.8)
+
+
+@pytest.mark.parametrize("visible", [0, 1])
+def test_a_frame_with_nothing_to_see_gives_no_gradient(visible: int) -> None:
+    net = network().map(lambda w: torch.from_numpy(w).requires_grad_())
+    mask = torch.zeros(1, P, 1, dtype=torch.float64)
+    mask[:, :visible] = 1
+    frames = Frames(torch.ones(1, P, 2, dtype=torch.float64) * 30 * mask, mask)
+    losses = Objective(Normaliser(), PLAIN)(net, frames, torch.Generator())
+    losses.total.backward()
+    assert torch.isfinite(losses.total)
+    for _, weight in net.learned():
+        assert weight.grad is None or not weight.grad.any()

@@ -1,0 +1,161 @@
+"""Errors of known perturbations, what must not change them, and which way round a shape is."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.nrsfm.metrics import (
+    object_frame,
+    procrustes_distances,
+    shape_errors,
+    signed_volumes,
+)
+
+some = settings(max_examples=25, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+MIRROR = np.array([1.0, 1.0, -1.0])
+
+
+def rotations(n: int, rng: np.random.Generator) -> np.ndarray:
+    return rotation_from_camera(random_cameras(n, rng).astype(float))
+
+
+def frames(seed: int, f: int = 20) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+    """Return centred truth (f, 10, 3) and a reconstruction that is some 20 % off."""
+    rng = np.random.default_rng(seed)
+    truth = centre(rng.standard_normal((f, 10, 3)))
+    return truth, truth + 0.2 * rng.standard_normal(truth.shape), rng
+
+
+@some
+@given(seeds, st.floats(0.01, 100))
+def test_place_and_attitude_do_not_matter(seed: int, factor: float) -> None:
+    truth, S, rng = frames(seed)
+    errors = shape_errors(S, truth)
+    moved = S @ rotations(len(S), rng) + rng.standard_normal((len(S), 1, 3))
+    np.testing.assert_allclose(shape_errors(moved, truth), errors, atol=1e-6)
+    truth_moved = truth @ rotations(len(S), rng) + 5
+    np.testing.assert_allclose(shape_errors(S, truth_moved), errors, atol=1e-6)
+    mirrored = shape_errors(S * MIRROR, truth)  # the whole set: one global reflection
+    np.testing.assert_allclose(mirrored, errors, atol=1e-6)
+    scaled = shape_errors(factor * S, truth)
+    np.testing.assert_allclose(scaled[:4], errors[:4], atol=1e-6)
+    distances = procrustes_distances(S, truth)
+    np.testing.assert_allclose(procrustes_distances(factor * moved, truth), distances, atol=1e-6)
+
+
+def test_perfect_is_zero() -> None:
+    truth, _, _ = frames(0)
+    np.testing.assert_allclose(shape_errors(truth, truth), 0, atol=1e-9)
+    np.testing.assert_allclose(procrustes_distances(truth, truth), 0, atol=1e-9)
+
+
+OCTAHEDRON = np.concatenate([np.diag([1.0, 2, 3]), -np.diag([1.0, 2, 3])])[None]
+
+
+def test_errors_of_a_shape_pulled_apart_by_hand() -> None:
+    # Symmetric, so that neither centre nor best rotation moves: only z grows, from 3 to 4.
+    pulled = OCTAHEDRON * [1, 1, 4 / 3]
+    after = (2 * (1 + 4 + 16)) ** 0.5
+    before = (2 * (1 + 4 + 9)) ** 0.5
+    unscaled = 2**0.5 / before
+    errors = shape_errors(pulled, OCTAHEDRON)
+    assert errors.unscaled == pytest.approx(unscaled)
+    s = before / after
+    moves = np.array([s - 1, 2 * s - 2, 4 * s - 3])
+    assert errors.shape == errors.proper == pytest.approx((2 * moves @ moves) ** 0.5 / before)
+    assert errors.point == pytest.approx(np.abs(moves).mean())
+    best = (1 + 4 + 12) / (1 + 4 + 16)  # least squares instead of equal norms
+    expected = np.abs(best * np.array([1, 2, 4]) - [1, 2, 3])
+    np.testing.assert_allclose(procrustes_distances(pulled, OCTAHEDRON), [[*expected, *expected]])
+
+
+def test_only_unscaled_sees_the_size() -> None:
+    truth, _, _ = frames(0)
+    errors = shape_errors(1.25 * truth, truth)
+    np.testing.assert_allclose(errors[:4], 0, atol=1e-9)
+    assert errors.unscaled == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("count", [0, 3, 10, 17, 20])
+def test_mirrored_frames_are_counted(count: int) -> None:
+    truth, _, rng = frames(1)
+    S = truth.copy()
+    S[rng.permutation(20)[:count]] *= MIRROR
+    errors = shape_errors(S @ rotations(20, rng), truth)
+    share = min(count, 20 - count) / 20
+    assert errors.mirrored == pytest.approx(share)
+    assert errors.shape == pytest.approx(0, abs=1e-6)  # the published metric hides them
+    assert (errors.proper > 0.1 * share) if share else (errors.proper < 1e-6)
+
+
+def test_procrustes_never_reflects() -> None:
+    truth, _, _ = frames(2)
+    assert procrustes_distances(truth * MIRROR, truth).mean() > 0.1
+
+
+NAMES = ("left_hip", "nose", "right_hip", "neck", "tail")
+PERSON = KeypointLayout("person", NAMES, handedness=("left_hip", "right_hip", "neck", "nose"))
+# x to the front, y to the left, z up.
+STANDING = np.array([[0, 0.2, 0], [0.3, 0, 0.8], [0, -0.2, 0], [0, 0, 0.6], [-0.2, 0, 0.1]])
+
+
+def people(seed: int, f: int = 30) -> np.ndarray:
+    return STANDING + np.random.default_rng(seed).normal(0, 0.02, (f, *STANDING.shape))
+
+
+def test_signed_volume_is_positive_for_a_person_as_they_are() -> None:
+    # det[(0, .4, 0), (0, .2, .6), (.3, .2, .8)] by hand.
+    np.testing.assert_allclose(signed_volumes(STANDING[None], PERSON), 0.4 * 0.6 * 0.3)
+    turned = people(0) @ rotations(30, np.random.default_rng(0))
+    assert (signed_volumes(turned, PERSON) > 0).all()
+    for axis in np.eye(3):
+        mirror = np.eye(3) - 2 * np.outer(axis, axis)
+        np.testing.assert_allclose(
+            signed_volumes(turned @ mirror, PERSON), -signed_volumes(turned, PERSON)
+        )
+
+
+@some
+@given(seeds, st.booleans())
+def test_object_frame_rights_an_ensemble_and_names_its_axes(seed: int, mirrored: bool) -> None:
+    rng = np.random.default_rng(seed)
+    network_axes = rotations(1, rng)[0] * (-1 if mirrored else 1)
+    S = people(seed) @ network_axes
+    assert ((signed_volumes(S, PERSON) < 0) == mirrored).all()
+    A = object_frame(S, PERSON)
+    np.testing.assert_allclose(A @ A.T, np.eye(3), atol=1e-5)
+    assert np.linalg.det(A) == pytest.approx(-1 if mirrored else 1, abs=1e-5)
+    right = S @ A
+    assert (signed_volumes(right, PERSON) > 0).all()
+    np.testing.assert_allclose(right.mean(0), STANDING, atol=0.06)
+
+
+def test_the_majority_decides_which_way_round() -> None:
+    S = people(3)
+    S[:10] *= MIRROR
+    assert np.linalg.det(object_frame(S, PERSON)) > 0
+    S[10:25] *= MIRROR
+    assert np.linalg.det(object_frame(S, PERSON)) < 0
+
+
+def test_layouts_without_handedness_keep_their_axes_and_have_no_volume() -> None:
+    nameless = KeypointLayout.numbered(5)
+    np.testing.assert_array_equal(object_frame(people(0), nameless), np.eye(3))
+    with pytest.raises(ValueError, match="points5.*handedness"):
+        signed_volumes(people(0), nameless)
+
+
+def test_every_order_of_the_four_has_the_sign_of_its_permutation() -> None:
+    for order in itertools.permutations(range(4)):
+        names = tuple(("left_hip", "right_hip", "neck", "nose")[i] for i in order)
+        layout = KeypointLayout("person", NAMES, handedness=names)
+        sign = np.linalg.det(np.eye(4)[list(order)])
+        assert np.sign(signed_volumes(STANDING[None], layout)[0]) == sign
