@@ -25,7 +25,7 @@ from deep_nrsfm_ros.observations.bags import read_bags
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 from deep_nrsfm_ros.observations.mocap import protocol_split, read_trials, trials
 
-CANCELLED = "cancelled; the model holds what was learned so far"
+CANCELLED = "cancelled; the model holds what was learned so far, --resume goes on"
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -202,10 +202,11 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     )
     model = finish(trainer, given.name, ensemble.layout, ensemble.source)
     save_model(model_path, model)
-    checkpoint.unlink(missing_ok=True)
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
     if trainer.step < preset.recipe.steps:
         state, message = "cancelled", CANCELLED
+    else:
+        checkpoint.unlink(missing_ok=True)
     report.end(state, message, model=str(model_path), **model.quality)
 
 

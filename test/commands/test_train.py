@@ -1,0 +1,294 @@
+"""The training program as others start it: a bag in, progress as JSON lines, a model out."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import deep_nrsfm_ros
+from deep_nrsfm_ros.commands import train
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.nrsfm.keypoints import COCO17, HUMAN17
+from deep_nrsfm_ros.nrsfm.lifting import Lifter
+from deep_nrsfm_ros.nrsfm.model_file import Model, load_model
+from deep_nrsfm_ros.nrsfm.training import Trainer
+from deep_nrsfm_ros.observations.bags import frames, write_bag
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+
+DEADLINE = 90.0
+QUICK = ("--widths", "8", "4", "--batch", "8", "--threads", "1", "--name", "mine")
+ENDLESS = ("--steps", "1000000")
+
+
+def people(f: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a detector saw of people of COCO17: pixels (f, 17, 2) and confidence."""
+    rng = np.random.default_rng(0)
+    shapes = centre(rng.standard_normal((17, 3)) + 0.3 * rng.standard_normal((f, 17, 3)))
+    points = 100 * (shapes @ random_cameras(f, rng)) + [320, 240]
+    return points.astype(np.float32), np.full((f, 17), 0.9, np.float32)
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """A bag of COCO17 keypoints."""
+    write_bag(tmp_path / "bag", "/keypoints", frames(*people()))
+    return tmp_path / "bag"
+
+
+@pytest.fixture
+def models(tmp_path: Path) -> Path:
+    return tmp_path / "models"
+
+
+@pytest.fixture
+def arguments(bag: Path, models: Path) -> list[str]:
+    """Arguments of a training that takes no time."""
+    source = ("--bag", str(bag), "--topic", "/keypoints", "--keypoint-layout", "coco17")
+    return [*source, "--output", str(models), *QUICK]
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start the program with JSON progress; its standard input stays open."""
+    started: list[subprocess.Popen[str]] = []
+
+    def run(*words: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "deep_nrsfm_ros.commands.train", *words, "--json-progress"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(Path(deep_nrsfm_ros.__file__).parents[1])},
+        )
+        started.append(process)
+        return process
+
+    yield run
+    for process in started:
+        with process:  # closes its pipes
+            process.kill()
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Run the program within the test, without its signal handlers; return the exit code."""
+    monkeypatch.setattr(train, "stop_on_signals", lambda: lambda: False)
+    threads = torch.get_num_threads()
+
+    def run(*words: str) -> int:
+        try:
+            train.main(words)
+        except SystemExit as end:
+            return int(end.code or 0)
+        finally:
+            torch.set_num_threads(threads)
+        return 0
+
+    return run
+
+
+def wait_for_training(process: subprocess.Popen[str]) -> list[dict[str, Any]]:
+    """Read lines until one says that training goes on; return them parsed."""
+    lines = []
+    for line in process.stdout or ():
+        lines.append(json.loads(line))
+        if lines[-1]["state"] == "training":
+            return lines
+    pytest.fail(f"no training: {lines} {process.communicate()[1]}")
+
+
+def finish(process: subprocess.Popen[str]) -> list[dict[str, Any]]:
+    """Return the remaining lines of a process that ends by itself, parsed."""
+    lines = [json.loads(line) for line in process.stdout or ()]
+    process.wait(DEADLINE)
+    return lines
+
+
+def assert_lifts(path: Path) -> Model:
+    model = load_model(path)
+    points = np.random.default_rng(1).uniform(0, 500, (3, len(model.layout), 2))
+    lifted = Lifter(model)(points.astype(np.float32), np.ones(points.shape[:2], np.float32))
+    assert np.isfinite(lifted.shapes).all() and lifted.shapes.any()
+    return model
+
+
+def test_from_bag_to_model(
+    arguments: list[str], models: Path, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    process = start(*arguments, "--steps", "30", "--seeds", "2", "--screening", "5")
+    lines = finish(process)
+    assert process.returncode == 0
+    states = [line["state"] for line in lines]
+    order = ["reading", "training", "finished"]
+    assert states[-1] == "finished" and [*dict.fromkeys(states)] == [
+        s for s in order if s in states
+    ]
+    progress = [line for line in lines if line["state"] == "training"]
+    assert (progress[-1]["step"], progress[-1]["steps"]) == (30, 30)
+    for field in ("loss", "cycle_error", "coherence", "seconds_left"):
+        assert isinstance(progress[-1][field], float)
+    assert any("60 frames of 17 keypoints (bags bag)" in line.get("message", "") for line in lines)
+    path = models / "mine.safetensors"
+    assert lines[-1]["model"] == str(path) and str(path) in lines[-1]["message"]
+    model = assert_lifts(path)
+    assert (model.name, model.layout) == ("mine", HUMAN17)
+    assert model.network.architecture.widths == (8, 4)
+    assert model.provenance["recipe"]["steps"] == 30 and model.provenance["step"] == 30
+    assert lines[-1]["cycle_error"] == model.quality["cycle_error"]
+    assert [f.name for f in models.iterdir()] == ["mine.safetensors"]
+
+
+@pytest.mark.parametrize("how", ["SIGTERM", "end of standard input"])
+def test_cancelling_keeps_what_was_learned(
+    arguments: list[str], models: Path, start: Callable[..., subprocess.Popen[str]], how: str
+) -> None:
+    process = start(*arguments, *ENDLESS)
+    wait_for_training(process)
+    before = time.monotonic()
+    if how == "SIGTERM":
+        process.send_signal(signal.SIGTERM)
+    else:
+        assert process.stdin is not None
+        process.stdin.close()
+    lines = finish(process)
+    assert time.monotonic() - before < 20
+    assert process.returncode == 0
+    assert lines[-1]["state"] == "cancelled" and "cancelled" in lines[-1]["message"]
+    assert lines[-1]["model"] == str(models / "mine.safetensors")
+    assert 0 < assert_lifts(models / "mine.safetensors").provenance["step"] < 1000000
+
+
+def stop_after(steps: int) -> Callable[[], Callable[[], bool]]:
+    calls = iter(range(10**6))
+    return lambda: lambda: next(calls) >= steps
+
+
+def test_resume_goes_on_where_it_was_cancelled(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words = [*arguments, "--steps", "12"]
+    assert in_process(*words) == 0
+    whole = dict(load_model(models / "mine.safetensors").network.named())
+    with monkeypatch.context() as cancelled:
+        cancelled.setattr(train, "stop_on_signals", stop_after(5))
+        assert in_process(*words) == 0
+    assert load_model(models / "mine.safetensors").provenance["step"] == 5
+    taken: list[int] = []
+    advance = Trainer.advance
+    monkeypatch.setattr(Trainer, "advance", lambda t: (taken.append(t.step), advance(t)))
+    assert in_process(*words, "--resume") == 0
+    assert taken == list(range(5, 12))
+    for name, weight in load_model(models / "mine.safetensors").network.named():
+        np.testing.assert_array_equal(weight, whole[name])
+    assert [f.name for f in models.iterdir()] == ["mine.safetensors"]
+
+
+def test_without_resume_it_begins_anew(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with monkeypatch.context() as cancelled:
+        cancelled.setattr(train, "stop_on_signals", stop_after(5))
+        assert in_process(*arguments, "--steps", "12") == 0
+    # A checkpoint of another architecture would be refused, were it read.
+    assert in_process(*arguments, "--steps", "3", "--widths", "6", "3") == 0
+    model = load_model(models / "mine.safetensors")
+    assert model.provenance["step"] == 3 and model.network.architecture.widths == (6, 3)
+
+
+BAD: dict[str, tuple[list[str], str]] = {
+    "no data": ([], "--bag"),
+    "both kinds of data": (["--bag", "BAG", "--cmu", "FOLDER"], "--bag"),
+    "absent bag": (["--bag", "FOLDER/absent"], "absent"),
+    "absent topic": (["--bag", "BAG", "--topic", "/poses"], "/poses"),
+    "absent subject": (["--cmu", "FOLDER", "--subjects", "99"], "99"),
+    "wrong layout": (["--bag", "BAG", "--keypoint-layout", "body25"], "17"),
+    "layouts that share nothing": (
+        ["--bag", "BAG", "--keypoint-layout", "coco17", "--object", "cmu31"],
+        "at least 4",
+    ),
+    "out of range": (["--bag", "BAG", "--learning-rate", "7"], "learning_rate is 7.0"),
+    "no dictionary": (["--bag", "BAG", "--widths"], "widths"),
+    "output is a file": (
+        ["--bag", "BAG", "--keypoint-layout", "coco17", "--output", "FOLDER/file"],
+        "file",
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "complaint"), BAD.values(), ids=BAD)
+def test_bad_input_is_named_and_ends_with_2(
+    words: list[str],
+    complaint: str,
+    bag: Path,
+    in_process: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "file").touch()
+    places = {"BAG": str(bag), "FOLDER": str(tmp_path)}
+    for name, place in places.items():
+        words = [word.replace(name, place) for word in words]
+    output = () if "--output" in words else ("--output", str(tmp_path / "models"))
+    assert in_process("--steps", "1", *output, *words) == 2
+    errors = capsys.readouterr().err
+    assert "failed: " in errors and complaint in errors
+    assert not list(tmp_path.glob("models/*"))
+
+
+@pytest.mark.parametrize("words", [("--object", "horse"), ("--steps", "many"), ("--unknown",)])
+def test_a_wrong_command_line_ends_with_2(
+    words: tuple[str, ...], in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert in_process(*words) == 2
+    assert words[0] in capsys.readouterr().err
+
+
+def test_failing_is_a_line_of_json_too(start: Callable[..., subprocess.Popen[str]]) -> None:
+    process = start("--bag", "absent")
+    (line,) = finish(process)
+    assert process.returncode == 2
+    assert line["state"] == "failed" and "absent" in line["message"]
+
+
+def test_a_bag_in_which_nothing_is_seen_fails(
+    tmp_path: Path, in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, confidence = people(5)
+    write_bag(tmp_path / "dark", "/keypoints", frames(points, 0 * confidence))
+    words = ("--bag", str(tmp_path / "dark"), "--keypoint-layout", "coco17", *QUICK)
+    assert in_process(*words, "--output", str(tmp_path)) == 2
+    assert "none of the 5 frames" in capsys.readouterr().err
+
+
+def test_the_ground_truth_is_not_read(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    points, confidence = people()
+    found = []
+    for shapes in (None, np.full((60, 17, 3), np.nan, np.float32)):
+        ensemble = Ensemble(points, confidence > 0, COCO17, "made up", shapes)
+        monkeypatch.setattr(train, "read_data", lambda given, report, e=ensemble: e)
+        assert in_process(*arguments, "--steps", "5") == 0
+        found.append((models / "mine.safetensors").read_bytes())
+    assert found[0] == found[1]
