@@ -64,6 +64,7 @@ def save_model(path: Path, model: Model) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         save_file(weights, partial, {"format": _FORMAT, "model": json.dumps(header)})
+        partial.chmod(0o644)  # safetensors writes for its owner alone; models are for everybody
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -133,7 +133,7 @@ def initialise(
         fan = sum(shape) if len(shape) < 3 else 3 * shape[0] + shape[2]
         limit = 0.0 if is_bias and not glorot_biases else (6 / fan) ** 0.5
         weights[name] = rng.uniform(-limit, limit, shape).astype(np.float32)
-    weights["L"] = weights["L_inverse"] = np.eye(p, dtype=np.float32)
+    weights |= {name: np.eye(p, dtype=np.float32) for name in ("L", "L_inverse")}
     return Network.from_named(architecture, weights)
 
 
@@ -155,7 +155,12 @@ def whitening(
 
 def whiten(net: Network, X: Array) -> Array:
     """Return L X for points X (..., p, d): differences as the network weighs them."""
-    return net.L @ X if net.architecture.whitening else X
+    return _symmetric_product(net.L, X) if net.architecture.whitening else X
+
+
+def _symmetric_product(A: Array, X: Array) -> Array:
+    """Return A X for a symmetric A (p, p): X^T A is one matrix product for the whole batch."""
+    return (X.swapaxes(-1, -2) @ A).swapaxes(-1, -2)
 
 
 def forward(net: Network, W: Array) -> tuple[Array, Array]:
@@ -238,7 +243,7 @@ def decode(net: Network, psi: Array) -> Array:
     p, _, k = net.D[0].shape
     s = psi @ net.D[0].reshape(3 * p, k).swapaxes(-1, -2)
     S = s.reshape(*psi.shape[:-1], p, 3) - net.b_[0]
-    return net.L_inverse @ S if net.architecture.whitening else S
+    return _symmetric_product(net.L_inverse, S) if net.architecture.whitening else S
 
 
 def coherence(net: Network) -> float:

@@ -14,7 +14,7 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 class Recipe:
     """Training."""
 
-    steps: int = option(60000, "gradient steps", low=1, high=10_000_000)
+    steps: int = option(30_000, "gradient steps", low=1, high=10_000_000)
     batch: int = option(64, "frames a step", low=1, high=65536)
     learning_rate: float = option(3e-3, "learning rate of Adam at the start", low=1e-7, high=1.0)
     schedule: str = option(
