@@ -51,7 +51,7 @@ class Architecture:
         high=1.0,
     )
     whitening_floor: float = option(
-        1e-4,
+        1e-3,
         "variance below which a direction counts as noise, relative to the largest",
         low=1e-8,
         high=1.0,

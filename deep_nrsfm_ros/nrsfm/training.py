@@ -162,7 +162,7 @@ def train(
     """
     for config in preset:
         check(config)
-    # The moments of silent units fade into denormal numbers, which slow a step down tenfold.
+    # The moments of silent units fade into denormal numbers, with which a CPU reckons slowly.
     torch.set_flush_denormal(True)
     recipe = preset.recipe
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

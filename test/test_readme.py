@@ -1,0 +1,42 @@
+"""The README's tables say what the code says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.node.pipeline import InputOptions
+from deep_nrsfm_ros.node.training_request import TrainingOptions
+from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointLayout
+from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+from deep_nrsfm_ros.nrsfm.recipe import Recipe
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+
+
+def parameter_rows(cls: type, prefix: str) -> list[str]:
+    rows = []
+    for field, _, opt in options(cls):
+        default: Any = field.default
+        shown = {"models_dir": "$ROS_HOME/deep_nrsfm_ros/models", (): "none", "": "empty"}
+        text = shown.get(field.name) or shown.get(default, default)
+        star = "*" if opt.read_only else ""
+        rows.append(f"| `{prefix}{field.name}`{star} | {text} | {opt.description} |")
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("cls", "prefix"),
+    [(InputOptions, ""), (LiftingOptions, ""), (TrainingOptions, "train."), (Recipe, "train.")],
+)
+def test_lists_every_parameter(cls: type, prefix: str) -> None:
+    for row in parameter_rows(cls, prefix):
+        assert row in README
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_lists_every_layout_in_order(layout: KeypointLayout) -> None:
+    assert f"| `{layout.name}` | {len(layout)} | {', '.join(layout.keypoints)} |" in README
