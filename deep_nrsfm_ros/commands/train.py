@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import signal
+import stat
 import sys
 import threading
 import time
@@ -159,7 +160,12 @@ def stop_on_signals() -> Callable[[], bool]:
 
 
 def stop_with_parent(stopped: Callable[[], bool]) -> Callable[[], bool]:
-    """Return `stopped`, or standard input at its end: the program that started us is gone."""
+    """Return `stopped`, or the end of a pipe on standard input: who started us is gone.
+
+    Anything but a pipe says nothing about that: a terminal, /dev/null in a shell's background.
+    """
+    if not stat.S_ISFIFO(os.fstat(sys.stdin.fileno()).st_mode):
+        return stopped
     orphaned = threading.Event()
 
     def watch() -> None:
