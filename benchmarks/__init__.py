@@ -1,0 +1,1 @@
+"""The paper's experiments: one command a table, from a folder of data."""
