@@ -129,6 +129,20 @@ def reprojection_error(W: Floats, P: Floats, visible: NDArray[np.bool_]) -> Floa
     return relative
 
 
+def on_one_line(W: Floats, visible: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell (...) where the visible points of W (..., p, 2) lie on one line, or on one spot.
+
+    Their spread across it is less than a thousandth of that along it: no camera can be told.
+    """
+    m = visible[..., None].astype(np.float64)
+    X = (W - (W * m).sum(-2, keepdims=True) / np.maximum(m.sum(-2, keepdims=True), 1)) * m
+    C = X.swapaxes(-1, -2) @ X
+    trace = C[..., 0, 0] + C[..., 1, 1]
+    determinant = C[..., 0, 0] * C[..., 1, 1] - C[..., 0, 1] ** 2
+    flat: NDArray[np.bool_] = determinant <= 1e-6 * trace**2
+    return flat
+
+
 def quaternion(R: Floats) -> Floats:
     """Return the unit quaternion (x, y, z, w), w >= 0, of one rotation matrix R (3, 3)."""
     # The largest of the four squares is the pivot: the others would lose digits near zero.

@@ -12,6 +12,7 @@ from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.nrsfm.geometry import (
     back_project,
     centre,
+    on_one_line,
     polar,
     reprojection_error,
     rotation_from_camera,
@@ -21,6 +22,8 @@ from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import forward
 
 Float32 = NDArray[np.float32]
+
+_RESIDUAL_SPREAD = 0.02  # squared residual by which a turn loses all but 1/e of its weight
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,13 @@ class LiftingOptions:
     )
     refill: int = option(
         5, "rounds of filling missing points with their own reprojection", low=0, high=50
+    )
+    rotations: int = option(
+        4,
+        "turns of the input within the image plane of which the lifted shapes are averaged, each "
+        "by its residual; the network is not exactly equivariant, and now and then one turn fails",
+        low=1,
+        high=64,
     )
     min_visible: int = option(
         4, "objects with fewer visible keypoints are not lifted", low=3, high=1000
@@ -71,6 +81,9 @@ class Lifter:
         self.model = model
         self.options = options or LiftingOptions()
         pair = model.layout.reference
+        angles = 2 * np.pi * np.arange(self.options.rotations) / self.options.rotations
+        c, s = np.cos(angles), np.sin(angles)
+        self._turns = np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy()
         self._reference = pair and (model.layout.index(pair[0]), model.layout.index(pair[1]))
 
     def __call__(self, points: Float32, confidence: Float32) -> Lifted:
@@ -85,37 +98,68 @@ class Lifter:
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
         visible = confidence > 0
-        S, M, W = self._reconstruct(points, visible)
-        residual = reprojection_error(points, S @ M, visible)
-        S = back_project(S, M, W, self.options.back_projection)
-        A = self.model.object_frame
-        R = rotation_from_camera(A.T @ M)
-        S = centre(S) @ A
+        S, M, residual = self._average(points, visible)
+        S = centre(S)
         S *= self.options.reference_length / self._reference_size(S)
-        S = S @ R.swapaxes(1, 2)
         scale, translation = weak_perspective(points, S[..., :2], visible)
+        R = rotation_from_camera(M)
         lifted = Lifted(S, R, scale, translation, residual, self._sure(confidence, residual))
-        lost = np.abs(M.swapaxes(1, 2) @ M - np.eye(2, dtype=M.dtype)).max((1, 2)) > 0.01
+        lost = on_one_line(points, visible)
         lost |= visible.sum(1) < self.options.min_visible
         return _blank(lifted, lost) if lost.any() else lifted
 
-    def _reconstruct(
+    def _average(
         self, points: Float32, visible: NDArray[np.bool_]
     ) -> tuple[Float32, Float32, Float32]:
-        """Return the network's S, M and its input W, missing points where S M puts them."""
+        """Return S (n, p, 3) in camera axes and pixels, M (n, 3, 2) from the object, residual (n,).
+
+        Means over the turns of the input within the image plane, weighed by exp(-residual^2).
+        """
+        turns = self._turns  # (k, 2, 2)
+        k, (n, p, _) = len(turns), points.shape
+        turned = (points @ turns.swapaxes(1, 2)[:, None]).reshape(k * n, p, 2)
+        S, M, residual = self._lift(turned, np.tile(visible, (k, 1)))
+        S, M, residual = S.reshape(k, n, p, 3), M.reshape(k, n, 3, 2), residual.reshape(k, n)
+        S[..., :2] = S[..., :2] @ turns[:, None]
+        M = M @ turns[:, None]
+        trust = np.exp((residual.min(0) ** 2 - residual**2) / _RESIDUAL_SPREAD)
+        trust /= trust.sum(0)
+        M = (trust[..., None, None] * M).sum(0)
+        return (
+            (trust[..., None, None] * S).sum(0),
+            polar(M.swapaxes(1, 2)).swapaxes(1, 2),
+            (trust * residual).sum(0),
+        )
+
+    def _lift(
+        self, points: Float32, visible: NDArray[np.bool_]
+    ) -> tuple[Float32, Float32, Float32]:
+        """Return S in camera axes and pixels, M from the object's axes, and the residual (n,)."""
+        S, M, W, unit = self._reconstruct(points, visible)
+        residual = reprojection_error(points, S @ M, visible)
+        S = back_project(S, M, W, self.options.back_projection)
+        A = self.model.object_frame
+        M = A.T @ M
+        R = rotation_from_camera(M)
+        return unit * (S @ A @ R.swapaxes(1, 2)), M, residual
+
+    def _reconstruct(
+        self, points: Float32, visible: NDArray[np.bool_]
+    ) -> tuple[Float32, Float32, Float32, Float32]:
+        """Return the network's S and M, its input W, missing points at S M, and W's unit."""
         mask = visible[..., None].astype(np.float32)
         encode = self.model.normaliser.encode
         seen = encode(points, mask)
         S, M = self._forward(seen.W * seen.gain)
         if visible.all():
-            return S, M, seen.W
+            return S, M, seen.W, seen.unit
         for _ in range(self.options.refill):
             P = S @ M
             scale, shift = weak_perspective(points, P, visible)
             filled = np.where(mask > 0, points, scale[:, None, None] * P + shift[:, None])
             seen = encode(filled, np.ones_like(mask))
             S, M = self._forward(seen.W)
-        return S, M, np.where(mask > 0, seen.W, S @ M)
+        return S, M, np.where(mask > 0, seen.W, S @ M), seen.unit
 
     def _forward(self, W: Float32) -> tuple[Float32, Float32]:
         """Return the network's S and an orthonormal M; S takes over the size of a free camera."""

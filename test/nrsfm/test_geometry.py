@@ -14,6 +14,7 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     align,
     back_project,
     centre,
+    on_one_line,
     polar,
     quaternion,
     random_cameras,
@@ -238,3 +239,14 @@ def test_rotation_from_camera_is_proper() -> None:
     np.testing.assert_array_equal(R[:, :2], M.swapaxes(1, 2))
     np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.tile(np.eye(3), (100, 1, 1)), atol=1e-4)
     np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-4)
+
+
+def test_on_one_line_sees_lines_and_spots_among_the_visible_points_only() -> None:
+    rng = np.random.default_rng(0)
+    line = rng.normal(size=(9, 1)) * [3, 4] + [200, 100]
+    W = np.stack((line, np.full((9, 2), 7.0), rng.normal(size=(9, 2)), line))
+    visible = np.ones((4, 9), bool)
+    W[3, 0] += [5, 0]
+    assert on_one_line(W, visible).tolist() == [True, True, False, False]
+    visible[3, 0] = False
+    assert on_one_line(W, visible)[3]

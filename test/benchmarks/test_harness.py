@@ -1,0 +1,184 @@
+"""Trainings are kept, go on where they stopped, and are told apart by all that shapes them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import harness
+from benchmarks.harness import Session, across, command, in_pairs
+from benchmarks.table import Table, bars
+from deep_nrsfm_ros.nrsfm import training
+from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.nrsfm.recipe import Preset
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+
+STEPS = 23  # snapshots do not divide it
+
+
+class StoppedError(Exception):
+    """Somebody pressed Ctrl-C."""
+
+
+@pytest.fixture
+def session(data: Path, tmp_path: Path) -> Session:
+    return Session(data, tmp_path / "out", ("01",), (0,), STEPS, 1)
+
+
+@pytest.fixture
+def ensemble(session: Session) -> Ensemble:
+    return session.mocap(["01"], "train")
+
+
+@pytest.fixture
+def preset(session: Session) -> Preset:
+    preset = session.preset("default", 3)
+    return preset._replace(architecture=dataclasses.replace(preset.architecture, widths=(8, 4)))
+
+
+@pytest.fixture
+def count_steps(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], list[int]]:
+    """Return a function that counts steps from now on, and stops training after some of them."""
+
+    advance = training.Trainer.advance
+
+    def count(limit: int = STEPS + 1) -> list[int]:
+        steps: list[int] = []
+
+        def counted(trainer: training.Trainer) -> None:
+            if len(steps) == limit:
+                raise StoppedError
+            steps.append(trainer.step)
+            advance(trainer)
+
+        monkeypatch.setattr(training.Trainer, "advance", counted)
+        return steps
+
+    return count
+
+
+def same(a: Model, b: Model) -> bool:
+    pairs = zip(a.network.named(), b.network.named(), strict=True)
+    return all(np.array_equal(x, y) for (_, x), (_, y) in pairs)
+
+
+def test_reads_the_protocols_split(session: Session) -> None:
+    train, held_out, both = (session.mocap(["01"], s) for s in ("train", "held-out", "all"))
+    assert (len(train), len(held_out), len(both)) == (32, 8, 40)
+    assert len(dataclasses.replace(session, stride=4).mocap(["01", "05"], "all")) == 20
+
+
+def test_preset_has_seed_steps_and_options(session: Session) -> None:
+    assert session.preset("paper", 7, noise=0.1).recipe == dataclasses.replace(
+        harness.PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1
+    )
+    whole = dataclasses.replace(session, steps=None)
+    assert whole.preset("default", 0).recipe.steps == harness.PRESETS["default"].recipe.steps
+
+
+def test_snapshots_are_those_of_one_uninterrupted_training(
+    session: Session, ensemble: Ensemble, preset: Preset
+) -> None:
+    models = session.snapshots("a title", ensemble, preset)
+    steps = [model.provenance["step"] for model in models]
+    assert steps == [3, 5, 7, 10, 12, 14, 17, 19, 21, 23]
+    seconds = [model.provenance["cpu_seconds"] for model in models]
+    assert seconds == sorted(seconds) and seconds[0] > 0
+    whole = training.train(ensemble.points, ensemble.visible, preset)
+    assert same(models[-1], training.finish(whole, "x", ensemble.layout, ensemble.source))
+    assert not same(models[-2], models[-1])
+
+
+def test_what_is_trained_is_not_trained_again(
+    session: Session, ensemble: Ensemble, preset: Preset, count_steps: Callable[..., list[int]]
+) -> None:
+    steps = count_steps()
+    first = session.trained("a title", ensemble, preset)
+    assert steps == list(range(STEPS))
+    again = session.trained("a title", ensemble, preset)
+    assert len(steps) == STEPS and same(first, again)
+    assert first.provenance == again.provenance
+
+
+def test_goes_on_where_it_stopped(
+    session: Session, ensemble: Ensemble, preset: Preset, count_steps: Callable[..., list[int]]
+) -> None:
+    whole = session.trained("a title", ensemble, preset)
+    elsewhere = dataclasses.replace(session, output=session.output / "elsewhere")
+    count_steps(limit=11)
+    with pytest.raises(StoppedError):
+        elsewhere.trained("a title", ensemble, preset)
+    steps = count_steps()
+    resumed = elsewhere.trained("a title", ensemble, preset)
+    assert steps[0] == 10 and same(whole, resumed)  # 10 is the last snapshot
+    assert not list(elsewhere.output.glob("models/*/checkpoint"))
+
+
+def test_screened_seeds_are_trained_in_one_piece(
+    session: Session, ensemble: Ensemble, preset: Preset
+) -> None:
+    recipe = dataclasses.replace(preset.recipe, seeds=2, screening=4)
+    models = session.snapshots("screened", ensemble, preset._replace(recipe=recipe))
+    assert [model.provenance["step"] for model in models] == [STEPS]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda e, p: (e, p._replace(recipe=dataclasses.replace(p.recipe, seed=4))),
+        lambda e, p: (e, p._replace(recipe=dataclasses.replace(p.recipe, noise=0.1))),
+        lambda e, p: (
+            e,
+            p._replace(architecture=dataclasses.replace(p.architecture, widths=(9, 4))),
+        ),
+        lambda e, p: (e, p._replace(normaliser=dataclasses.replace(p.normaliser, scale="none"))),
+        lambda e, p: (e[slice(1, None)], p),
+        lambda e, p: (dataclasses.replace(e, points=2 * e.points), p),
+        lambda e, p: (dataclasses.replace(e, visible=e.visible & (e.points[..., 0] > 0)), p),
+    ],
+    ids=["seed", "recipe", "architecture", "normaliser", "frames", "points", "visible"],
+)
+def test_another_training_is_another(
+    session: Session, ensemble: Ensemble, preset: Preset, change: Any
+) -> None:
+    session.trained("a title", ensemble, preset)
+    session.trained("a title", *change(ensemble, preset))
+    assert len(list(session.output.glob("models/a-title-*"))) == 2
+
+
+def test_across_gives_both_errors_of_every_test(
+    session: Session, ensemble: Ensemble, preset: Preset
+) -> None:
+    model = session.trained("a title", ensemble, preset)
+    row = across({"x": (model, ensemble), "y": (model, ensemble)}, harness.ALONE)
+    assert list(row) == in_pairs(["x", "y"]) == ["x", "x proper", "y", "y proper"]
+    assert 0 < row["x"] <= row["x proper"] and row["x"] == row["y"]
+
+
+def test_command_prints_and_writes(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def benchmark(session: Session) -> Table:
+        assert (session.subjects, session.seeds, session.steps) == (("05",), (4, 5), 6)
+        table = Table("t", "T", ("a",), ("b",), {}, bars("b"))
+        table.add(("x",), {"b": 1.0})
+        return table
+
+    options = ["--data", str(data), "--output", str(tmp_path), "--seeds", "4", "5", "--steps", "6"]
+    command(benchmark, "about", ("05",), options)
+    assert capsys.readouterr().out.strip() == (tmp_path / "t.md").read_text().strip()
+    assert (tmp_path / "t.csv").exists() and (tmp_path / "t.png").exists()
+
+
+def test_command_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def benchmark(session: Session) -> Table:
+        raise AssertionError(session.mocap(session.subjects, "train"))
+
+    with pytest.raises(SystemExit, match="2"):
+        command(benchmark, "about", ("01",), ["--data", str(tmp_path)])
+    assert "no trials 01_*.amc" in capsys.readouterr().err

@@ -1,0 +1,183 @@
+"""Each table from end to end on a tiny database, and its own arithmetic on known cases."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import batches, coherence, missing, noise, nrsfm_on_cmu, unseen
+from benchmarks.harness import ALONE, Session
+from benchmarks.table import Table
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+
+LONE = ("--subjects", "01", "--seeds", "0", "1", "--steps", "3")
+ALL_TABLES = [nrsfm_on_cmu, unseen, noise, missing, coherence]
+
+
+@pytest.fixture(scope="module")
+def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One folder for all tables: what one has trained, the next finds."""
+    return tmp_path_factory.mktemp("output")
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let everything that takes long take less."""
+    for name, preset in PRESETS.items():
+        small = dataclasses.replace(preset.architecture, widths=(8, 4))
+        monkeypatch.setitem(PRESETS, name, preset._replace(architecture=small))
+    monkeypatch.setattr(batches, "RANKS", (2,))
+    monkeypatch.setattr(coherence, "VARIANT_STEPS", 3)
+    monkeypatch.setattr(unseen, "TRAINED_ON", {"86": ("86",), "union": ("01", "86")})
+
+
+@pytest.fixture
+def session(data: Path, tmp_path: Path) -> Session:
+    return Session(data, tmp_path / "out", ("01",), (0,), 3, 1)
+
+
+@pytest.fixture
+def ensemble(session: Session) -> Ensemble:
+    return session.mocap(["01"], "train")
+
+
+def known(ensemble: Ensemble) -> dict[bytes, Any]:
+    """Return the true shape of each frame's points."""
+    assert ensemble.shapes is not None
+    frames = zip(ensemble.points, ensemble.shapes, strict=True)
+    return {points.tobytes(): shape for points, shape in frames}
+
+
+def rows(output: Path, name: str) -> list[dict[str, str]]:
+    return list(csv.DictReader((output / f"{name}.csv").open()))
+
+
+@pytest.mark.usefixtures("few")
+@pytest.mark.parametrize("module", ALL_TABLES, ids=lambda module: module.__name__)
+def test_runs_end_to_end(
+    module: ModuleType, data: Path, output: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module.main(["--data", str(data), "--output", str(output), *LONE])
+    name = module.__name__.rsplit(".", 1)[-1]
+    printed = capsys.readouterr().out
+    assert printed.strip() == (output / f"{name}.md").read_text().strip()
+    assert "O(3)" in printed and "proper" in printed  # the metric's conventions stand below
+    assert (output / f"{name}.png").stat().st_size > 1000
+    found = rows(output, name)
+    assert {row["seed"] for row in found} >= {"0", "1"}
+    for row in found:
+        figures = [value for key, value in row.items() if "%" in key and value]
+        assert all(np.isfinite(float(value)) for value in figures)
+
+
+@pytest.mark.usefixtures("few")
+def test_nrsfm_on_cmu_has_the_papers_figures_beside_ours(data: Path, output: Path) -> None:
+    nrsfm_on_cmu.main(["--data", str(data), "--output", str(output), *LONE])
+    found = {row["method"]: row for row in rows(output, "nrsfm_on_cmu")}
+    assert list(found) == [
+        *("paper: Deep NRSfM", "paper: Simple", "paper: Sparse", "paper: EM-SfM"),
+        "paper's network, ours, network alone",
+        *("default recipe, network alone", "default recipe, back-projected"),
+        "rigid factorisation (Tomasi-Kanade)",
+        *("Simple (Dai et al.), K = 2", "EM-SfM (Torresani et al., EM-PPCA), K = 2"),
+    ]
+    assert found["paper: Deep NRSfM"]["shape %"] == "10.74"
+    assert found["paper: Deep NRSfM"]["point cm"] == "5.0638"
+    assert found["paper: Deep NRSfM"]["proper %"] == ""
+    ours = found["default recipe, back-projected"]
+    assert float(ours["shape %"]) <= float(ours["proper %"]) and float(ours["CPU min"]) > 0
+
+
+def test_papers_table_is_whole() -> None:
+    assert nrsfm_on_cmu.PAPER["Simple"]["127"] == {"shape %": 23.70, "point cm": 10.9473}
+    assert all(len(subjects) == 10 for subjects in nrsfm_on_cmu.PAPER.values())
+
+
+def test_batches_are_compared_one_by_one(
+    ensemble: Ensemble, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches, "BATCH", 8)
+    monkeypatch.setattr("benchmarks.baselines.BATCH", 8)
+    S = known(ensemble)
+    turns = iter([1, -1, 1, -1])
+
+    def mirrors_every_other_batch(W: Any) -> Any:
+        assert len(W) == 8
+        shapes = np.stack([S[points.tobytes()] for points in W])
+        return 3 * shapes * np.array([1, 1, next(turns)])
+
+    errors = batches.batch_errors(mirrors_every_other_batch, ensemble)
+    assert errors.shape == pytest.approx(0, abs=1e-5)
+    assert errors.proper == pytest.approx(0, abs=1e-5) and errors.mirrored == 0
+    assert errors.unscaled == pytest.approx(2, abs=1e-5)
+
+
+def test_baselines_are_solved_once(
+    session: Session, ensemble: Ensemble, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = batches.solve(session, "rigid factorisation (Tomasi-Kanade)", ensemble)
+    monkeypatch.setattr(batches, "_solve", None)
+    assert batches.solve(session, "rigid factorisation (Tomasi-Kanade)", ensemble) == first
+
+
+def test_rank_is_the_one_of_lowest_error(
+    session: Session, ensemble: Ensemble, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    S = known(ensemble)
+
+    def best_at_five(W: Any, K: int) -> Any:
+        shapes = np.stack([S[points.tobytes()] for points in W])
+        noise = np.random.default_rng(0).standard_normal(shapes.shape)
+        return shapes + 0.01 * abs(K - 5) * noise
+
+    monkeypatch.setitem(batches.BASELINES, "known", best_at_five)
+    solved = batches.solve(session, "known", ensemble)
+    assert solved.rank == 5 and solved.errors.shape < 1e-5
+
+
+def test_noise_has_the_ratio_asked_for(ensemble: Ensemble) -> None:
+    added = noise.disturbed(ensemble, 0.2).points - ensemble.points
+    ratio = np.linalg.norm(added, axis=(1, 2)) / np.linalg.norm(ensemble.points, axis=(1, 2))
+    np.testing.assert_allclose(ratio, 0.2, rtol=1e-5)
+    assert noise.disturbed(ensemble, 0.0) is ensemble
+
+
+@pytest.mark.parametrize(("what", "count"), [("0", 0), ("1", 1), ("9", 9), ("arm", 6), ("leg", 4)])
+def test_hides_points(ensemble: Ensemble, what: str, count: int) -> None:
+    test = missing.hidden(ensemble, what)
+    assert ((~test.visible).sum(1) == count).all()
+    assert (test.points[~test.visible] == 0).all()
+    np.testing.assert_array_equal(test.points[test.visible], ensemble.points[test.visible])
+    if what in missing.LIMBS:
+        sides = {tuple(np.flatnonzero(~frame)) for frame in test.visible}
+        names = {"".join(ensemble.layout.keypoints[i][0] for i in side) for side in sides}
+        assert names == {"l" * count, "r" * count}
+
+
+def test_similarity_forgives_the_scale_only(session: Session, ensemble: Ensemble) -> None:
+    model = session.trained("a title", ensemble, session.preset("default", 0))
+    found = unseen.errors(model, ensemble, ALONE)
+    assert 0 < found["similarity %"] < found["proper %"] + 1e-6 or found["mirrored %"] > 0
+
+
+def test_correlation_has_its_sign_and_choice_its_error() -> None:
+    table = Table("t", "", ("a", "b", "error"), (*coherence.GUIDES, *coherence.CHOSEN), {}, print)
+    points = [
+        coherence.Point(
+            {"coherence": 1 - x, "combined": x, "reprojection_error": x, "cycle_error": x},
+            {"shape %": 10 * x + 1, "proper %": 10 * x + 2},
+        )
+        for x in (0.1, 0.5, 0.3, 0.9)
+    ]
+    coherence._correlate(table, ("01", "along"), points, 0)
+    shape, proper = (row.figures for row in table.rows)
+    assert shape["coherence"] == pytest.approx(-1) and shape["combined"] == pytest.approx(1)
+    assert (shape["chosen by coherence"], shape["chosen by combined"]) == (10.0, 2.0)
+    assert (shape["best"], proper["best"]) == (2.0, 3.0)
