@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
 from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 from deep_nrsfm_ros.observations.mocap import HEIGHT_18, protocol_split, read_trials, trials
 
-_HEADER = """\
-| model | back-projection | shape error % | point error cm | proper % | mirrored % | unscaled % |
-|---|---|---|---|---|---|---|"""
-_LEGEND = """
-shape error: the paper's (each frame rescaled, aligned by O(3)); point error: the same alignment,
-the rest skeleton taken as 1.8 m high; proper: no reflection frame by frame; mirrored: frames that
-a reflection would fit better; unscaled: proper, without rescaling."""
+CONVENTIONS = {
+    "shape %": "the paper's: each frame rescaled to the norm of the truth and aligned by O(3), "
+    "which forgives a mirrored depth",
+    "point cm": "mean distance of the same alignment, the rest skeleton taken as 1.8 m high",
+    "proper %": "rescaled, aligned by proper rotations, no reflection frame by frame",
+    "mirrored %": "frames that a reflection would fit better",
+    "unscaled %": "as proper, without rescaling",
+}
+"""What each figure of `figures` means."""
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -42,48 +46,75 @@ def arguments() -> argparse.ArgumentParser:
     return parser
 
 
-def read_split(given: argparse.Namespace, model: Model) -> Ensemble:
-    """Return the chosen trials of all subjects in the layout of `model`."""
+def read_split(
+    folder: Path,
+    subjects: Sequence[str],
+    split: str,
+    layout: KeypointLayout,
+    *,
+    seed: int = 0,
+    stride: int = 1,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Ensemble:
+    """Return the trials "train", "held-out" (by the paper's protocol) or "all" of the subjects.
+
+    The rest is as in `read_trials`.
+    """
     paths = []
-    for subject in given.subjects:
-        found = trials(given.cmu, subject)
+    for subject in subjects:
+        found = trials(folder, subject)
         train, held_out = protocol_split(found)
-        paths += {"train": train, "held-out": held_out, "all": found}[given.split]
-    return read_trials(paths, model.layout, seed=given.camera_seed, stride=given.stride)
+        paths += {"train": train, "held-out": held_out, "all": found}[split]
+    return read_trials(paths, layout, seed=seed, stride=stride, on_progress=on_progress)
 
 
-def evaluate(model: Model, ensemble: Ensemble, back_projection: float) -> ShapeErrors:
+def reconstruct(lifter: Lifter, ensemble: Ensemble) -> NDArray[np.float32]:
+    """Return the shapes (f, p, 3) of every frame, in the units of its points.
+
+    A frame that cannot be lifted comes out as a point, which is an error of 100 %.
+    """
+    chunks = (ensemble[slice(i, i + 4096)] for i in range(0, len(ensemble), 4096))
+    lifted = [lifter(chunk.points, chunk.visible.astype(np.float32)) for chunk in chunks]
+    S: NDArray[np.float32] = np.concatenate(
+        [np.nan_to_num(part.shapes * part.scale[:, None, None]) for part in lifted]
+    )
+    return S
+
+
+def evaluate(model: Model, ensemble: Ensemble, options: LiftingOptions) -> ShapeErrors:
     """Lift every frame of an ensemble with ground truth and compare."""
     if ensemble.shapes is None:
         raise ValueError(f"{ensemble.source} has no ground truth to compare with")
-    lifter = Lifter(model, LiftingOptions(back_projection=back_projection))
-    chunks = range(0, len(ensemble), 4096)
-    parts = (ensemble[slice(i, i + 4096)] for i in chunks)
-    lifted = [lifter(part.points, part.visible.astype(np.float32)) for part in parts]
-    S = np.concatenate([part.shapes * part.scale[:, None, None] for part in lifted])
-    return shape_errors(S, ensemble.shapes)
+    return shape_errors(reconstruct(Lifter(model, options), ensemble), ensemble.shapes)
+
+
+def figures(errors: ShapeErrors) -> dict[str, float]:
+    """Return the errors (of shapes in metres) as tables show them, by the `CONVENTIONS`."""
+    shown = (errors.shape, HEIGHT_18 * errors.point, *errors[2:])
+    return {name: 100 * value for name, value in zip(CONVENTIONS, shown, strict=True)}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per model and back-projection; exit code 2 says the input was at fault."""
     given = arguments().parse_args(argv)
-    print(_HEADER)
+    columns = ("model", "back-projection", *CONVENTIONS)
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
     try:
         for name in given.models:
             model = load_model(find_model(name, [given.models_dir]))
-            ensemble = read_split(given, model)
-            for share in (0.0, 1.0):
-                e = evaluate(model, ensemble, share)
-                figures = (
-                    *(100 * e.shape, 100 * HEIGHT_18 * e.point, 100 * e.proper),
-                    *(100 * e.mirrored, 100 * e.unscaled),
-                )
-                cells = " | ".join(f"{figure:.2f}" for figure in figures)
-                print(f"| {model.name} | {'yes' if share else 'no'} | {cells} |", flush=True)
+            ensemble = read_split(
+                *(given.cmu, given.subjects, given.split, model.layout),
+                seed=given.camera_seed,
+                stride=given.stride,
+            )
+            for share, word in ((0.0, "no"), (1.0, "yes")):
+                errors = evaluate(model, ensemble, LiftingOptions(back_projection=share))
+                cells = " | ".join(f"{figure:.2f}" for figure in figures(errors).values())
+                print(f"| {model.name} | {word} | {cells} |", flush=True)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)
-    print(_LEGEND)
+    print("", *(f"{name}: {meaning}" for name, meaning in CONVENTIONS.items()), sep="\n")
 
 
 if __name__ == "__main__":
