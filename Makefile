@@ -1,6 +1,7 @@
 # make demo        from a fresh clone to the picture
 # make test        environment, lint, types and all tests
 # make lint        lint and types only
+# make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
 # make lock        resolve requirements.lock anew
 # make clean       remove what building and testing left; .venv and downloads stay
 #
@@ -11,10 +12,13 @@ PYTHON3 ?= python3
 LOCK_PYTHON ?= python3.10
 LOCK_TORCH ?= torch==2.13.0
 
+# In order: what an earlier one has trained, the later ones find in the output folder.
+BENCHMARKS := nrsfm_on_cmu unseen noise missing coherence
+
 PYTHON := .venv/bin/python
 READY := .venv/.ready
 
-.PHONY: demo test lint lock clean
+.PHONY: demo test lint benchmark lock clean
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
@@ -26,6 +30,11 @@ lint: $(READY)
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
+
+benchmark: $(READY)
+	@test -n "$(DATA)" || { echo "make benchmark DATA=DIR: DIR holds cmu/ and nrsfm/"; exit 2; }
+	set -e; for name in $(BENCHMARKS); do \
+	    $(PYTHON) -m benchmarks.$$name --data $(DATA) --output runs/benchmarks; done
 
 # Editable, so that a stale copy never shadows the source; the tests install real copies elsewhere.
 $(READY): requirements.lock setup.py
@@ -54,4 +63,4 @@ lock:
 clean:
 	rm -rf build install log dist demo_output .hypothesis .pytest_cache .ruff_cache .mypy_cache
 	rm -rf *.egg-info
-	find deep_nrsfm_ros test launch -name __pycache__ -type d -prune -exec rm -rf {} +
+	find deep_nrsfm_ros benchmarks test launch -name __pycache__ -type d -prune -exec rm -rf {} +

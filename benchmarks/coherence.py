@@ -1,0 +1,135 @@
+"""Table 7, coherence as guide: does a figure that needs no truth tell the error?"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+
+from benchmarks.harness import ALONE, Session, command
+from benchmarks.table import Table
+from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, evaluate
+from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+
+SUBJECTS = ("01", "05", "127")
+GUIDES = ("coherence", "combined", "reprojection_error", "cycle_error")
+PRESETS = ("default", "paper")
+VARIANT_STEPS = 10_000
+VARIANTS: dict[str, tuple[dict[str, object], dict[str, object]]] = {
+    "no cycle loss": ({}, {"cycle": 0.0}),
+    "no whitening": ({"whitening": 0.0}, {}),
+    "neither": ({"whitening": 0.0}, {"cycle": 0.0}),
+    "paper's widths": ({"widths": PAPER_WIDTHS}, {}),
+}
+"""What is changed in the default, architecture and recipe, for models of every quality."""
+LEGEND = {
+    "figures": "Spearman's rank correlation of the guide with the error: +1 if the guide falls "
+    "exactly when the error falls; the network alone, no back-projection",
+    "coherence": "largest |cos| between two atoms of the final dictionary, the paper's guide",
+    "combined": "sqrt(reprojection error^2 + cycle error^2)",
+    "along": "snapshots at each tenth of one training",
+    "across": f"the results of all trainings of a subject: {', '.join(PRESETS)}, and the default "
+    f"of {VARIANT_STEPS} steps with {', '.join(VARIANTS)}",
+    "chosen by": "error of the snapshot (or model) that has the lowest coherence, the lowest "
+    "combined measure, or the lowest error, which takes the truth to know",
+    "shape %": CONVENTIONS["shape %"],
+    "proper %": CONVENTIONS["proper %"],
+}
+CHOSEN = ("chosen by coherence", "chosen by combined", "best")
+
+
+class Point(NamedTuple):
+    """One model in the scatter: its label-free quality and its errors in %."""
+
+    quality: Mapping[str, float]
+    error: Mapping[str, float]
+
+
+def benchmark(session: Session) -> Table:
+    """Correlate errors and guides along trainings and across models."""
+    clouds: dict[str, dict[str, list[Point]]] = {}
+    table = Table(
+        "coherence",
+        "Coherence as guide",
+        ("subject", "models", "error"),
+        (*GUIDES, *CHOSEN),
+        LEGEND,
+        lambda _, figure: scatter(clouds, figure),
+    )
+    for subject in session.subjects:
+        ensemble = session.mocap([subject], "train")
+        cloud = clouds.setdefault(subject, {})
+        results: list[Point] = []
+        for seed in session.seeds:
+            for preset in PRESETS:
+                title = f"{subject} {preset} seed {seed}"
+                models = session.snapshots(title, ensemble, session.preset(preset, seed))
+                points = [measure(model, ensemble) for model in models]
+                _correlate(table, (subject, f"along, {preset}"), points, seed)
+                cloud.setdefault(f"along, {preset}", []).extend(points)
+                results.append(points[-1])
+            models = [_variant(session, subject, ensemble, name, seed) for name in VARIANTS]
+            results += [measure(model, ensemble) for model in models]
+        _correlate(table, (subject, "across"), results, None)
+        cloud["across"] = results
+    return table
+
+
+def _variant(session: Session, subject: str, ensemble: Ensemble, name: str, seed: int) -> Model:
+    architecture, recipe = VARIANTS[name]
+    preset = session.preset("default", seed, steps=VARIANT_STEPS, **recipe)
+    preset = preset._replace(
+        architecture=dataclasses.replace(preset.architecture, **architecture)  # type: ignore[arg-type]
+    )
+    return session.trained(f"{subject} {name} seed {seed}", ensemble, preset)
+
+
+def measure(model: Model, ensemble: Ensemble, every: int = 10) -> Point:
+    """Return the guides of a model and its errors on each `every`-th frame."""
+    step = max(1, min(every, len(ensemble) // 100))
+    errors = evaluate(model, ensemble[slice(None, None, step)], ALONE)
+    return Point(model.quality, {"shape %": 100 * errors.shape, "proper %": 100 * errors.proper})
+
+
+def _correlate(
+    table: Table, labels: tuple[str, str], points: Sequence[Point], seed: int | None
+) -> None:
+    """Add the correlations with both errors, and what each guide would have chosen."""
+    for error in ("shape %", "proper %"):
+        errors = [point.error[error] for point in points]
+        row = {}
+        for guide in GUIDES:
+            row[guide] = float(spearmanr([p.quality[guide] for p in points], errors).statistic)
+        for guide in ("coherence", "combined"):
+            lowest = int(np.argmin([point.quality[guide] for point in points]))
+            row[f"chosen by {guide}"] = errors[lowest]
+        table.add((*labels, error), row | {"best": min(errors)}, seed)
+
+
+def scatter(clouds: Mapping[str, Mapping[str, Sequence[Point]]], figure: Figure) -> None:
+    """Draw the error against coherence and against the combined measure, a row a subject."""
+    guides = ("coherence", "combined")
+    figure.set_size_inches(9, 3.5 * len(clouds))
+    axes = figure.subplots(len(clouds), len(guides), squeeze=False)
+    for row, (subject, cloud) in zip(axes, clouds.items(), strict=True):
+        for panel, guide in zip(row, guides, strict=True):
+            for name, points in cloud.items():
+                x = [point.quality[guide] for point in points]
+                panel.scatter(x, [point.error["shape %"] for point in points], s=12, label=name)
+            panel.set(xlabel=guide, ylabel=f"{subject}: shape error %")
+    axes[0, 0].legend(fontsize="small")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    command(benchmark, __doc__, SUBJECTS, argv)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""Table 4, missing points: some of 31 at random, and whole limbs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.harness import Session, across, command, in_pairs
+from benchmarks.table import Table, lines
+from deep_nrsfm_ros.commands.evaluate import CONVENTIONS
+from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+
+SUBJECTS = ("01",)
+COUNTS = (0, 1, 3, 6, 9)
+LIMBS = {
+    "arm": ("humerus", "radius", "wrist", "hand", "fingers", "thumb"),
+    "leg": ("femur", "tibia", "foot", "toes"),
+}
+LIFTING = {"zero-fill": LiftingOptions(refill=0), "refill (shipped)": LiftingOptions()}
+TRAINED = {"default recipe": {}, "masked": {"mask": 0.3}}
+LEGEND = {
+    "0 ... 9": "keypoints hidden in each frame, drawn at random",
+    "arm, leg": "; ".join(f"{limb}: {' '.join(parts)}" for limb, parts in LIMBS.items())
+    + " of one side, drawn for each frame",
+    "masked": f"default recipe, up to {TRAINED['masked']['mask']:.0%} of the points hidden at each "
+    "training step",
+    "zero-fill": "missing points are zero in the network's input",
+    "refill (shipped)": "they are filled with their own reprojection, "
+    f"{LiftingOptions().refill} rounds; both are back-projected where points are seen",
+    "figures": f"shape error in %, over all points: {CONVENTIONS['shape %']}",
+    "proper": CONVENTIONS["proper %"],
+}
+
+
+def benchmark(session: Session) -> Table:
+    """Hide points of the training frames from trained models."""
+    columns = [*map(str, COUNTS), *LIMBS]
+    table = Table(
+        "missing",
+        "Missing points",
+        ("subject", "trained", "lifting"),
+        in_pairs(columns),
+        LEGEND,
+        lines(columns, "missing points", "shape error %"),
+    )
+    for subject in session.subjects:
+        ensemble = session.mocap([subject], "train")
+        tests = {column: hidden(ensemble, column) for column in columns}
+        for trained, recipe in TRAINED.items():
+            for seed in session.seeds:
+                preset = session.preset("default", seed, **recipe)
+                name = "masked" if recipe else "default"
+                model = session.trained(f"{subject} {name} seed {seed}", ensemble, preset)
+                for lifting, options in LIFTING.items():
+                    row = across({c: (model, test) for c, test in tests.items()}, options)
+                    table.add((subject, trained, lifting), row, seed)
+    return table
+
+
+def hidden(ensemble: Ensemble, what: str, seed: int = 0) -> Ensemble:
+    """Return the ensemble without so many points a frame, or without a limb of `LIMBS`."""
+    rng = np.random.default_rng(seed)
+    f, p = ensemble.visible.shape
+    visible: NDArray[np.bool_] = np.ones((f, p), bool)
+    if what in LIMBS:
+        sides = [[ensemble.layout.index(side + part) for part in LIMBS[what]] for side in "lr"]
+        gone = np.array(sides)[rng.integers(2, size=f)]
+    else:
+        gone = rng.random((f, p)).argsort(1)[:, : int(what)]
+    np.put_along_axis(visible, gone, False, 1)
+    points = np.where(visible[..., None], ensemble.points, np.float32(0))
+    return dataclasses.replace(ensemble, points=points, visible=visible)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    command(benchmark, __doc__, SUBJECTS, argv)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Table 3, noise: keypoints disturbed by 0 to 20 % of their size, trained with and without."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.batches import BASELINES, solve
+from benchmarks.harness import ALONE, FULL, HALF, Session, across, command, in_pairs
+from benchmarks.table import Table, lines
+from deep_nrsfm_ros.commands.evaluate import CONVENTIONS
+from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+
+SUBJECTS = ("01",)
+RATIOS = {"0 %": 0.0, "5 %": 0.05, "10 %": 0.1, "15 %": 0.15, "20 %": 0.2}
+SHARES = {"0": ALONE, "0.5": HALF, "1": FULL}
+LEGEND = {
+    "noise": "||noise||_F / ||W||_F of each frame, Gaussian; the truth is without",
+    "clean": "default recipe, trained on the frames without noise",
+    "augmented": "the same frames, noise up to the highest ratio added to the input at each step",
+    "retrained": "default recipe, trained on the disturbed frames and tested on them: the paper's "
+    "protocol, a model for each ratio",
+    "back-projection": "share of the reprojection error that lifting removes",
+    "N %": f"shape error: {CONVENTIONS['shape %']}",
+    "N % proper": CONVENTIONS["proper %"],
+}
+
+
+def disturbed(ensemble: Ensemble, ratio: float, seed: int = 0) -> Ensemble:
+    """Return the ensemble with Gaussian noise of `ratio` times the norm of each (centred) frame."""
+    if not ratio:
+        return ensemble
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal(ensemble.points.shape).astype(np.float32)
+    size = [np.linalg.norm(x, axis=(1, 2), keepdims=True) for x in (ensemble.points, noise)]
+    points = ensemble.points + np.float32(ratio) * size[0] / size[1] * noise
+    return dataclasses.replace(ensemble, points=points)
+
+
+def benchmark(session: Session) -> Table:
+    """Compare models trained with and without noise at every ratio."""
+    table = Table(
+        "noise",
+        "Noise",
+        ("subject", "trained", "back-projection"),
+        in_pairs(RATIOS),
+        LEGEND,
+        lines(list(RATIOS), "noise", "shape error %"),
+    )
+    for subject in session.subjects:
+        clean = session.mocap([subject], "train")
+        tests = {name: disturbed(clean, ratio) for name, ratio in RATIOS.items()}
+        for seed in session.seeds:
+            for trained, models in _models(session, subject, tests, seed).items():
+                pairs = {name: (models[name], test) for name, test in tests.items()}
+                for share, options in SHARES.items():
+                    table.add((subject, trained, share), across(pairs, options), seed)
+        solved = {name: solve(session, name, clean).errors for name in BASELINES}
+        name = min(solved, key=lambda name: solved[name].shape)
+        found = 100 * solved[name].shape, 100 * solved[name].proper
+        row = dict(zip(in_pairs(["0 %"]), found, strict=True))
+        table.add((subject, f"best baseline: {name}", ""), row)
+    return table
+
+
+def _models(
+    session: Session, subject: str, tests: dict[str, Ensemble], seed: int
+) -> dict[str, dict[str, Model]]:
+    """Return way of training -> noise -> model."""
+
+    def trained(title: str, of: str, **recipe: float) -> Model:
+        preset = session.preset("default", seed, **recipe)
+        return session.trained(f"{subject} {title} seed {seed}", tests[of], preset)
+
+    plain = trained("default", "0 %")
+    augmented = trained("augmented by noise", "0 %", noise=max(RATIOS.values()))
+    noisy = {name: trained(f"with noise {name[:-2]}", name) for name in tests if name != "0 %"}
+    return {
+        "clean": dict.fromkeys(tests, plain),
+        "augmented": dict.fromkeys(tests, augmented),
+        "retrained": {"0 %": plain} | noisy,
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    command(benchmark, __doc__, SUBJECTS, argv)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""Tables of figures: markdown for people, CSV for programs, and a plot."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+from matplotlib import pyplot
+from matplotlib.figure import Figure
+
+
+class Row(NamedTuple):
+    """One run: what it is, its seed (None: nothing random) and its figures."""
+
+    labels: tuple[str, ...]
+    seed: int | None
+    figures: Mapping[str, float]
+
+
+class Table:
+    """Rows of figures, of which those with equal labels are the seeds of one method.
+
+    Markdown and plot show their mean +- half their range; the CSV has a row for each.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        title: str,
+        labels: Sequence[str],
+        figures: Sequence[str],
+        legend: Mapping[str, str],
+        draw: Callable[[Table, Figure], None],
+    ) -> None:
+        """Start empty; `name` is that of its files, `legend` says what labels and figures mean."""
+        self.name, self.title, self.legend, self.draw = name, title, legend, draw
+        self.labels, self.figures = tuple(labels), tuple(figures)
+        self.rows: list[Row] = []
+
+    def add(
+        self, labels: Sequence[str], figures: Mapping[str, float], seed: int | None = None
+    ) -> None:
+        """Add a run; figures that it has not stay empty. Raises ValueError for unknown ones."""
+        if len(labels) != len(self.labels) or not set(figures) <= set(self.figures):
+            raise ValueError(
+                f"row {labels} {list(figures)} is none of {self.labels} {self.figures}"
+            )
+        self.rows.append(Row(tuple(labels), seed, figures))
+
+    def values(self) -> dict[tuple[str, ...], dict[str, list[float]]]:
+        """Return labels -> figure -> its values over the seeds, rows in order of appearance."""
+        merged: dict[tuple[str, ...], dict[str, list[float]]] = {}
+        for row in self.rows:
+            for name, value in row.figures.items():
+                merged.setdefault(row.labels, {}).setdefault(name, []).append(value)
+        return merged
+
+    def markdown(self) -> str:
+        """Return title, table and legend."""
+        columns = (*self.labels, *self.figures)
+        lines = [f"## {self.title}", "", f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+        for labels, figures in self.values().items():
+            cells = (_cell(figures.get(name, [])) for name in self.figures)
+            lines.append(f"| {' | '.join((*labels, *cells))} |")
+        seeds = max(len(v) for figures in self.values().values() for v in figures.values())
+        legend = dict(self.legend)
+        if seeds > 1:
+            legend["±"] = f"half the range of {seeds} seeds"
+        return "\n".join([*lines, "", *(f"- {name}: {text}" for name, text in legend.items()), ""])
+
+    def write(self, folder: Path) -> None:
+        """Write `name`.md, .csv and .png."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{self.name}.md").write_text(self.markdown())
+        with open(folder / f"{self.name}.csv", "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow((*self.labels, "seed", *self.figures))
+            for row in self.rows:
+                figures = (row.figures.get(name, "") for name in self.figures)
+                writer.writerow((*row.labels, "" if row.seed is None else row.seed, *figures))
+        figure = pyplot.figure(
+            figsize=(9, max(4.5, 0.3 * len(self.values()))), layout="constrained"
+        )
+        figure.suptitle(self.title)
+        self.draw(self, figure)
+        figure.savefig(folder / f"{self.name}.png", dpi=120)
+        pyplot.close(figure)
+
+
+def _cell(values: Sequence[float]) -> str:
+    """Return the mean of the seeds, with half of their range if there are several."""
+    if not values:
+        return ""
+    mean = f"{np.mean(values):.2f}"
+    return mean if len(values) == 1 else f"{mean} ± {np.ptp(values) / 2:.2f}"
+
+
+def bars(*names: str) -> Callable[[Table, Figure], None]:
+    """Return a plot of some figures side by side, a group of bars a row."""
+
+    def draw(table: Table, figure: Figure) -> None:
+        axes = figure.subplots()
+        values = table.values()
+        places = np.arange(len(values))
+        width = 0.8 / len(names)
+        for i, name in enumerate(names):
+            seeds = [figures.get(name, [np.nan]) for figures in values.values()]
+            mean, spread = [np.mean(s) for s in seeds], [np.ptp(s) / 2 for s in seeds]
+            axes.barh(places + i * width, mean, width, xerr=spread, label=name)
+        axes.set_yticks(places + 0.4 - width / 2, [", ".join(row) for row in values])
+        axes.invert_yaxis()
+        axes.legend()
+
+    return draw
+
+
+def lines(names: Sequence[str], across: str, up: str) -> Callable[[Table, Figure], None]:
+    """Return a plot of figures along the columns `names`, a line a row."""
+
+    def draw(table: Table, figure: Figure) -> None:
+        axes = figure.subplots()
+        for labels, figures in table.values().items():
+            seeds = [figures.get(name, [np.nan]) for name in names]
+            mean, spread = [np.mean(s) for s in seeds], [np.ptp(s) / 2 for s in seeds]
+            axes.errorbar(range(len(names)), mean, spread, marker="o", label=", ".join(labels))
+        axes.set_xticks(range(len(names)), names)
+        axes.set(xlabel=across, ylabel=up, ylim=(0, None))
+        axes.legend(fontsize="small")
+
+    return draw
