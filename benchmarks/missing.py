@@ -30,7 +30,7 @@ LEGEND = {
     "training step",
     "zero-fill": "missing points are zero in the network's input",
     "refill (shipped)": "they are filled with their own reprojection, "
-    f"{LiftingOptions().refill} rounds; both are back-projected where points are seen",
+    f"{LiftingOptions().refill} rounds; all else is as shipped in both",
     "figures": f"shape error in %, over all points: {CONVENTIONS['shape %']}",
     "proper": CONVENTIONS["proper %"],
 }

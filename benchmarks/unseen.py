@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.harness import LIFTING, Session, command
+from benchmarks.harness import LIFTING, LIFTING_LEGEND, Session, command
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, figures, reconstruct
 from deep_nrsfm_ros.nrsfm.geometry import centre
@@ -43,7 +43,7 @@ def benchmark(session: Session) -> Table:
         "Unseen data",
         ("trained on", "tested on", "method"),
         (*SIMILARITY, *CONVENTIONS),
-        CONVENTIONS | SIMILARITY | {"union": " ".join(TRAINED_ON["union"])},
+        CONVENTIONS | SIMILARITY | LIFTING_LEGEND | {"union": " ".join(TRAINED_ON["union"])},
         bars("shape %", "proper %"),
     )
     for subject, methods in PAPER.items():
