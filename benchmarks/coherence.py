@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from benchmarks.harness import ALONE, Session, command
+from benchmarks.harness import Session, command
 from benchmarks.table import Table
-from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, evaluate
+from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, evaluate
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS
 from deep_nrsfm_ros.observations.ensemble import Ensemble

@@ -29,13 +29,6 @@ from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 SNAPSHOTS = 10
 """Models kept of each training, evenly spaced; the last is its result."""
-ALONE = LiftingOptions(back_projection=0.0, rotations=1)
-LIFTING = {
-    "network alone": ALONE,
-    "back-projected": LiftingOptions(rotations=1),
-    "as shipped": LiftingOptions(),
-}
-"""The rows of each of our models."""
 LIFTING_LEGEND = {
     "network alone": "one pass of the network, nothing after it",
     "back-projected": "one pass, then moved within the image plane onto the keypoints",

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from benchmarks.batches import BASELINES, solve
 from benchmarks.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.harness import ALONE, LIFTING, LIFTING_LEGEND, Session, command
+from benchmarks.harness import LIFTING_LEGEND, Session, command
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, evaluate, figures
+from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, LIFTING, evaluate, figures
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.observations.mocap import HEIGHT_18
 

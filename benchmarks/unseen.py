@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.harness import LIFTING, LIFTING_LEGEND, Session, command
+from benchmarks.harness import LIFTING_LEGEND, Session, command
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, figures, reconstruct
+from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, figures, reconstruct
 from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.metrics import procrustes_distances, shape_errors

@@ -215,7 +215,10 @@ def _header(frame: Frame) -> Any:
 def _triples(frame: Frame) -> NDArray[np.float32]:
     """Return (n, q, 3) rows of x, y, confidence, NaN where missing."""
     points = np.where(frame.confidence[..., None] > 0, frame.points, np.nan)
-    return np.concatenate([points, frame.confidence[..., None]], -1).astype(np.float32)
+    triples: NDArray[np.float32] = np.concatenate(
+        [points, frame.confidence[..., None]], -1, dtype=np.float32
+    )
+    return triples
 
 
 def _point_cloud(frame: Frame) -> Any:

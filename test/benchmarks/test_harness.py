@@ -13,6 +13,7 @@ import pytest
 from benchmarks import harness
 from benchmarks.harness import Session, across, command, in_pairs
 from benchmarks.table import Table, bars
+from deep_nrsfm_ros.commands.evaluate import ALONE
 from deep_nrsfm_ros.nrsfm import training
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.recipe import Preset
@@ -155,7 +156,7 @@ def test_across_gives_both_errors_of_every_test(
     session: Session, ensemble: Ensemble, preset: Preset
 ) -> None:
     model = session.trained("a title", ensemble, preset)
-    row = across({"x": (model, ensemble), "y": (model, ensemble)}, harness.ALONE)
+    row = across({"x": (model, ensemble), "y": (model, ensemble)}, ALONE)
     assert list(row) == in_pairs(["x", "y"]) == ["x", "x proper", "y", "y proper"]
     assert 0 < row["x"] <= row["x proper"] and row["x"] == row["y"]
 

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from benchmarks import batches, coherence, missing, noise, nrsfm_on_cmu, unseen
-from benchmarks.harness import ALONE, Session
+from benchmarks.harness import Session
 from benchmarks.table import Table
+from deep_nrsfm_ros.commands.evaluate import ALONE
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
