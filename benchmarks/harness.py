@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import hashlib
 import sys
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -78,8 +77,6 @@ class Session:
                 path = folder / f"{step:07}{MODEL_SUFFIX}"
                 if not path.exists():
                     model = _train_on(title, ensemble, preset, step, folder / "checkpoint", bar)
-                    spent = models[-1].provenance["cpu_seconds"] if models else 0.0
-                    model.provenance["cpu_seconds"] += spent
                     save_model(path, model)
                 models.append(load_model(path))
                 bar.update(step - bar.n)
@@ -109,13 +106,8 @@ def _hash(ensemble: Ensemble, preset: Preset) -> str:
 def _train_on(
     title: str, ensemble: Ensemble, preset: Preset, step: int, checkpoint: Path, bar: tqdm[Any]
 ) -> Model:
-    """Return the model at `step`, trained on from `checkpoint`.
-
-    `cpu_seconds` of its provenance are those of the steps from the snapshot before: what an
-    interruption has lost is not counted twice but reckoned from the pace of the rest.
-    """
-    began, before = time.process_time(), int(bar.n)
-    start = int(read_checkpoint(checkpoint)["step"]) if checkpoint.exists() else before
+    """Return the model at `step`, trained on from `checkpoint`."""
+    start = int(read_checkpoint(checkpoint)["step"]) if checkpoint.exists() else 0
     last = step == preset.recipe.steps
     # `train` asks once a step.
     asked = repeat(False) if last else chain(repeat(False, step - start), repeat(True))
@@ -127,9 +119,7 @@ def _train_on(
         should_stop=asked.__next__,
         checkpoint=checkpoint,
     )
-    spent = (time.process_time() - began) * (step - before) / max(step - start, 1)
-    model = finish(trainer, title, ensemble.layout, ensemble.source)
-    return dataclasses.replace(model, provenance=model.provenance | {"cpu_seconds": spent})
+    return finish(trainer, title, ensemble.layout, ensemble.source)
 
 
 def _show(bar: tqdm[Any], step: int, loss: float, cycle: float) -> None:

@@ -120,21 +120,35 @@ def weight_shapes(architecture: Architecture, p: int) -> dict[str, tuple[int, ..
 
 
 def initialise(
-    architecture: Architecture, p: int, rng: np.random.Generator, *, glorot_biases: bool = False
+    architecture: Architecture, p: int, rng: np.random.Generator, *, as_released: bool = False
 ) -> Network:
     """Return a float32 network of Glorot-uniform dictionaries and heads, not yet whitened.
 
-    Thresholds and biases start at zero; `glorot_biases` draws them as the authors' release does,
-    which silences 20-40 % of the narrowest layer from the start.
+    Thresholds and biases start at zero. `as_released` starts as the authors' release does: it
+    draws them too, which silences 20-40 % of the narrowest layer from the start, and its fans
+    are those of the convolutions ("Variation of implementation").
     """
     weights = {}
     for name, shape in weight_shapes(architecture, p).items():
-        is_bias = name.startswith("b")
-        fan = sum(shape) if len(shape) < 3 else 3 * shape[0] + shape[2]
-        limit = 0.0 if is_bias and not glorot_biases else (6 / fan) ** 0.5
+        fan = _convolution_fan(name, shape) if as_released else _matrix_fan(shape)
+        limit = 0.0 if name.startswith("b") and not as_released else (6 / fan) ** 0.5
         weights[name] = rng.uniform(-limit, limit, shape).astype(np.float32)
     weights |= {name: np.eye(p, dtype=np.float32) for name in ("L", "L_inverse")}
     return Network.from_named(architecture, weights)
+
+
+def _matrix_fan(shape: tuple[int, ...]) -> int:
+    """Return inputs + outputs of a weight as the matrix that it is applied as."""
+    return sum(shape) if len(shape) < 3 else 3 * shape[0] + shape[2]
+
+
+def _convolution_fan(name: str, shape: tuple[int, ...]) -> int:
+    """Return (input + output channels) x kernel size of a weight as a convolution kernel."""
+    if name == "D.0":
+        return 3 * (shape[0] + shape[2])
+    if name == "code_head":
+        return 6 * (shape[1] + shape[1])
+    return 2 * int(np.prod(shape)) if name.startswith("b") else sum(shape)
 
 
 def whitening(

@@ -30,7 +30,7 @@ class Recipe:
         0.0, "highest noise added to the input, relative to its size", low=0.0, high=1.0
     )
     mask: float = option(0.0, "highest share of points hidden in the input", low=0.0, high=0.9)
-    glorot_biases: bool = option(False, "random biases at the start, as in the paper's release")
+    as_released: bool = option(False, "start from random biases, as the paper's release does")
     seeds: int = option(
         1, "initialisations tried for `screening` steps; the lowest cycle error goes on", low=1
     )
@@ -57,7 +57,7 @@ PRESETS: dict[str, Preset] = {
             learning_rate=1e-3,
             schedule="exponential",
             cycle=0.0,
-            glorot_biases=True,
+            as_released=True,
         ),
     ),
 }

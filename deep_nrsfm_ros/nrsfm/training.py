@@ -51,12 +51,13 @@ class Trainer:
         """Initialise the network from `seed`."""
         architecture, normaliser, recipe = preset
         self.frames, self.preset, self.seed, self.step = frames, preset, seed, 0
+        self.cpu_seconds = 0.0
         device = frames.points.device
         initial = initialise(
             architecture,
             frames.points.shape[1],
             np.random.default_rng(seed),
-            glorot_biases=recipe.glorot_biases,
+            as_released=recipe.as_released,
         )
         if architecture.whitening:
             moment = second_moment(frames, normaliser)
@@ -82,6 +83,7 @@ class Trainer:
 
     def advance(self) -> None:
         """Take one gradient step."""
+        began = time.process_time()
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.preset.recipe, self.step)
         losses = self.objective(
@@ -91,6 +93,7 @@ class Trainer:
         losses.total.backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()
         self.step += 1
+        self.cpu_seconds += time.process_time() - began
 
     @torch.no_grad()
     def measure(self) -> tuple[float, float]:
@@ -102,6 +105,7 @@ class Trainer:
     def state(self) -> dict[str, Tensor]:
         """Return everything that `restore` needs, as named tensors."""
         tensors = {"step": torch.tensor(self.step), "seed": torch.tensor(self.seed)}
+        tensors["cpu_seconds"] = torch.tensor(self.cpu_seconds)
         for name, weight in self.net.named():
             moments = self.optimiser.state.get(weight, {})
             tensors[f"weight.{name}"] = weight.detach()
@@ -113,6 +117,7 @@ class Trainer:
         if not {"step", "seed"} <= tensors.keys():
             raise ValueError("the checkpoint is none of a training; delete it")
         self.step, self.seed = int(tensors["step"]), int(tensors["seed"])
+        self.cpu_seconds = float(tensors["cpu_seconds"])
         with torch.no_grad():
             for name, weight in self.net.named():
                 saved = tensors.get(f"weight.{name}")
@@ -162,8 +167,6 @@ def train(
     """
     for config in preset:
         check(config)
-    # The moments of silent units fade into denormal numbers, with which a CPU reckons slowly.
-    torch.set_flush_denormal(True)
     recipe = preset.recipe
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     frames = Frames(*(tensor.to(device) for tensor in _usable(points, visible)))
@@ -289,7 +292,7 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
             "recipe": dataclasses.asdict(trainer.preset.recipe),
             "seed": trainer.seed,
             "step": trainer.step,
-            "cpu_seconds": round(time.process_time()),
+            "cpu_seconds": round(trainer.cpu_seconds, 2),
             "versions": {"deep_nrsfm_ros": __version__, "torch": torch.__version__},
         },
         quality={

@@ -40,7 +40,7 @@ def model(
 ) -> Model:
     rng = np.random.default_rng(seed)
     architecture = architecture or Architecture(widths=(8, 4))
-    network = initialise(architecture, len(layout), rng, glorot_biases=True)
+    network = initialise(architecture, len(layout), rng, as_released=True)
     provenance = {"data": "bags a, b", "frames": 5, "recipe": {"cycle": 2.0}}
     quality = {"cycle_error": 0.25, "coherence": 0.5}
     return Model("mine", network, layout, Normaliser("none"), MIRROR, provenance, quality)
