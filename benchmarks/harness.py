@@ -31,7 +31,7 @@ SNAPSHOTS = 10
 LIFTING_LEGEND = {
     "network alone": "one pass of the network, nothing after it",
     "back-projected": "one pass, then moved within the image plane onto the keypoints",
-    "as shipped": f"averaged over {LiftingOptions().rotations} turns of the image, back-projected",
+    "as shipped": f"averaged over {LiftingOptions().turns} turns of the image, back-projected",
 }
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.node.model_folders import model_folders
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
@@ -26,10 +27,10 @@ CONVENTIONS = {
     "unscaled %": "as proper, without rescaling",
 }
 """What each figure of `figures` means."""
-ALONE = LiftingOptions(back_projection=0.0, rotations=1)
+ALONE = LiftingOptions(back_projection=0.0, turns=1)
 LIFTING = {
     "network alone": ALONE,
-    "back-projected": LiftingOptions(rotations=1),
+    "back-projected": LiftingOptions(turns=1),
     "as shipped": LiftingOptions(),
 }
 """How a model's shapes come about: one pass, one pass moved onto the input, the default."""
@@ -38,8 +39,10 @@ LIFTING = {
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
-    parser.add_argument("models", nargs="+", help="model files, or names in --models-dir")
-    parser.add_argument("--models-dir", type=Path, default=Path("models"))
+    parser.add_argument("models", nargs="+", help="model files, or names of models")
+    parser.add_argument(
+        "--models-dir", type=Path, default=Path("models"), help="searched before the package's own"
+    )
     parser.add_argument("--cmu", type=Path, required=True, help="folder of the CMU database")
     parser.add_argument("--subjects", nargs="+", default=["01"])
     parser.add_argument(
@@ -108,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
     try:
         for name in given.models:
-            model = load_model(find_model(name, [given.models_dir]))
+            model = load_model(find_model(name, model_folders(given.models_dir)))
             ensemble = read_split(
                 *(given.cmu, given.subjects, given.split, model.layout),
                 seed=given.camera_seed,

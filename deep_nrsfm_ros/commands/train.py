@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import signal
@@ -18,15 +19,13 @@ from tqdm import tqdm
 
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, layout
-from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, save_model
+from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, check_name, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.observations.bags import read_bags
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 from deep_nrsfm_ros.observations.mocap import protocol_split, read_trials, trials
-
-CANCELLED = "cancelled; the model holds what was learned so far, --resume goes on"
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -185,7 +184,14 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         override(preset.normaliser, given),
         override(preset.recipe, given),
     )
+    check_name("--name", given.name)
+    if importlib.util.find_spec("torch") is None:
+        raise ValueError("training needs torch, which is not installed: pip install torch")
     ensemble = read_data(given, report)
+    seen = ensemble.visible.sum(0)
+    unseen = [name for i, name in enumerate(ensemble.layout.keypoints) if not seen[i]]
+    if unseen:
+        report.say(f"no frame shows {', '.join(unseen)}: the model will only guess them")
     report.say(f"{len(ensemble)} frames of {len(ensemble.layout)} keypoints ({ensemble.source})")
     import torch  # seconds to import: bad arguments should not wait for it
 
@@ -206,11 +212,16 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         should_stop=should_stop,
         checkpoint=checkpoint,
     )
+    if not trainer.step:
+        report.end("cancelled", "cancelled before anything was learned; nothing was written")
+        return
     model = finish(trainer, given.name, ensemble.layout, ensemble.source)
     save_model(model_path, model)
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
     if trainer.step < preset.recipe.steps:
-        state, message = "cancelled", CANCELLED
+        state, message = "cancelled", "cancelled; the model holds what was learned so far"
+        if checkpoint.exists():
+            message += ", --resume goes on"
     else:
         checkpoint.unlink(missing_ok=True)
     report.end(state, message, model=str(model_path), **model.quality)

@@ -237,6 +237,9 @@ def main() -> None:
             raise
     finally:
         rclpy.try_shutdown()
+        # Launchers and terminals send the signal twice; Python's own end would die of the second.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _run() -> None:

@@ -57,7 +57,7 @@ class Pipeline:
     def __call__(self, message: Any) -> Lifted:
         """Return the shapes of the objects in `message`; raise ValueError if there is none.
 
-        Objects with too few visible keypoints are NaN, unless all are: that is an error too.
+        Objects that cannot be lifted are NaN, unless all are: that is an error too.
         """
         seen = read(message, self._input_type, len(self.source), self._min_confidence)
         if not len(seen.confidence):
@@ -65,8 +65,11 @@ class Pipeline:
         points, confidence = self._map(*seen)
         lifted = self._lifter(points, confidence)
         if np.isnan(lifted.residual).all():
+            most = (confidence > 0).sum(1).max()
+            if most >= self._min_visible:
+                raise MessageError("message has its visible keypoints on one line or on one spot")
             raise MessageError(
-                f"message has at most {(confidence > 0).sum(1).max()} visible keypoints of the "
+                f"message has at most {most} visible keypoints of the "
                 f"model's {len(self.model.layout)} in an object; min_visible is {self._min_visible}"
             )
         return lifted

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from deep_nrsfm_ros.configuration import option, to_arguments
+from deep_nrsfm_ros.nrsfm.keypoints import layout
+from deep_nrsfm_ros.nrsfm.model_file import check_name
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
-
-_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 
 
 @dataclass(frozen=True)
@@ -43,10 +42,9 @@ class TrainingRequest:
         for bag in self.options.bags:
             if not Path(bag).expanduser().exists():
                 raise ValueError(f"train.bags names {bag}, which does not exist")
-        if not _SAFE_NAME.fullmatch(self.options.name):
-            raise ValueError(
-                f"train.name is {self.options.name!r}; use letters, digits, '_', '-' and '.'"
-            )
+        check_name("train.name", self.options.name)
+        for name in (self.source_layout, self.target_layout):
+            layout(name)
 
     def arguments(self) -> list[str]:
         """Return the arguments of the training command."""

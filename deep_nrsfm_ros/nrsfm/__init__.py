@@ -15,6 +15,9 @@ D_i          D[i-1] (k_i-1, k_i) i-th dictionary, shared by encoder and decoder
 Psi_i        Psi (..., 2, 3, k)  i-th block code: k blocks M psi_j, stored transposed (2 x 3)
                                  with the atoms last, so that a layer is one matrix product
 psi_i        psi (..., k)        i-th code
-b_i, b'_i    b[i-1], b_[i-1]     thresholds of the encoder (a block each), decoder's own
+b_i, b'_i    b[i-1], b_[i]       thresholds of the encoder (a block each), decoder's own
+             code_head           psi_n from the entries of Psi_n ("Code and camera recovery")
+             camera_head         M from the blocks of Psi_n
+             L, L_inverse (p, p) whitening of the points, ours: the dictionaries are of L S
 ===========  ==================  ========================================================
 """

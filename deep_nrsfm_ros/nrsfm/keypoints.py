@@ -41,6 +41,13 @@ class KeypointLayout:
         if len(seen) != len(self.keypoints):
             twice = sorted({k for k in self.keypoints if self.keypoints.count(k) > 1})
             raise ValueError(f"layout {self.name!r} names {', '.join(twice)} more than once")
+        groups: list[tuple[str, int, tuple[str, ...]]]
+        groups = [("edge", 2, edge) for edge in self.edges]
+        groups += [("handedness", 4, self.handedness)] if self.handedness else []
+        groups += [("reference", 2, self.reference)] if self.reference else []
+        for what, size, group in groups:
+            if isinstance(group, str) or len(group) != size:
+                raise ValueError(f"layout {self.name!r}: {what} {group!r} must be {size} names")
         named = [*(n for edge in self.edges for n in edge), *(self.handedness or ())]
         for keypoint in [*named, *(self.reference or ())]:
             if keypoint not in seen:

@@ -40,7 +40,7 @@ class LiftingOptions:
     refill: int = option(
         5, "rounds of filling missing points with their own reprojection", low=0, high=50
     )
-    rotations: int = option(
+    turns: int = option(
         4,
         "turns of the input within the image plane of which the lifted shapes are averaged, each "
         "by its residual; the network is not exactly equivariant, and now and then one turn fails",
@@ -81,7 +81,7 @@ class Lifter:
         self.model = model
         self.options = options or LiftingOptions()
         pair = model.layout.reference
-        angles = 2 * np.pi * np.arange(self.options.rotations) / self.options.rotations
+        angles = 2 * np.pi * np.arange(self.options.turns) / self.options.turns
         c, s = np.cos(angles), np.sin(angles)
         self._turns = np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy()
         self._reference = pair and (model.layout.index(pair[0]), model.layout.index(pair[1]))
@@ -113,7 +113,7 @@ class Lifter:
     ) -> tuple[Float32, Float32, Float32]:
         """Return S (n, p, 3) in camera axes and pixels, M (n, 3, 2) from the object, residual (n,).
 
-        Means over the turns of the input within the image plane, weighed by exp(-residual^2).
+        Means over the turns of the input within the image plane, each by its residual.
         """
         turns = self._turns  # (k, 2, 2)
         k, (n, p, _) = len(turns), points.shape

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,7 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 
 MODEL_SUFFIX = ".safetensors"
 _FORMAT = "deep_nrsfm_ros model 1"
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _MAX_BYTES = 64 * 2**20
 
 
@@ -124,6 +126,12 @@ def _tuples(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _tuples(item) for key, item in value.items()}
     return value
+
+
+def check_name(option: str, name: str) -> None:
+    """Raise ValueError unless `name`, given by `option`, can name a model and so its file."""
+    if not _SAFE_NAME.fullmatch(name):
+        raise ValueError(f"{option} is {name!r}; use letters, digits, '_', '-' and '.'")
 
 
 def find_model(name_or_path: str, folders: Sequence[Path]) -> Path:

@@ -157,9 +157,9 @@ def whitening(
     """Return L and its inverse (p, p) for the second moment E[W W^T] (p, p) of the points.
 
     W = S M implies L W = (L S) M for any L, so a network may learn the shapes L S instead. With
-    L = moment^(-1/2) no keypoint's motion drowns another's: toes and nose, which tell the front
-    of a body from its back, weigh as much as the limbs. That is what keeps depth from coming out
-    mirrored in the poses whose mirror image looks like another pose. Scaled to keep the RMS.
+    L = moment^(-exponent / 2) the limbs no longer drown the toes and the nose, which tell the
+    front of a body from its back: that keeps depth from coming out mirrored in the poses whose
+    mirror image looks like another pose. Scaled to keep the RMS.
     """
     variance, U = np.linalg.eigh(moment)
     root = np.maximum(variance, floor * variance[-1]) ** (-exponent / 2)
@@ -187,7 +187,7 @@ def forward(net: Network, W: Array) -> tuple[Array, Array]:
 def encode(net: Network, W: Array) -> Array:
     """Return the last block code Psi_n (..., 2, 3, k_n): one block-ISTA step a layer.
 
-    "Encoder": Psi_1 = h((D_1#)^T W - b_1), Psi_i = h((D_i (x) I_3)^T Psi_i-1 - b_i).
+    "Encoder", on L W: Psi_1 = h((D_1#)^T W - b_1), Psi_i = h((D_i (x) I_3)^T Psi_i-1 - b_i).
     """
     threshold = _THRESHOLDS[net.architecture.threshold]
     p, _, k = net.D[0].shape
@@ -250,7 +250,7 @@ def decode(net: Network, psi: Array) -> Array:
     """Return S (..., p, 3) from the last code: "Decoder", with the encoder's dictionaries.
 
     psi_i-1 = relu(D_i psi_i - b'_i-1), s = D_1 psi_1 - b'_0. The last bias is not in the paper
-    but in its authors' release; it is the mean shape.
+    but in its authors' release; it is the mean shape, negative and whitened.
     """
     for D, b in zip(net.D[:0:-1], net.b_[:0:-1], strict=True):
         psi = _relu(psi @ D.swapaxes(-1, -2) - b)

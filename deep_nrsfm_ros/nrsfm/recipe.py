@@ -30,7 +30,9 @@ class Recipe:
         0.0, "highest noise added to the input, relative to its size", low=0.0, high=1.0
     )
     mask: float = option(0.0, "highest share of points hidden in the input", low=0.0, high=0.9)
-    as_released: bool = option(False, "start from random biases, as the paper's release does")
+    as_released: bool = option(
+        False, "start as the paper's release: random biases, convolutions' fans"
+    )
     seeds: int = option(
         1, "initialisations tried for `screening` steps; the lowest cycle error goes on", low=1
     )

@@ -126,7 +126,9 @@ class Trainer:
                 weight.copy_(saved)
                 keys = ("step", "exp_avg", "exp_avg_sq")
                 if f"exp_avg.{name}" in tensors:
-                    self.optimiser.state[weight] = {k: tensors[f"{k}.{name}"] for k in keys}
+                    self.optimiser.state[weight] = {
+                        k: tensors[f"{k}.{name}"].to(weight.device) for k in keys
+                    }
         self.probe = self._batch(1024, -1)
 
 
@@ -174,11 +176,13 @@ def train(
     def trainer_of(seed: int) -> Trainer:
         return Trainer(frames, preset, seed)
 
-    trainer = trainer_of(recipe.seed)
     clock = _Clock(recipe)
     if checkpoint is not None and checkpoint.exists():
+        trainer = trainer_of(recipe.seed)
         trainer.restore(read_checkpoint(checkpoint))
-    elif recipe.seeds > 1:
+    elif recipe.seeds == 1:
+        trainer = trainer_of(recipe.seed)
+    else:
         trainer = _screen(trainer_of, recipe, clock, on_progress, should_stop)
         if should_stop():  # no checkpoint: going on from here would skip seeds
             checkpoint = None
@@ -186,7 +190,7 @@ def train(
     saved = time.monotonic()
     while trainer.step < recipe.steps and not should_stop():
         trainer.advance()
-        if clock.due(trainer.step):
+        if clock.due():
             on_progress(clock.progress(trainer))
         if checkpoint is not None and time.monotonic() - saved > checkpoint_seconds:
             write_checkpoint(checkpoint, trainer)
@@ -228,7 +232,7 @@ def _screen(
         clock.restart(0)
         while trainer.step < min(recipe.screening, recipe.steps) and not should_stop():
             trainer.advance()
-            if clock.due(trainer.step):
+            if clock.due():
                 on_progress(clock.progress(trainer))
         candidates.append(trainer)
         if should_stop():
@@ -247,7 +251,7 @@ class _Clock:
         self.began = self.reported = time.monotonic()
         self.first = step
 
-    def due(self, step: int) -> bool:
+    def due(self) -> bool:
         return time.monotonic() - self.reported >= self.every
 
     def progress(self, trainer: Trainer) -> Progress:

@@ -135,8 +135,8 @@ def _pose(skeleton: Skeleton, columns: dict[str, list[list[str]]]) -> Motion:
     return Motion(joints.astype(np.float32), turn["head"].astype(np.float32))
 
 
-# HUMAN17 from CMU joints. A detector's wrist is `lwrist`, not the end of `lradius`'s parent
-# chain's hand; its neck and mid-hip are midpoints by definition.
+# HUMAN17 from CMU joints. A detector's wrist is the end of `lwrist`, not that of `lradius`; its
+# neck and mid-hip are midpoints by definition.
 _HUMAN17_FROM_CMU = {
     "shoulder": "clavicle",
     "elbow": "humerus",

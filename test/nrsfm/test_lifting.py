@@ -234,10 +234,10 @@ def test_lifting_does_not_import_torch() -> None:
 def test_a_quarter_turn_of_the_image_turns_the_shape_and_the_camera() -> None:
     points, confidence = pixels()
     quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
-    lift = Lifter(random_model(), LiftingOptions(rotations=4))
+    lift = Lifter(random_model(), LiftingOptions(turns=4))
     upright, turned = lift(points, confidence), lift(points @ quarter[:2, :2].T, confidence)
     np.testing.assert_allclose(turned.shapes, upright.shapes @ quarter.T, atol=1e-4)
     np.testing.assert_allclose(turned.rotations, quarter @ upright.rotations, atol=1e-4)
-    single = Lifter(random_model(), LiftingOptions(rotations=1))
+    single = Lifter(random_model(), LiftingOptions(turns=1))
     apart = single(points @ quarter[:2, :2].T, confidence).shapes
     assert np.abs(apart - single(points, confidence).shapes @ quarter.T).max() > 1e-2
