@@ -166,7 +166,9 @@ def say(text: str) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the demo; exit code 1 says that something went wrong, 130 that it was stopped."""
     given = arguments().parse_args(argv)
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    # A shell that starts a job in the background has it ignore SIGINT, unless it says otherwise.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     # A domain of its own, and never beyond this machine.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(random.randrange(1, 102))
