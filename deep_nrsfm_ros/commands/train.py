@@ -17,6 +17,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, layout
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, check_name, save_model
@@ -25,7 +26,6 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.observations.bags import read_bags
 from deep_nrsfm_ros.observations.ensemble import Ensemble
-from deep_nrsfm_ros.observations.mocap import protocol_split, read_trials, trials
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -82,12 +82,11 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
             count = f"{reading.unreadable} of {reading.messages}"
             report.say(f"{count} messages could not be read: {reading.reason}")
         return reading.ensemble
-    paths = []
-    for subject in given.subjects:
-        found = trials(given.cmu, subject)
-        paths += found if given.all_trials else protocol_split(found)[0]
-    return read_trials(
-        paths, target, seed=given.camera_seed, stride=given.stride, on_progress=report.reading
+    return read_split(
+        *(given.cmu, given.subjects, "all" if given.all_trials else "train", target),
+        seed=given.camera_seed,
+        stride=given.stride,
+        on_progress=report.reading,
     )
 
 
