@@ -13,17 +13,19 @@ import torch
 from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
-from deep_nrsfm_ros.nrsfm.network import Network, forward, whiten
+from deep_nrsfm_ros.nrsfm.gradient import differentiable
+from deep_nrsfm_ros.nrsfm.network import Network, whiten
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
 
 class Losses(NamedTuple):
-    """Terms of the training loss, means over a batch."""
+    """Terms of the training loss, means over a batch, and the shapes of the batch."""
 
     reprojection: Tensor
     cycle: Tensor
     total: Tensor
+    shapes: Tensor  # (b, p, 3) centred and back-projected, without gradient
 
 
 class Frames(NamedTuple):
@@ -54,35 +56,40 @@ class Objective:
         """
         self.normaliser, self.recipe, self.whitened = normaliser, recipe, whitened
 
-    def __call__(self, net: Network, frames: Frames, generator: torch.Generator) -> Losses:
-        """Return the losses; all randomness comes from `generator`."""
-        x, W, _ = self._observe(frames, generator)
-        S, M = forward(net, x)
-        W = visible_centre(W, frames.mask)
-        residual = W - visible_centre(S @ M, frames.mask)
-        reprojection = self._relative(net, residual, W)
-        total = reprojection
-        if net.architecture.camera == "free":
-            total = total + self.recipe.spectral * spectral_norm(M.swapaxes(-1, -2)).mean()
-        if not self.recipe.cycle:
-            return Losses(reprojection, torch.zeros(()), total)
-        cycle = self._cycle(net, S, M, residual, generator)
-        return Losses(reprojection, cycle, total + self.recipe.cycle * cycle)
+    def __call__(
+        self, net: Network, frames: Frames, known: Tensor | None, generator: torch.Generator
+    ) -> Losses:
+        """Return the losses; all randomness comes from `generator`.
 
-    def _cycle(
-        self, net: Network, S: Tensor, M: Tensor, residual: Tensor, generator: torch.Generator
-    ) -> Tensor:
-        """Return the relative error of S, back-projected, seen by a random camera and lifted."""
+        The cycle loss is that of the shapes `known` (c, p, 3), which an earlier call returned: so
+        one pass of the network serves both losses, and takes half the time of two. It is 0 for
+        None.
+        """
+        if not self.recipe.cycle:
+            known = None
+        b = len(frames.points)
+        if known is not None:
+            Q = polar(torch.randn(len(known), 2, 3, generator=generator, device=known.device))
+            replay = known @ Q.mT, torch.ones_like(known[..., :1])
+            frames = Frames(*(torch.cat(pair) for pair in zip(frames, replay, strict=True)))
+        x, W, unit = self._observe(frames, generator)
+        S, M = differentiable(net, x)
+        S, again, M, W, mask = S[:b], S[b:], M[:b], W[:b], frames.mask[:b]
+        W = visible_centre(W, mask)
+        residual = W - visible_centre(S @ M, mask)
+        total = reprojection = self._relative(net, residual, W)
+        if net.architecture.camera == "free":
+            total = total + self.recipe.spectral * spectral_norm(M.mT).mean()
+        cycle = torch.zeros_like(reprojection)
+        if known is not None:
+            T = known / unit[b:]
+            cycle = self._relative(net, again - again.mean(-2, keepdim=True) - T, T)
+            total = total + self.recipe.cycle * cycle
         with torch.no_grad():
-            T = S + residual @ M.swapaxes(-1, -2)
-            T = T - T.mean(-2, keepdim=True)
-            Q = polar(torch.randn(len(T), 2, 3, generator=generator, device=T.device))
-            seen = Frames(T @ Q.swapaxes(-1, -2), torch.ones_like(T[..., :1]))
-            x, _, unit = self._observe(seen, generator)
-            T = T / unit
-        again, _ = forward(net, x)
-        again = again - again.mean(-2, keepdim=True)
-        return self._relative(net, again - T, T)
+            shapes = S + residual @ M.mT
+            # Contiguous, as a checkpoint keeps it: the layout decides the last bit of a product.
+            shapes = (shapes - shapes.mean(-2, keepdim=True)).contiguous()
+        return Losses(reprojection, cycle, total, shapes)
 
     def _relative(self, net: Network, error: Tensor, X: Tensor) -> Tensor:
         """Return the mean of ||error|| / ||X|| over a batch, both whitened."""

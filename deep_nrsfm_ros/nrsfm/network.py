@@ -172,6 +172,11 @@ def whiten(net: Network, X: Array) -> Array:
     return _symmetric_product(net.L, X) if net.architecture.whitening else X
 
 
+def unwhiten(net: Network, X: Array) -> Array:
+    """Return L^-1 X, the inverse of `whiten`."""
+    return _symmetric_product(net.L_inverse, X) if net.architecture.whitening else X
+
+
 def _symmetric_product(A: Array, X: Array) -> Array:
     """Return A X for a symmetric A (p, p): X^T A is one matrix product for the whole batch."""
     return (X.swapaxes(-1, -2) @ A).swapaxes(-1, -2)
@@ -179,13 +184,12 @@ def _symmetric_product(A: Array, X: Array) -> Array:
 
 def forward(net: Network, W: Array) -> tuple[Array, Array]:
     """Return shape S (..., p, 3) and camera M (..., 3, 2) of the keypoints W (..., p, 2)."""
-    Psi = encode(net, W)
-    psi, M = recover(net, Psi)
-    return decode(net, psi), M
+    psi, M = recover(net, encode(net, W)[-1])
+    return decode(net, psi)[0], M
 
 
-def encode(net: Network, W: Array) -> Array:
-    """Return the last block code Psi_n (..., 2, 3, k_n): one block-ISTA step a layer.
+def encode(net: Network, W: Array) -> list[Array]:
+    """Return the block codes Psi_1 ... Psi_n (..., 2, 3, k_i): one block-ISTA step a layer.
 
     "Encoder", on L W: Psi_1 = h((D_1#)^T W - b_1), Psi_i = h((D_i (x) I_3)^T Psi_i-1 - b_i).
     """
@@ -193,9 +197,9 @@ def encode(net: Network, W: Array) -> Array:
     p, _, k = net.D[0].shape
     W = whiten(net, W)
     V = (W.swapaxes(-1, -2) @ net.D[0].reshape(p, 3 * k)).reshape(*W.shape[:-2], 2, 3, k)
-    Psi = threshold(V, net.b[0])
+    Psi = [threshold(V, net.b[0])]
     for D, b in zip(net.D[1:], net.b[1:], strict=True):
-        Psi = threshold(Psi @ D, b)
+        Psi.append(threshold(Psi[-1] @ D, b))
     return Psi
 
 
@@ -246,18 +250,20 @@ def _leading_factors(Psi: Array, iterations: int = 6) -> tuple[Array, Array]:
     return psi, (m * 2**0.5).reshape(*Psi.shape[:-3], 2, 3)
 
 
-def decode(net: Network, psi: Array) -> Array:
-    """Return S (..., p, 3) from the last code: "Decoder", with the encoder's dictionaries.
+def decode(net: Network, psi: Array) -> tuple[Array, list[Array]]:
+    """Return S (..., p, 3) and the codes psi_1 ... psi_n (..., k_i) from the last of them.
 
-    psi_i-1 = relu(D_i psi_i - b'_i-1), s = D_1 psi_1 - b'_0. The last bias is not in the paper
-    but in its authors' release; it is the mean shape, negative and whitened.
+    "Decoder", with the encoder's dictionaries: psi_i-1 = relu(D_i psi_i - b'_i-1),
+    s = D_1 psi_1 - b'_0. The last bias is not in the paper but in its authors' release; it is
+    the mean shape, negative and whitened.
     """
+    codes = [psi]
     for D, b in zip(net.D[:0:-1], net.b_[:0:-1], strict=True):
-        psi = _relu(psi @ D.swapaxes(-1, -2) - b)
+        codes.insert(0, _relu(codes[0] @ D.swapaxes(-1, -2) - b))
     p, _, k = net.D[0].shape
-    s = psi @ net.D[0].reshape(3 * p, k).swapaxes(-1, -2)
+    s = codes[0] @ net.D[0].reshape(3 * p, k).swapaxes(-1, -2)
     S = s.reshape(*psi.shape[:-1], p, 3) - net.b_[0]
-    return _symmetric_product(net.L_inverse, S) if net.architecture.whitening else S
+    return unwhiten(net, S), codes
 
 
 def coherence(net: Network) -> float:

@@ -193,15 +193,15 @@ def damage(kind: str, file: Path) -> None:
         tensors = load_file(file)
         if kind == "stranger":
             tensors = {"weight": torch.ones(3)}
-        elif kind == "other shape":
-            tensors["weight.D.1"] = torch.ones(8, 5)
+        elif kind == "other network":
+            tensors["weights"] = torch.ones(8, 5)
         else:
-            del tensors["weight.code_head"]
+            del tensors["weights"]
         save_file(tensors, file)
 
 
 @pytest.mark.parametrize(
-    "kind", ["random", "cut", "folder", "stranger", "other shape", "missing weight"]
+    "kind", ["random", "cut", "folder", "stranger", "other network", "no weights"]
 )
 def test_a_damaged_checkpoint_is_refused(figure: Any, tmp_path: Path, kind: str) -> None:
     file = tmp_path / "checkpoint"

@@ -1,0 +1,120 @@
+"""The gradient of the network, written out: torch's own bookkeeping costs more than the sums.
+
+`differentiable` is `network.forward` as one operation of torch's autograd. What follows runs the
+network's own layers and walks back through them, symbols as in the package's legend; X_bar is
+the gradient of the loss by X.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from deep_nrsfm_ros.nrsfm.network import (
+    Architecture,
+    Network,
+    decode,
+    encode,
+    forward,
+    recover,
+    unwhiten,
+    whiten,
+)
+
+
+def differentiable(net: Network, W: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `forward(net, W)` for W (b, p, 2); its gradient reaches the weights, not W."""
+    options = net.architecture
+    if (options.threshold, options.recovery, options.camera) != _WRITTEN_OUT:
+        return forward(net, W)
+    S, M = _Forward.apply(net, W, *(weight for _, weight in net.learned()))  # type: ignore[no-untyped-call]
+    return S, M
+
+
+_WRITTEN_OUT = (Architecture().threshold, Architecture().recovery, Architecture().camera)
+
+
+class _Forward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, net: Network, W: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
+        Psi = encode(net, W)
+        psi_n, M = recover(net, Psi[-1])
+        S, psi = decode(net, psi_n)
+        ctx.net, ctx.W, ctx.Psi, ctx.psi, ctx.M = net, W, Psi, psi, M
+        return S, M
+
+    @staticmethod
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
+        net, (S_bar, M_bar) = ctx.net, bars
+        D_bar, b__bar, psi_bar = _through_decoder(net, ctx.psi, S_bar)
+        heads_bar, Psi_bar = _through_recovery(net, ctx.Psi[-1], ctx.M, psi_bar, M_bar)
+        b_bar = _through_encoder(net, ctx.W, ctx.Psi, Psi_bar, D_bar)
+        return (None, None, *D_bar, *b_bar, *b__bar, *heads_bar)
+
+
+def _through_decoder(
+    net: Network, psi: list[Tensor], S_bar: Tensor
+) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """Return the gradients by D, by b' and by psi_n of one by S (b, p, 3)."""
+    s_bar = unwhiten(net, S_bar).reshape(len(S_bar), -1)
+    b__bar = [s_bar.sum(0).neg_().view(net.b_[0].shape)]
+    D_bar = [(s_bar.T @ psi[0]).view(net.D[0].shape)]
+    psi_bar = s_bar @ net.D[0].reshape(s_bar.shape[1], -1)
+    for i, D in enumerate(net.D[1:]):
+        psi_bar = _relu_gradient(psi_bar, psi[i])
+        b__bar.append(psi_bar.sum(0).neg_())
+        D_bar.append(psi_bar.T @ psi[i + 1])
+        psi_bar = psi_bar @ D
+    return D_bar, b__bar, psi_bar
+
+
+def _through_recovery(
+    net: Network, Psi: Tensor, M: Tensor, psi_bar: Tensor, M_bar: Tensor
+) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """Return the gradients by the heads and by Psi_n (b, 2, 3, k_n) of those by psi_n and M."""
+    flat = Psi.reshape(len(Psi), -1)
+    rows_bar = polar_gradient((Psi @ net.camera_head)[..., 0], M.mT, M_bar.mT)
+    heads_bar = flat.T @ psi_bar, Psi.reshape(-1, Psi.shape[-1]).T @ rows_bar.reshape(-1, 1)
+    Psi_bar = (psi_bar @ net.code_head.T).view(Psi.shape)
+    return heads_bar, Psi_bar.addcmul_(rows_bar[..., None], net.camera_head[:, 0])
+
+
+def _through_encoder(
+    net: Network, W: Tensor, Psi: list[Tensor], Psi_bar: Tensor, D_bar: list[Tensor]
+) -> list[Tensor]:
+    """Add to the gradients by D, and return those by b, of one by Psi_n."""
+    b_bar: list[Tensor] = []
+    for i in reversed(range(len(Psi))):
+        Psi_bar = _relu_gradient(Psi_bar, Psi[i])
+        rows = Psi_bar.view(-1, Psi_bar.shape[-1])
+        b_bar.insert(0, rows.sum(0).neg_())
+        if i:
+            D_bar[i].addmm_(Psi[i - 1].view(len(rows), -1).T, rows)
+            Psi_bar = (rows @ net.D[i].T).view(Psi[i - 1].shape)
+    W = whiten(net, W).mT.reshape(2 * len(W), -1)
+    D_bar[0].view(net.p, -1).addmm_(W.T, Psi_bar.view(len(W), -1))
+    return b_bar
+
+
+def _relu_gradient(bar: Tensor, result: Tensor) -> Tensor:
+    """Return `bar` where the result of a ReLU is positive, else 0: faster than by a mask."""
+    return torch.ops.aten.threshold_backward(bar, result, 0)  # type: ignore[no-any-return]
+
+
+def polar_gradient(A: Tensor, R: Tensor, R_bar: Tensor) -> Tensor:
+    """Return the gradient by A (..., 2, 3) of one by its orthonormal factor R = `polar(A)`.
+
+    With A = P R, P symmetric, a change of A turns the rows of R within their plane by
+    (dA R^T - R dA^T) / tr P and moves them out of it by P^-1 dA (I - R^T R); this is its adjoint.
+    """
+    P, X = A @ R.mT, R_bar @ R.mT
+    trace = (P[..., 0, 0] + P[..., 1, 1])[..., None, None]
+    determinant = (P[..., 0, 0] * P[..., 1, 1] - P[..., 0, 1] * P[..., 1, 0])[..., None, None]
+    # Where A has no camera in it, any finite gradient will do; see `polar`.
+    determinant = determinant.maximum(1e-6 * trace**2 + 1e-30)
+    within = (X - X.mT) @ R / trace.clamp(min=1e-15)
+    out = R_bar - X @ R
+    # P^-1 = (tr P - P) / det P for 2 x 2.
+    return within + (trace * out - P @ out) / determinant
