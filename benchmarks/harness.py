@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,13 @@ from deep_nrsfm_ros.nrsfm.keypoints import CMU31
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
-from deep_nrsfm_ros.nrsfm.training import finish, read_checkpoint, train
+from deep_nrsfm_ros.nrsfm.training import Progress, Trainer, finish, train
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 SNAPSHOTS = 10
 """Models kept of each training, evenly spaced; the last is its result."""
+CHECKPOINT_SECONDS = 30.0
+"""An interrupted training loses no more than this."""
 LIFTING_LEGEND = {
     "network alone": "one pass of the network, nothing after it",
     "back-projected": "one pass, then moved within the image plane onto the keypoints",
@@ -69,19 +70,41 @@ class Session:
         """
         folder = self.output / "models" / f"{title.replace(' ', '-')}-{_hash(ensemble, preset)}"
         folder.mkdir(parents=True, exist_ok=True)
-        steps, models = preset.recipe.steps, list[Model]()
-        # Seeds are screened in one go: a training that stops for a snapshot would choose early.
-        pieces = SNAPSHOTS if preset.recipe.seeds == 1 else 1
-        with tqdm(total=steps, desc=title, dynamic_ncols=True) as bar:
-            for step in sorted({-(-steps * i // pieces) for i in range(1, pieces + 1)}):
-                path = folder / f"{step:07}{MODEL_SUFFIX}"
-                if not path.exists():
-                    model = _train_on(title, ensemble, preset, step, folder / "checkpoint", bar)
-                    save_model(path, model)
-                models.append(load_model(path))
-                bar.update(step - bar.n)
-        (folder / "checkpoint").unlink(missing_ok=True)
-        return models
+        steps = preset.recipe.steps
+        wanted = sorted({-(-steps * i // SNAPSHOTS) for i in range(1, SNAPSHOTS + 1)})
+        paths = {step: folder / f"{step:07}{MODEL_SUFFIX}" for step in wanted}
+        if not all(path.exists() for path in paths.values()):
+            self._train(title, ensemble, preset, paths, folder / "checkpoint")
+        return [load_model(path) for path in paths.values()]
+
+    @staticmethod
+    def _train(
+        title: str, ensemble: Ensemble, preset: Preset, paths: dict[int, Path], checkpoint: Path
+    ) -> None:
+        """Train, and save the model at every step of `paths`."""
+
+        def keep(trainer: Trainer) -> None:
+            if trainer.step in paths:
+                model = finish(trainer, title, ensemble.layout, ensemble.source)
+                save_model(paths[trainer.step], model)
+
+        with tqdm(total=preset.recipe.steps, desc=title, dynamic_ncols=True) as bar:
+
+            def show(progress: Progress) -> None:
+                loss, cycle = progress.loss, progress.cycle_error
+                bar.set_postfix_str(f"loss {loss:.3f}, cycle error {cycle:.3f}", refresh=False)
+                bar.update(progress.step - bar.n)
+
+            train(
+                ensemble.points,
+                ensemble.visible,
+                preset,
+                on_step=keep,
+                on_progress=show,
+                checkpoint=checkpoint,
+                checkpoint_seconds=CHECKPOINT_SECONDS,
+            )
+        checkpoint.unlink(missing_ok=True)
 
 
 @cache
@@ -101,30 +124,6 @@ def _hash(ensemble: Ensemble, preset: Preset) -> str:
     digest.update(ensemble.points.tobytes())
     digest.update(ensemble.visible.tobytes())
     return digest.hexdigest()[:10]
-
-
-def _train_on(
-    title: str, ensemble: Ensemble, preset: Preset, step: int, checkpoint: Path, bar: tqdm[Any]
-) -> Model:
-    """Return the model at `step`, trained on from `checkpoint`."""
-    start = int(read_checkpoint(checkpoint)["step"]) if checkpoint.exists() else 0
-    last = step == preset.recipe.steps
-    # `train` asks once a step.
-    asked = repeat(False) if last else chain(repeat(False, step - start), repeat(True))
-    trainer = train(
-        ensemble.points,
-        ensemble.visible,
-        preset,
-        on_progress=lambda progress: _show(bar, progress.step, progress.loss, progress.cycle_error),
-        should_stop=asked.__next__,
-        checkpoint=checkpoint,
-    )
-    return finish(trainer, title, ensemble.layout, ensemble.source)
-
-
-def _show(bar: tqdm[Any], step: int, loss: float, cycle: float) -> None:
-    bar.set_postfix_str(f"loss {loss:.3f}, cycle error {cycle:.3f}", refresh=False)
-    bar.update(step - bar.n)
 
 
 def in_pairs(columns: Iterable[str]) -> list[str]:

@@ -44,14 +44,14 @@ class Architecture:
         choices=("orthonormal", "free"),
     )
     whitening: float = option(
-        0.75,
+        1.0,
         "exponent of the keypoints' whitening: 1 makes the network care as much for the small "
         "ways in which the points vary as for the large ones, 0 is the paper's network",
         low=0.0,
         high=1.0,
     )
     whitening_floor: float = option(
-        1e-3,
+        1e-2,
         "variance below which a direction counts as noise, relative to the largest",
         low=1e-8,
         high=1.0,

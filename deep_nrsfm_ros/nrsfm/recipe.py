@@ -34,10 +34,12 @@ class Recipe:
         False, "start as the paper's release: random biases, convolutions' fans"
     )
     seeds: int = option(
-        1, "initialisations tried for `screening` steps; the lowest cycle error goes on", low=1
+        3, "initialisations tried; the one with the lowest cycle error goes on", low=1, high=1000
     )
-    screening: int = option(3000, "steps after which seeds are compared", low=1)
-    seed: int = option(0, "first seed of everything random", low=0, high=2**31)
+    screening: int = option(
+        1000, "steps after which they are compared, at most a tenth of all", low=1
+    )
+    seed: int = option(0, "seed of everything random", low=0, high=2**31)
 
 
 class Preset(NamedTuple):
@@ -60,6 +62,7 @@ PRESETS: dict[str, Preset] = {
             schedule="exponential",
             cycle=0.0,
             as_released=True,
+            seeds=1,
         ),
     ),
 }

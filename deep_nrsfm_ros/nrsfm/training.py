@@ -170,6 +170,7 @@ def train(
     visible: NDArray[np.bool_],
     preset: Preset,
     *,
+    on_step: Callable[[Trainer], None] = lambda trainer: None,
     on_progress: Callable[[Progress], None] = lambda progress: None,
     should_stop: Callable[[], bool] = lambda: False,
     checkpoint: Path | None = None,
@@ -179,36 +180,58 @@ def train(
 
     Returns the trainer at its last step, earlier if `should_stop`. With `checkpoint`, goes on
     from that file if it exists and writes it every `checkpoint_seconds` and when it stops early.
-    Raises ValueError for data that cannot be trained on or a checkpoint that does not fit.
+    `on_step` sees the trainer when its seed is chosen and after each step from then on;
+    `on_progress` hears of all steps now and then. Raises ValueError for data that cannot be
+    trained on or a checkpoint that does not fit.
     """
     for config in preset:
         check(config)
     recipe = preset.recipe
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     frames = Frames(*(tensor.to(device) for tensor in _usable(points, visible)))
-
-    def trainer_of(seed: int) -> Trainer:
-        return Trainer(frames, preset, seed)
-
     clock = _Clock(recipe)
-    if checkpoint is not None and checkpoint.exists():
-        trainer = trainer_of(recipe.seed)
-        trainer.restore(read_checkpoint(checkpoint))
-    elif recipe.seeds == 1:
-        trainer = trainer_of(recipe.seed)
-    else:
-        trainer = _screen(trainer_of, recipe, clock, on_progress, should_stop)
-        if should_stop():  # no checkpoint: going on from here would skip seeds
-            checkpoint = None
-    clock.restart(trainer.step)
+
+    def run(trainer: Trainer, until: int, on_step: Callable[[Trainer], None]) -> Trainer:
+        clock.restart(trainer.step)
+        on_step(trainer)
+        while trainer.step < until and not should_stop():
+            trainer.advance()
+            on_step(trainer)
+            if clock.due():
+                on_progress(clock.progress(trainer))
+        return trainer
+
+    def chosen() -> Trainer:
+        """Return the seed with the lowest cycle error after a short training.
+
+        A half-mirrored solution shows a high one soon, whatever its loss.
+        """
+        first, until = recipe.seed * recipe.seeds, min(recipe.screening, recipe.steps // 10)
+        candidates = (
+            run(Trainer(frames, preset, first + i), until, lambda trainer: None)
+            for i in range(recipe.seeds)
+        )
+        return min(candidates, key=lambda trainer: trainer.measure()[1])
+
     saved = time.monotonic()
-    while trainer.step < recipe.steps and not should_stop():
-        trainer.advance()
-        if clock.due():
-            on_progress(clock.progress(trainer))
+
+    def save_and_show(trainer: Trainer) -> None:
+        nonlocal saved
+        on_step(trainer)
         if checkpoint is not None and time.monotonic() - saved > checkpoint_seconds:
             write_checkpoint(checkpoint, trainer)
             saved = time.monotonic()
+
+    if checkpoint is not None and checkpoint.exists():
+        trainer = Trainer(frames, preset, recipe.seed)
+        trainer.restore(read_checkpoint(checkpoint))
+    elif recipe.seeds == 1:
+        trainer = Trainer(frames, preset, recipe.seed)
+    else:
+        trainer = chosen()
+        if should_stop():  # no checkpoint: going on from here would skip seeds
+            checkpoint = None
+    run(trainer, recipe.steps, save_and_show)
     if checkpoint is not None and trainer.step < recipe.steps:
         write_checkpoint(checkpoint, trainer)
     on_progress(clock.progress(trainer))
@@ -227,31 +250,6 @@ def _usable(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> Frames:
     if not usable.any():
         raise ValueError(f"none of the {len(points)} frames shows two keypoints apart")
     return Frames(tensor[usable], mask[usable])
-
-
-def _screen(
-    trainer_of: Callable[[int], Trainer],
-    recipe: Recipe,
-    clock: _Clock,
-    on_progress: Callable[[Progress], None],
-    should_stop: Callable[[], bool],
-) -> Trainer:
-    """Train each seed for a short while and return the one with the lowest cycle error.
-
-    Half-mirrored solutions show a high cycle error within seconds, whatever their loss.
-    """
-    candidates = []
-    for seed in range(recipe.seed, recipe.seed + recipe.seeds):
-        trainer = trainer_of(seed)
-        clock.restart(0)
-        while trainer.step < min(recipe.screening, recipe.steps) and not should_stop():
-            trainer.advance()
-            if clock.due():
-                on_progress(clock.progress(trainer))
-        candidates.append(trainer)
-        if should_stop():
-            break
-    return min(candidates, key=lambda trainer: trainer.measure()[1])
 
 
 class _Clock:

@@ -29,8 +29,11 @@ from deep_nrsfm_ros.nrsfm.training import (
 )
 
 SMALL = Preset(
-    Architecture(widths=(8, 4)), Normaliser(), Recipe(steps=12, batch=16, noise=0.1, mask=0.2)
+    Architecture(widths=(8, 4)),
+    Normaliser(),
+    Recipe(steps=12, batch=16, noise=0.1, mask=0.2, seeds=1),
 )
+SCREENED = {"steps": 40, "seeds": 3, "screening": 4}
 
 
 def small(**changes: Any) -> Preset:
@@ -125,7 +128,7 @@ def test_checkpoints_are_written_on_the_way(figure: Any, tmp_path: Path) -> None
 
 
 def test_a_checkpoint_keeps_the_seed_that_was_chosen(figure: Any, tmp_path: Path) -> None:
-    preset, file = small(seeds=3, screening=4, seed=7), tmp_path / "checkpoint"
+    preset, file = small(**SCREENED, seed=7), tmp_path / "checkpoint"
     whole = run(figure, preset)
     # 3 x (4 steps and a look), one look after the screening, then 2 steps.
     stopped = run(figure, preset, checkpoint=file, should_stop=stop_after(3 * 5 + 1 + 2))
@@ -144,26 +147,39 @@ def test_stopping_returns_at_once(figure: Any) -> None:
 
 def test_stopping_a_screening_leaves_no_checkpoint(figure: Any, tmp_path: Path) -> None:
     file = tmp_path / "checkpoint"
-    trainer = run(figure, small(seeds=3, screening=5), checkpoint=file, should_stop=stop_after(8))
-    assert trainer.step <= 5 and not file.exists()
+    trainer = run(figure, small(**SCREENED), checkpoint=file, should_stop=stop_after(6))
+    assert trainer.step <= 4 and not file.exists()
 
 
 def test_screening_goes_on_with_the_lowest_cycle_error(figure: Any) -> None:
     frames = Frames(torch.from_numpy(figure.points), torch.ones(*figure.points.shape[:2], 1))
     chosen = set()
-    for seed in (10, 20):
-        preset = small(seeds=3, screening=4, seed=seed)
+    for seed in (3, 6):
+        preset = small(**SCREENED, seed=seed)
         cycle = {}
-        for candidate in range(seed, seed + 3):
+        for candidate in range(3 * seed, 3 * seed + 3):
             trainer = Trainer(frames, preset, candidate)
             for _ in range(4):
                 trainer.advance()
             cycle[candidate] = trainer.measure()[1]
         best = min(cycle, key=lambda candidate: cycle[candidate])
         assert run(figure, preset).seed == best
-        assert_same(run(figure, preset), run(figure, small(seed=best)))
-        chosen.add(best - seed)
+        assert_same(run(figure, preset), run(figure, small(steps=40, seed=best)))
+        chosen.add(best % 3)
     assert len(chosen) > 1
+
+
+def test_screening_takes_a_tenth_of_a_short_training(figure: Any) -> None:
+    seen: list[tuple[int, int]] = []
+    for screening in (1000, 2):
+        run(
+            figure,
+            small(steps=20, seeds=2, screening=screening),
+            on_step=lambda trainer: seen.append((trainer.seed, trainer.step)),
+        )
+        assert [step for _, step in seen] == list(range(2, 21))
+        assert len({seed for seed, _ in seen}) == 1
+        seen.clear()
 
 
 def test_the_same_seed_is_the_same_training_and_another_is_not(figure: Any) -> None:
