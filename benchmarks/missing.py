@@ -20,7 +20,7 @@ LIMBS = {
     "arm": ("humerus", "radius", "wrist", "hand", "fingers", "thumb"),
     "leg": ("femur", "tibia", "foot", "toes"),
 }
-LIFTING = {"zero-fill": LiftingOptions(refill=0), "refill (shipped)": LiftingOptions()}
+LIFTING = {"shipped": LiftingOptions()}
 TRAINED = {"default recipe": {}, "masked": {"mask": 0.3}}
 LEGEND = {
     "0 ... 9": "keypoints hidden in each frame, drawn at random",
@@ -29,8 +29,6 @@ LEGEND = {
     "masked": f"default recipe, up to {TRAINED['masked']['mask']:.0%} of the points hidden at each "
     "training step",
     "zero-fill": "missing points are zero in the network's input",
-    "refill (shipped)": "they are filled with their own reprojection, "
-    f"{LiftingOptions().refill} rounds; all else is as shipped in both",
     "figures": f"shape error in %, over all points: {CONVENTIONS['shape %']}",
     "proper": CONVENTIONS["proper %"],
 }

@@ -17,7 +17,7 @@ from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 SUBJECTS = ("01",)
 RATIOS = {"0 %": 0.0, "5 %": 0.05, "10 %": 0.1, "15 %": 0.15, "20 %": 0.2}
-SHARES = {f"{share:g}": LiftingOptions(back_projection=share) for share in (0.0, 0.5, 1.0)}
+SHARES = {f"{share:g}": LiftingOptions(noise=share) for share in (0.0, 0.5, 1.0)}
 LEGEND = {
     "noise": "||noise||_F / ||W||_F of each frame, Gaussian; the truth is without",
     "clean": "default recipe, trained on the frames without noise",

@@ -27,10 +27,10 @@ CONVENTIONS = {
     "unscaled %": "as proper, without rescaling",
 }
 """What each figure of `figures` means."""
-ALONE = LiftingOptions(back_projection=0.0, turns=1)
+ALONE = LiftingOptions(correction="none", turns=1)
 LIFTING = {
     "network alone": ALONE,
-    "back-projected": LiftingOptions(turns=1),
+    "back-projected": LiftingOptions(correction="back_projection", turns=1),
     "as shipped": LiftingOptions(),
 }
 """How a model's shapes come about: one pass, one pass moved onto the input, the default."""
@@ -83,7 +83,7 @@ def reconstruct(lifter: Lifter, ensemble: Ensemble) -> NDArray[np.float32]:
 
     A frame that cannot be lifted comes out as a point, which is an error of 100 %.
     """
-    chunks = (ensemble[slice(i, i + 4096)] for i in range(0, len(ensemble), 4096))
+    chunks = (ensemble[slice(i, i + 1024)] for i in range(0, len(ensemble), 1024))
     lifted = [lifter(chunk.points, chunk.visible.astype(np.float32)) for chunk in chunks]
     S: NDArray[np.float32] = np.concatenate(
         [np.nan_to_num(part.shapes * part.scale[:, None, None]) for part in lifted]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.nrsfm.correction import correct
 from deep_nrsfm_ros.nrsfm.geometry import (
-    back_project,
     centre,
     on_one_line,
     polar,
@@ -19,7 +19,7 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     weak_perspective,
 )
 from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.nrsfm.network import forward
+from deep_nrsfm_ros.nrsfm.network import complete, reconstruct
 
 Float32 = NDArray[np.float32]
 
@@ -30,15 +30,21 @@ _RESIDUAL_SPREAD = 0.02  # squared residual by which a turn loses all but 1/e of
 class LiftingOptions:
     """Lifting."""
 
-    back_projection: float = option(
-        1.0,
-        "share of the remaining reprojection error that is removed by moving points within the "
-        "image plane; 1 pays below 5 % noise, 0.5 below 10 %, 0 leaves the network's shape",
+    correction: str = option(
+        "learned",
+        "how what is left of the keypoints moves the shape: by what the model has learned of its "
+        "own errors, depth included; by back-projection, within the image plane; or not at all",
+        choices=("learned", "back_projection", "none"),
+    )
+    noise: float = option(
+        0.02,
+        "noise of the keypoints, relative to the size of the object in the image: how far the "
+        "corrected shape may stay from them; 0 meets them exactly and magnifies their noise",
         low=0.0,
         high=1.0,
     )
     refill: int = option(
-        5, "rounds of filling missing points with their own reprojection", low=0, high=50
+        2, "rounds of filling missing points with those of the lifted shape", low=0, high=50
     )
     turns: int = option(
         4,
@@ -69,7 +75,7 @@ class Lifted(NamedTuple):
     rotations: Float32  # (n, 3, 3) object to camera: p_camera = R p_object, det +1
     scale: Float32  # (n,) pixels per output unit
     translation: Float32  # (n, 2) where the shape's centre is in the image
-    residual: Float32  # (n,) relative reprojection error of the network, before back-projection
+    residual: Float32  # (n,) relative reprojection error of the network, before correction
     confidence: Float32  # (n, p) 0..1
 
 
@@ -84,6 +90,10 @@ class Lifter:
         angles = 2 * np.pi * np.arange(self.options.turns) / self.options.turns
         c, s = np.cos(angles), np.sin(angles)
         self._turns = np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy()
+        p = len(model.layout)
+        turn = np.kron(np.eye(p), model.object_frame)
+        learned = self.options.correction == "learned"
+        self._covariance = turn.T @ model.error_covariance @ turn if learned else np.eye(3 * p)
         self._reference = pair and (model.layout.index(pair[0]), model.layout.index(pair[1]))
 
     def __call__(self, points: Float32, confidence: Float32) -> Lifted:
@@ -98,30 +108,56 @@ class Lifter:
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
         visible = confidence > 0
-        S, M, residual = self._average(points, visible)
+        mask = visible[..., None].astype(np.float32)
+        whole = np.ones_like(mask)
+        fitted = self._fit(*complete(self.model.network, points, mask), visible)
+        if not visible.all():
+            for _ in range(self.options.refill):
+                S, _, _, unit, origin = fitted
+                filled = np.where(visible[..., None], points, unit * S[..., :2] + origin)
+                fitted = self._fit(filled, whole, visible)
+        S, R, residual, _, _ = fitted
         S = centre(S)
         S *= self.options.reference_length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
-        R = rotation_from_camera(M)
         lifted = Lifted(S, R, scale, translation, residual, self._sure(confidence, residual))
         lost = on_one_line(points, visible)
         lost |= visible.sum(1) < self.options.min_visible
         return _blank(lifted, lost) if lost.any() else lifted
 
-    def _average(
-        self, points: Float32, visible: NDArray[np.bool_]
-    ) -> tuple[Float32, Float32, Float32]:
-        """Return S (n, p, 3) in camera axes and pixels, M (n, 3, 2) from the object, residual (n,).
+    def _fit(
+        self, points: Float32, mask: Float32, visible: NDArray[np.bool_]
+    ) -> tuple[Float32, Float32, Float32, Float32, Float32]:
+        """Return S in camera axes, R, residual (n,), and what leads to the image: unit, origin.
 
-        Means over the turns of the input within the image plane, each by its residual.
+        The network sees the points (n, p, 2) of mask (n, p, 1); the correction the visible alone.
+        """
+        W, gain, unit, origin = self.model.normaliser.encode(points, mask)
+        S, M, residual = self._average(gain * W, W, visible)
+        R = rotation_from_camera(M)
+        if self.options.correction != "none":
+            seen = visible[..., None]
+            size = np.sqrt((W * W * seen).sum((1, 2)) / np.maximum(2 * seen.sum((1, 2)), 1))
+            noise = self.options.noise * size
+            S = correct(S @ R, M, W, visible, self._covariance, noise) @ R.swapaxes(1, 2)
+        return S, R, residual, unit, origin
+
+    def _average(
+        self, x: Float32, W: Float32, visible: NDArray[np.bool_]
+    ) -> tuple[Float32, Float32, Float32]:
+        """Return S (n, p, 3) in camera axes, M (n, 3, 2) from the object's, residual (n,).
+
+        Means over the turns of the network's input x within the image plane, each by the residual
+        that it leaves of W.
         """
         turns = self._turns  # (k, 2, 2)
-        k, (n, p, _) = len(turns), points.shape
-        turned = (points @ turns.swapaxes(1, 2)[:, None]).reshape(k * n, p, 2)
-        S, M, residual = self._lift(turned, np.tile(visible, (k, 1)))
-        S, M, residual = S.reshape(k, n, p, 3), M.reshape(k, n, 3, 2), residual.reshape(k, n)
-        S[..., :2] = S[..., :2] @ turns[:, None]
-        M = M @ turns[:, None]
+        k, (n, p, _) = len(turns), W.shape
+        turned = (x @ turns.swapaxes(1, 2)[:, None]).reshape(k * n, p, 2)
+        S, M = reconstruct(self.model.network, turned)
+        A = self.model.object_frame
+        M = (A.T @ M).reshape(k, n, 3, 2) @ turns[:, None]
+        S = (S @ A).reshape(k, n, p, 3) @ rotation_from_camera(M).swapaxes(-1, -2)
+        residual = reprojection_error(W, S[..., :2], visible)
         trust = np.exp((residual.min(0) ** 2 - residual**2) / _RESIDUAL_SPREAD)
         trust /= trust.sum(0)
         M = (trust[..., None, None] * M).sum(0)
@@ -130,44 +166,6 @@ class Lifter:
             polar(M.swapaxes(1, 2)).swapaxes(1, 2),
             (trust * residual).sum(0),
         )
-
-    def _lift(
-        self, points: Float32, visible: NDArray[np.bool_]
-    ) -> tuple[Float32, Float32, Float32]:
-        """Return S in camera axes and pixels, M from the object's axes, and the residual (n,)."""
-        S, M, W, unit = self._reconstruct(points, visible)
-        residual = reprojection_error(points, S @ M, visible)
-        S = back_project(S, M, W, self.options.back_projection)
-        A = self.model.object_frame
-        M = A.T @ M
-        R = rotation_from_camera(M)
-        return unit * (S @ A @ R.swapaxes(1, 2)), M, residual
-
-    def _reconstruct(
-        self, points: Float32, visible: NDArray[np.bool_]
-    ) -> tuple[Float32, Float32, Float32, Float32]:
-        """Return the network's S and M, its input W, missing points at S M, and W's unit."""
-        mask = visible[..., None].astype(np.float32)
-        encode = self.model.normaliser.encode
-        seen = encode(points, mask)
-        S, M = self._forward(seen.W * seen.gain)
-        if visible.all():
-            return S, M, seen.W, seen.unit
-        for _ in range(self.options.refill):
-            P = S @ M
-            scale, shift = weak_perspective(points, P, visible)
-            filled = np.where(mask > 0, points, scale[:, None, None] * P + shift[:, None])
-            seen = encode(filled, np.ones_like(mask))
-            S, M = self._forward(seen.W)
-        return S, M, np.where(mask > 0, seen.W, S @ M), seen.unit
-
-    def _forward(self, W: Float32) -> tuple[Float32, Float32]:
-        """Return the network's S and an orthonormal M; S takes over the size of a free camera."""
-        S, M = forward(self.model.network, W)
-        if self.model.network.architecture.camera == "free":
-            S = S * ((M * M).sum((1, 2), keepdims=True) / 2) ** 0.5
-            M = polar(M.swapaxes(1, 2)).swapaxes(1, 2)
-        return S, M
 
     def _reference_size(self, S: Float32) -> Float32:
         """Return the size (n, 1, 1) of each shape that the reference length stands for."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
 from deep_nrsfm_ros.nrsfm.gradient import differentiable
-from deep_nrsfm_ros.nrsfm.network import Network, whiten
+from deep_nrsfm_ros.nrsfm.network import Network, complete, whiten
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
@@ -72,7 +72,7 @@ class Objective:
             Q = polar(torch.randn(len(known), 2, 3, generator=generator, device=known.device))
             replay = known @ Q.mT, torch.ones_like(known[..., :1])
             frames = Frames(*(torch.cat(pair) for pair in zip(frames, replay, strict=True)))
-        x, W, unit = self._observe(frames, generator)
+        x, W, unit = self._observe(net, frames, generator)
         S, M = differentiable(net, x)
         S, again, M, W, mask = S[:b], S[b:], M[:b], W[:b], frames.mask[:b]
         W = visible_centre(W, mask)
@@ -97,7 +97,9 @@ class Objective:
             error, X = whiten(net, error), whiten(net, X)
         return (frobenius(error) / frobenius(X)).mean()
 
-    def _observe(self, frames: Frames, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    def _observe(
+        self, net: Network, frames: Frames, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the network's input, what it should reproject to, and the unit (b, 1, 1).
 
         The input is noisy and incomplete by the recipe; the target is the frame itself.
@@ -114,5 +116,5 @@ class Objective:
                 (len(points), 1, 1), generator=generator, device=device
             )
             mask = mask * (torch.rand(mask.shape, generator=generator, device=device) >= level)
-        seen = self.normaliser.encode(points, mask)
+        seen = self.normaliser.encode(*complete(net, points, mask))
         return seen.W * seen.gain, (frames.points - seen.origin) / seen.unit, seen.unit

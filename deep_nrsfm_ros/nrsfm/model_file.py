@@ -22,7 +22,7 @@ from deep_nrsfm_ros.nrsfm.network import Architecture, Network, weight_shapes
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 
 MODEL_SUFFIX = ".safetensors"
-_FORMAT = "deep_nrsfm_ros model 1"
+_FORMAT = "deep_nrsfm_ros model 2"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _MAX_BYTES = 64 * 2**20
 
@@ -38,6 +38,7 @@ class Model:
     object_frame: (3, 3) orthonormal A that takes the network's axes to the object's (S A, A^T M).
         det -1 undoes a mirrored depth; the axes are x front, y left, z up where the layout has
         a handedness.
+    error_covariance: (3p, 3p) of the network's errors, in its own axes; see `correction`.
     provenance: data, recipe and versions; quality: label-free figures.
     """
 
@@ -46,6 +47,7 @@ class Model:
     layout: KeypointLayout
     normaliser: Normaliser
     object_frame: NDArray[np.float32]
+    error_covariance: NDArray[np.float32]
     provenance: dict[str, Any] = field(default_factory=dict)
     quality: dict[str, Any] = field(default_factory=dict)
 
@@ -62,6 +64,7 @@ def save_model(path: Path, model: Model) -> None:
         "quality": model.quality,
     }
     weights = {k: np.ascontiguousarray(w, np.float32) for k, w in model.network.named()}
+    weights["error_covariance"] = np.ascontiguousarray(model.error_covariance, np.float32)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -99,7 +102,9 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     check(architecture)
     check(normaliser)
     layout = KeypointLayout(**_tuples(header["layout"]))
-    for name, shape in weight_shapes(architecture, len(layout)).items():
+    p = len(layout)
+    shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
+    for name, shape in shapes.items():
         found = weights[name]
         if found.shape != shape or found.dtype != np.float32 or not np.isfinite(found).all():
             raise ValueError(
@@ -108,12 +113,18 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     frame = np.array(header["object_frame"], np.float32)
     if frame.shape != (3, 3) or not np.abs(frame @ frame.T - np.eye(3)).max() < 1e-3:
         raise ValueError("object_frame is not orthonormal (3, 3)")
+    covariance = weights["error_covariance"]
+    if not (np.abs(covariance - covariance.T) <= 1e-5 * np.trace(covariance)).all():
+        raise ValueError("error_covariance is not symmetric")
+    if not np.linalg.eigvalsh(covariance)[0] > 0:
+        raise ValueError("error_covariance is not positive definite")
     return Model(
         str(header["name"]),
         Network.from_named(architecture, weights),
         layout,
         normaliser,
         frame,
+        covariance,
         dict(header["provenance"]),
         dict(header["quality"]),
     )

@@ -177,6 +177,34 @@ def unwhiten(net: Network, X: Array) -> Array:
     return _symmetric_product(net.L_inverse, X) if net.architecture.whitening else X
 
 
+def complete(net: Network, points: Array, mask: Array) -> tuple[Array, Array]:
+    """Fill the missing of points (n, p, d), mask (n, p, 1) 1 or 0; return points and mask.
+
+    They go where ||L C X||_F is least, C taking the mean off: where a Gaussian of the keypoints'
+    second moment expects them, given those seen. Zeros would not do, since L spreads every point
+    over all others. A network without whitening takes zeros, so all stays as it is.
+    """
+    if not net.architecture.whitening or mask.all():
+        return points, mask
+    P = net.L @ net.L
+    sums = P.sum(-1)
+    # Least over the translation as well, which takes one direction out of P.
+    P = P - sums[:, None] * sums / sums.sum()
+    one = net.L @ net.L_inverse
+    P = P + 1e-6 * P.trace() * one  # so that a frame without a visible point has an answer too
+    rows = mask * one + (1 - mask) * P
+    return _solve(rows, mask * points), mask * 0 + 1
+
+
+def _solve(A: Array, B: Array) -> Array:
+    """Return A^-1 B in the library that they are of."""
+    if isinstance(A, np.ndarray):
+        return np.linalg.solve(A, B)
+    from torch.linalg import solve
+
+    return solve(A, B)
+
+
 def _symmetric_product(A: Array, X: Array) -> Array:
     """Return A X for a symmetric A (p, p): X^T A is one matrix product for the whole batch."""
     return (X.swapaxes(-1, -2) @ A).swapaxes(-1, -2)
@@ -186,6 +214,15 @@ def forward(net: Network, W: Array) -> tuple[Array, Array]:
     """Return shape S (..., p, 3) and camera M (..., 3, 2) of the keypoints W (..., p, 2)."""
     psi, M = recover(net, encode(net, W)[-1])
     return decode(net, psi)[0], M
+
+
+def reconstruct(net: Network, W: Array) -> tuple[Array, Array]:
+    """Return `forward` with an orthonormal M; S takes over the size of a free camera."""
+    S, M = forward(net, W)
+    if net.architecture.camera == "orthonormal":
+        return S, M
+    size = ((M * M).sum((-2, -1))[..., None, None] / 2) ** 0.5
+    return S * size, polar(M.swapaxes(-1, -2)).swapaxes(-1, -2)
 
 
 def encode(net: Network, W: Array) -> list[Array]:

@@ -19,11 +19,20 @@ from torch import Tensor
 
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.nrsfm.correction import error_covariance
+from deep_nrsfm_ros.nrsfm.geometry import Floats
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.losses import Frames, Objective, visible_centre
 from deep_nrsfm_ros.nrsfm.metrics import object_frame
 from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.nrsfm.network import Network, coherence, forward, initialise, whitening
+from deep_nrsfm_ros.nrsfm.network import (
+    Network,
+    coherence,
+    complete,
+    initialise,
+    reconstruct,
+    whitening,
+)
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 
@@ -73,7 +82,7 @@ class Trainer:
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)
         self.shapes: Tensor | None = None  # of the last batch, for the cycle loss
-        self.probe = self._batch(1024, -1)
+        self.probe = self.sample(1024)
 
     @property
     def net(self) -> Network:
@@ -84,7 +93,7 @@ class Trainer:
         weights = dict(self.initial.named()) | dict(zip(learned, views, strict=True))
         return Network.from_named(self.initial.architecture, weights)
 
-    def _batch(self, size: int, step: int) -> Frames:
+    def sample(self, size: int, step: int = -1) -> Frames:
         """Return the random batch of a step; leaves the generator ready for its cameras."""
         self.generator.manual_seed((self.seed << 32) + step + 1)
         f = len(self.frames.points)
@@ -97,7 +106,7 @@ class Trainer:
         began = time.process_time()
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.preset.recipe, self.step)
-        batch = self._batch(self.preset.recipe.batch, self.step)
+        batch = self.sample(self.preset.recipe.batch, self.step)
         losses = self.objective(self.net, batch, self.shapes, self.generator)
         self.shapes = losses.shapes
         self.optimiser.zero_grad(set_to_none=True)
@@ -140,9 +149,10 @@ class Trainer:
             for name, value in tensors.items()
             if name.startswith("adam.")
         }
-        self.probe = self._batch(1024, -1)
+        self.probe = self.sample(1024)
 
 
+_COVARIANCE_FRAMES = 4096
 _COUNTS = {"step", "seed", "cpu_seconds"}
 
 
@@ -294,14 +304,23 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
     """Return the trained model with its object frame, provenance and label-free quality."""
     loss, cycle = trainer.measure()
     net = trainer.net.map(lambda w: w.detach().cpu().numpy())
-    seen = trainer.preset.normaliser.encode(*trainer.probe)
-    S, _ = forward(net, (seen.W * seen.gain).cpu().numpy())
+    normaliser = trainer.preset.normaliser
+
+    def lift(W: Floats) -> tuple[Floats, Floats, Floats]:
+        seen = normaliser.encode(W, np.ones_like(W[..., :1]))
+        return *reconstruct(net, seen.W), seen.W
+
+    sample = trainer.sample(_COVARIANCE_FRAMES)
+    W, _ = complete(net, sample.points.cpu().numpy(), sample.mask.cpu().numpy())
+    S, _, _ = lift(W)
+    covariance = error_covariance(lift, W, np.random.default_rng(trainer.seed))
     return Model(
         name,
         net,
         layout,
-        trainer.preset.normaliser,
+        normaliser,
         object_frame(S, layout),
+        covariance,
         provenance={
             "data": source,
             "frames": len(trainer.frames.points),

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective
-from deep_nrsfm_ros.nrsfm.network import Architecture, Network, forward, initialise
+from deep_nrsfm_ros.nrsfm.network import Architecture, Network, complete, forward, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
@@ -89,10 +89,12 @@ def test_a_whitened_net_weighs_differences_by_its_whitening(scale: str) -> None:
     net, (points, visible) = network(whitening=1.0), batch(incomplete=True)
     whitened, plain = [], []
     for frame, seen in zip(points, visible, strict=True):
-        W = np.zeros((P, 2))
-        W[seen] = normalised(frame[seen], scale)
-        S, M = forward(net, W * P / seen.sum())
-        error = np.zeros((P, 2))
+        filled, _ = complete(net, frame[None], seen[None, :, None] * 1.0)
+        x = normalised(filled[0], scale)
+        unit = np.linalg.norm(filled[0] - filled[0].mean(0)) / np.linalg.norm(x)
+        W, error = np.zeros((P, 2)), np.zeros((P, 2))
+        W[seen] = (frame[seen] - frame[seen].mean(0)) / unit
+        S, M = forward(net, x)
         error[seen] = W[seen] - ((S @ M)[seen] - (S @ M)[seen].mean(0))
         whitened.append(np.linalg.norm(net.L @ error) / np.linalg.norm(net.L @ W))
         plain.append(np.linalg.norm(error) / np.linalg.norm(W))

@@ -43,7 +43,10 @@ def model(
     network = initialise(architecture, len(layout), rng, as_released=True)
     provenance = {"data": "bags a, b", "frames": 5, "recipe": {"cycle": 2.0}}
     quality = {"cycle_error": 0.25, "coherence": 0.5}
-    return Model("mine", network, layout, Normaliser("none"), MIRROR, provenance, quality)
+    covariance = np.diag(rng.uniform(1, 2, 3 * len(layout))).astype(np.float32)
+    return Model(
+        "mine", network, layout, Normaliser("none"), MIRROR, covariance, provenance, quality
+    )
 
 
 @pytest.fixture
@@ -151,6 +154,20 @@ def test_weights_are_checked(file: Path, weight: str, kind: str) -> None:
     assert weight in refused(file)
 
 
+@pytest.mark.parametrize(
+    ("kind", "refusal"), [("skew", "not symmetric"), ("indefinite", "not positive definite")]
+)
+def test_the_error_covariance_is_checked(file: Path, kind: str, refusal: str) -> None:
+    def change(header: Any, weights: Any, metadata: Any) -> None:
+        if kind == "skew":
+            weights["error_covariance"][0, 1] = 0.5
+        else:
+            weights["error_covariance"][2, 2] *= -1
+
+    rewrite(file, change)
+    assert f"error_covariance is {refusal}" in refused(file)
+
+
 HEADERS: dict[str, dict[str, Any]] = {
     "no layer": {"architecture": {"widths": []}},
     "widths of words": {"architecture": {"widths": ["8", "4"]}},
@@ -187,15 +204,15 @@ def test_a_header_is_complete(file: Path, missing: str) -> None:
 
 def test_metadata_are_checked(file: Path) -> None:
     rewrite(file, lambda header, weights, metadata: metadata.update(format="another model 7"))
-    assert "deep_nrsfm_ros model 1" in refused(file)
+    assert "deep_nrsfm_ros model 2" in refused(file)
     save_model(file, model())
     rewrite(file, lambda header, weights, metadata: header.clear())
     assert "damaged header" in refused(file)
     weights = dict(model().network.named())
     save_file(weights, file)
-    assert "deep_nrsfm_ros model 1" in refused(file)
+    assert "deep_nrsfm_ros model 2" in refused(file)
     for text in ("", "{", "[]", "3", "[" * 100_000):
-        save_file(weights, file, {"format": "deep_nrsfm_ros model 1", "model": text})
+        save_file(weights, file, {"format": "deep_nrsfm_ros model 2", "model": text})
         assert "damaged header" in refused(file)
 
 

@@ -16,10 +16,12 @@ from deep_nrsfm_ros.nrsfm.network import (
     Architecture,
     Network,
     coherence,
+    complete,
     decode,
     encode,
     forward,
     initialise,
+    reconstruct,
     recover,
     weight_shapes,
     whitening,
@@ -347,3 +349,44 @@ def test_whitening_of_centred_points_is_finite() -> None:
 def test_training_learns_everything_but_the_whitening() -> None:
     net = random_network(Architecture((4, 3)), 5)
     assert {n for n, _ in net.named()} - {n for n, _ in net.learned()} == {"L", "L_inverse"}
+
+
+@some
+@given(points, seeds, st.sampled_from([1, 2]))
+def test_missing_points_go_where_the_whitened_norm_is_least(p: int, seed: int, d: int) -> None:
+    net = random_network(Architecture((4,), whitening=1.0), p, seed)
+    rng = np.random.default_rng(seed)
+    points, mask = rng.standard_normal((3, p, d)) + 5, (rng.random((3, p, 1)) < 0.6) * 1.0
+    mask[0], mask[1] = 1, np.arange(p)[:, None] == 0
+    filled, whole = complete(net, points, mask)
+    assert (whole == 1).all()
+    np.testing.assert_allclose(filled[0], points[0], atol=1e-6)
+    for X, W, m in zip(filled, points, mask[..., 0] > 0, strict=True):
+        np.testing.assert_allclose(X[m], W[m], atol=1e-6)
+        if not m.any():
+            continue
+        # Over the missing points and the translation, which the columns of B move.
+        B = np.c_[np.eye(p)[:, ~m], np.ones(p)]
+        visible = np.where(m[:, None], W, 0)
+        least = visible - B @ np.linalg.lstsq(net.L @ B, net.L @ visible, rcond=None)[0]
+        np.testing.assert_allclose(X - X[m][0], least - least[m][0], atol=1e-2)
+    tensors = net.map(torch.from_numpy)
+    again, _ = complete(tensors, torch.from_numpy(points), torch.from_numpy(mask))
+    np.testing.assert_allclose(again, filled, atol=1e-8)
+
+
+def test_without_whitening_missing_points_stay_as_they_are() -> None:
+    net = random_network(Architecture((4,), whitening=0.0), 5)
+    points, mask = np.ones((2, 5, 2)), np.tile([[1.0], [0], [1], [1], [0]], (2, 1, 1))
+    assert complete(net, points, mask)[0] is points and complete(net, points, mask)[1] is mask
+
+
+def test_a_free_camera_gives_its_size_to_the_shape() -> None:
+    net = random_network(Architecture((8, 5), camera="free"), 6)
+    W = np.random.default_rng(0).standard_normal((4, 6, 2))
+    (S, M), (shape, camera) = forward(net, W), reconstruct(net, W)
+    np.testing.assert_allclose(
+        camera.swapaxes(1, 2) @ camera, np.tile(np.eye(2), (4, 1, 1)), atol=1e-9
+    )
+    size = np.linalg.norm(M, axis=(1, 2)) / 2**0.5
+    np.testing.assert_allclose(shape, S * size[:, None, None])

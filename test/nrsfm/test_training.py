@@ -63,8 +63,8 @@ def assert_same(a: Trainer, b: Trainer) -> None:
 def test_a_low_rank_object_is_recovered(figure: Any, trained: Trainer) -> None:
     model = finish(trained, "figure", figure.layout, "test")
     confidence = np.ones(figure.points.shape[:2], np.float32)
-    for back_projection, bound in ((0.0, 0.08), (1.0, 0.06)):
-        lifter = Lifter(model, LiftingOptions(back_projection=back_projection))
+    for correction, bound in (("none", 0.08), ("back_projection", 0.06), ("learned", 0.06)):
+        lifter = Lifter(model, LiftingOptions(correction=correction))
         lifted = lifter(figure.points, confidence)
         errors = shape_errors(lifted.shapes, figure.shapes)
         assert errors.shape < bound
