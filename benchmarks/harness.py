@@ -32,7 +32,8 @@ CHECKPOINT_SECONDS = 30.0
 LIFTING_LEGEND = {
     "network alone": "one pass of the network, nothing after it",
     "back-projected": "one pass, then moved within the image plane onto the keypoints",
-    "as shipped": f"averaged over {LiftingOptions().turns} turns of the image, back-projected",
+    "as shipped": f"averaged over {LiftingOptions().turns} turns of the image, then corrected by "
+    "what the model knows of its own errors",
 }
 
 

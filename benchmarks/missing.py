@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.harness import Session, across, command, in_pairs
 from benchmarks.table import Table, lines
-from deep_nrsfm_ros.commands.evaluate import CONVENTIONS
+from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, figures
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+from deep_nrsfm_ros.nrsfm.metrics import shape_errors
+from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.nrsfm.network import reconstruct
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 SUBJECTS = ("01",)
@@ -20,7 +23,11 @@ LIMBS = {
     "arm": ("humerus", "radius", "wrist", "hand", "fingers", "thumb"),
     "leg": ("femur", "tibia", "foot", "toes"),
 }
-LIFTING = {"shipped": LiftingOptions()}
+ZERO_FILL = "zero-fill"
+LIFTING = {
+    "expected": LiftingOptions(refill=0),
+    "expected, refilled (shipped)": LiftingOptions(),
+}
 TRAINED = {"default recipe": {}, "masked": {"mask": 0.3}}
 LEGEND = {
     "0 ... 9": "keypoints hidden in each frame, drawn at random",
@@ -28,7 +35,10 @@ LEGEND = {
     + " of one side, drawn for each frame",
     "masked": f"default recipe, up to {TRAINED['masked']['mask']:.0%} of the points hidden at each "
     "training step",
-    "zero-fill": "missing points are zero in the network's input",
+    ZERO_FILL: "missing points are zero in the network's input; the network alone",
+    "expected": "they go where the second moment of the keypoints expects them; the lifted shape "
+    "is corrected by the points that are seen",
+    "refilled": f"they then follow the lifted shape, {LiftingOptions().refill} rounds",
     "figures": f"shape error in %, over all points: {CONVENTIONS['shape %']}",
     "proper": CONVENTIONS["proper %"],
 }
@@ -53,10 +63,24 @@ def benchmark(session: Session) -> Table:
                 preset = session.preset("default", seed, **recipe)
                 name = "masked" if recipe else "default"
                 model = session.trained(f"{subject} {name} seed {seed}", ensemble, preset)
+                row = zero_filled(model, tests)
+                table.add((subject, trained, ZERO_FILL), row, seed)
                 for lifting, options in LIFTING.items():
                     row = across({c: (model, test) for c, test in tests.items()}, options)
                     table.add((subject, trained, lifting), row, seed)
     return table
+
+
+def zero_filled(model: Model, tests: Mapping[str, Ensemble]) -> dict[str, float]:
+    """Return the errors (%) of the network alone with zeros for what is missing."""
+    row: dict[str, float] = {}
+    for column, test in tests.items():
+        seen = model.normaliser.encode(test.points, test.visible[..., None].astype(np.float32))
+        S, _ = reconstruct(model.network, seen.W * seen.gain)
+        assert test.shapes is not None
+        found = figures(shape_errors(S, test.shapes))
+        row |= {column: found["shape %"], f"{column} proper": found["proper %"]}
+    return row
 
 
 def hidden(ensemble: Ensemble, what: str, seed: int = 0) -> Ensemble:
