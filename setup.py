@@ -22,6 +22,7 @@ setup(
         (SHARE, ["package.xml"]),
         (f"{SHARE}/launch", glob("launch/*.launch.py")),
         (f"{SHARE}/config", glob("config/*.yaml")),
+        (f"{SHARE}/config/objects", glob("config/objects/*.yaml")),
         (f"{SHARE}/models", glob("models/*.safetensors") + glob("models/*.md")),
         (f"lib/{NAME}", glob("scripts/*")),
     ],
@@ -32,7 +33,7 @@ setup(
         "safetensors",  # model files: weights and metadata, never pickle
         "torch>=2.2",  # training only; the node lifts without it
         "rosbags",  # reads and writes rosbag2 without a ROS installation
-        "pyyaml",  # parameter files and bag metadata
+        "pyyaml",  # object files, parameter files and bag metadata
         "tqdm",  # progress of training and evaluation
         "ros-jazzy-rclpy",  # the node
         "ros-jazzy-common-interfaces",  # the messages it hears and speaks

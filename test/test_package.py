@@ -131,6 +131,7 @@ def test_share_has_what_the_source_has(prefix):
     for folder, patterns in {
         "launch": ["*.launch.py"],
         "config": ["*.yaml"],
+        "config/objects": ["*.yaml"],
         "models": ["*.safetensors", "*.md"],
     }.items():
         expected = sorted(p.name for pattern in patterns for p in (ROOT / folder).glob(pattern))

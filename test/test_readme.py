@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.node.parameters import name_of
 from deep_nrsfm_ros.node.pipeline import InputOptions
 from deep_nrsfm_ros.node.training_request import TrainingOptions
 from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointLayout
@@ -24,7 +25,7 @@ def parameter_rows(cls: type, prefix: str) -> list[str]:
         shown = {"models_dir": "$ROS_HOME/deep_nrsfm_ros/models", (): "none", "": "empty"}
         text = shown.get(field.name) or shown.get(default, default)
         star = "*" if opt.read_only else ""
-        rows.append(f"| `{prefix}{field.name}`{star} | {text} | {opt.description} |")
+        rows.append(f"| `{name_of(field, prefix)}`{star} | {text} | {opt.description} |")
     return rows
 
 

@@ -19,12 +19,22 @@ from tqdm import tqdm
 
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.configuration import add_arguments, override
-from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, layout
-from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, check_name, save_model
+from deep_nrsfm_ros.node.model_folders import model_folders
+from deep_nrsfm_ros.nrsfm.fine_tuning import inherit, keep_what_is_fixed, start_from
+from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.model_file import (
+    MODEL_SUFFIX,
+    Model,
+    check_name,
+    find_model,
+    load_model,
+    save_model,
+)
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
-from deep_nrsfm_ros.observations.bags import read_bags
+from deep_nrsfm_ros.observations.bags import most_keypoints, read_bags
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 
@@ -37,7 +47,6 @@ def arguments() -> argparse.ArgumentParser:
     data.add_argument(
         "--keypoint-layout",
         default="",
-        choices=list(LAYOUTS),
         help="order of the keypoints in the bags (default: that of the object)",
     )
     data.add_argument(
@@ -53,10 +62,22 @@ def arguments() -> argparse.ArgumentParser:
     data.add_argument("--stride", type=int, default=1, help="take every n-th CMU frame")
     data.add_argument("--camera-seed", type=int, default=0, help="seed of the CMU cameras")
     result = parser.add_argument_group("Result")
-    result.add_argument("--object", default="human17", choices=list(LAYOUTS), help="model's layout")
+    result.add_argument(
+        "--object",
+        default="",
+        help="the model's layout: a preset, an object file (.yaml), a model file, or 'numbered' "
+        "for points without names (default: that of --from, or human17)",
+    )
     result.add_argument("--name", default="trained", help="name of the model")
     result.add_argument("--output", type=Path, default=Path("models"), help="folder of the model")
     run = parser.add_argument_group("Run")
+    run.add_argument(
+        "--from",
+        dest="start",
+        default="",
+        metavar="MODEL",
+        help="start from this model, a name or a file, instead of from chance",
+    )
     run.add_argument("--preset", default="default", choices=list(PRESETS), help="see below")
     run.add_argument("--threads", type=int, default=0, help="threads of torch (0: all cores)")
     run.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
@@ -68,11 +89,10 @@ def arguments() -> argparse.ArgumentParser:
 
 def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
     """Return the ensemble that the arguments name; raise ValueError if there is none."""
-    target = layout(given.object)
     if bool(given.bag) == bool(given.cmu):
         raise ValueError("name what to train on: --bag (repeatable), or --cmu with --subjects")
+    source, target = read_layouts(given)
     if given.bag:
-        source = layout(given.keypoint_layout or given.object)
         reading = read_bags(
             given.bag, given.topic, source, target, given.min_confidence, report.reading
         )
@@ -88,6 +108,30 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
         stride=given.stride,
         on_progress=report.reading,
     )
+
+
+def read_layouts(given: argparse.Namespace) -> tuple[KeypointLayout, KeypointLayout]:
+    """Return the layouts of the data and of the new model; raise ValueError if there is none."""
+    if given.object == NUMBERED:
+        if not given.bag or given.keypoint_layout:
+            raise ValueError(
+                f"--object {NUMBERED} takes the points of bags as they come; "
+                "leave out --keypoint-layout and --cmu, or name an object"
+            )
+        points = KeypointLayout.numbered(most_keypoints(given.bag, given.topic))
+        return points, points
+    target = find_layout("--object", given.object or HUMAN17.name)
+    named = given.keypoint_layout
+    return find_layout("--keypoint-layout", named) if named else target, target
+
+
+def read_start(given: argparse.Namespace) -> Model | None:
+    """Return the model that `--from` names; the new one has its layout unless another is named."""
+    if not given.start:
+        return None
+    path = find_model(given.start, model_folders(given.output))
+    given.object = given.object or str(path)
+    return load_model(path)
 
 
 class Reporter:
@@ -177,16 +221,23 @@ def stop_with_parent(stopped: Callable[[], bool]) -> Callable[[], bool]:
 
 def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], bool]) -> None:
     """Read, train and save as the arguments say; raise ValueError for what cannot be done."""
-    preset = PRESETS[given.preset]
+    preset, start = PRESETS[given.preset], read_start(given)
+    if start:
+        preset = Preset(start.network.architecture, start.normaliser, preset.recipe)
     preset = Preset(
         override(preset.architecture, given),
         override(preset.normaliser, given),
         override(preset.recipe, given),
     )
+    if start:
+        keep_what_is_fixed(start, preset)
     check_name("--name", given.name)
     if importlib.util.find_spec("torch") is None:
         raise ValueError("training needs torch, which is not installed: pip install torch")
     ensemble = read_data(given, report)
+    if ensemble.layout.warning and not start:
+        report.say(ensemble.layout.warning)
+    network = start_from(start, ensemble.layout) if start else None
     seen = ensemble.visible.sum(0)
     unseen = [name for i, name in enumerate(ensemble.layout.keypoints) if not seen[i]]
     if unseen:
@@ -210,11 +261,15 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         on_progress=report.training,
         should_stop=should_stop,
         checkpoint=checkpoint,
+        start=network,
     )
     if not trainer.step:
         report.end("cancelled", "cancelled before anything was learned; nothing was written")
         return
     model = finish(trainer, given.name, ensemble.layout, ensemble.source)
+    model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
+    if start:
+        model = inherit(model, start)
     save_model(model_path, model)
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
     if trainer.step < preset.recipe.steps:

@@ -40,11 +40,13 @@ from visualization_msgs.msg import MarkerArray
 from deep_nrsfm_ros.node import parameters, publishing
 from deep_nrsfm_ros.node.health import Health
 from deep_nrsfm_ros.node.model_folders import model_folders
-from deep_nrsfm_ros.node.pipeline import InputOptions, Pipeline
-from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest
+from deep_nrsfm_ros.node.pipeline import MODEL_ORDER, InputOptions, Pipeline
+from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest, layouts
 from deep_nrsfm_ros.node.training_service import TrainingService
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
-from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
+from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
+from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.observations.messages import MULTI_ARRAY, POINT_CLOUD, POLYGON
 
@@ -179,11 +181,25 @@ class LifterNode(Node):
         lifting = parameters.read(self, LiftingOptions, changes=changes)
         for checked in (TrainingOptions, Recipe):
             parameters.read(self, checked, _TRAIN, changes)
-        if changes and not any(change.name == "model" for change in changes):
-            model = self._pipeline.model
+        # Files are read again only when they are named again: they may be gone by now.
+        changed = {change.name for change in changes} or {"model", "keypoint_layout"}
+        model: Model
+        detector: KeypointLayout | None
+        if "model" in changed:
+            model = load_model(self._model_file(inputs.model))
         else:
-            model = load_model(find_model(inputs.model, model_folders(self._models_dir)))
-        return Pipeline(model, inputs, lifting)
+            model = self._pipeline.model
+        if "keypoint_layout" not in changed:
+            detector = self._pipeline.detector
+        elif inputs.keypoint_layout == MODEL_ORDER:
+            detector = None
+        else:
+            detector = find_layout("keypoint_layout", inputs.keypoint_layout)
+        return Pipeline(model, detector, inputs, lifting)
+
+    def _model_file(self, name: str) -> Path:
+        """Return the file of a model by name or path; raise ValueError if there is none."""
+        return find_model(name, model_folders(self._models_dir))
 
     def _consider(self, changes: list[Parameter]) -> SetParametersResult:
         """Prepare for changed parameters, or refuse them with the reason."""
@@ -202,13 +218,18 @@ class LifterNode(Node):
     def _training_request(self) -> TrainingRequest:
         """Return what ~/train is to do, as the parameters stand."""
         wanted = parameters.read(self, TrainingOptions, _TRAIN)
+        inputs = parameters.read(self, InputOptions)
+        start = str(self._model_file(wanted.from_)) if wanted.from_ else ""
+        heard, model = inputs.keypoint_layout, self._model_file(inputs.model)
+        source, target = layouts(wanted, heard, model, start)
         return TrainingRequest(
             wanted,
             parameters.read(self, Recipe, _TRAIN),
             topic=wanted.topic or self._topic,
-            source_layout=self._pipeline.source.name,
-            target_layout=wanted.object or self._pipeline.model.layout.name,
-            min_confidence=parameters.read(self, InputOptions).min_confidence,
+            source_layout=source,
+            target_layout=target,
+            start=start,
+            min_confidence=inputs.min_confidence,
             output=self._models_dir,
         )
 

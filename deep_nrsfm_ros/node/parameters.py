@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import Field
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -22,7 +23,7 @@ def declare(node: Node, cls: type[Config], prefix: str = "") -> Config:
     """
     for field, _, opt in options(cls):
         descriptor = _descriptor(field.default, opt)
-        node.declare_parameter(prefix + field.name, _to_ros(field.default), descriptor)
+        node.declare_parameter(name_of(field, prefix), _to_ros(field.default), descriptor)
     return read(node, cls, prefix)
 
 
@@ -36,13 +37,18 @@ def read(
     proposed = {parameter.name: parameter.value for parameter in changes}
     values = {}
     for field, _, opt in options(cls):
-        name = prefix + field.name
+        name = name_of(field, prefix)
         # `[]` in a parameter file leaves an array without a value: that is the default too.
         now = node.get_parameter_or(name, Parameter(name, value=_to_ros(field.default)))
         value = proposed.get(name, now.value)
         values[field.name] = _from_ros(name, value, field.default)
         opt.check(name, values[field.name])
     return cls(**values)
+
+
+def name_of(field: Field[Any], prefix: str = "") -> str:
+    """Return the name of the parameter of an option, e.g. "train.from" of the field `from_`."""
+    return prefix + field.name.rstrip("_")
 
 
 def _descriptor(default: Any, opt: Option) -> ParameterDescriptor:

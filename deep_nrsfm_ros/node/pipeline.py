@@ -9,7 +9,7 @@ import numpy as np
 
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.node.model_folders import default_models_dir
-from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointMap, layout
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, MessageError, read
@@ -32,8 +32,8 @@ class InputOptions:
     )
     keypoint_layout: str = option(
         MODEL_ORDER,
-        "order of the detector's keypoints: a preset, or 'model' for the order of the model's own",
-        choices=(MODEL_ORDER, *LAYOUTS),
+        "order of the detector's keypoints: a preset, the path of an object file, or 'model' for "
+        "the order of the model's own",
     )
     min_confidence: float = option(
         0.1, "a keypoint with less confidence counts as missing", low=0, high=1
@@ -43,11 +43,19 @@ class InputOptions:
 class Pipeline:
     """One model, one detector layout, one set of options, ready for messages."""
 
-    def __init__(self, model: Model, inputs: InputOptions, lifting: LiftingOptions) -> None:
-        """Raise ValueError if the model and the detector's layout do not fit each other."""
-        own_order = inputs.keypoint_layout == MODEL_ORDER
-        self.model = model
-        self.source = model.layout if own_order else layout(inputs.keypoint_layout)
+    def __init__(
+        self,
+        model: Model,
+        detector: KeypointLayout | None,
+        inputs: InputOptions,
+        lifting: LiftingOptions,
+    ) -> None:
+        """Raise ValueError if the model and the detector's layout do not fit each other.
+
+        detector: the layout that `inputs.keypoint_layout` names; None for the model's own.
+        """
+        self.model, self.detector = model, detector
+        self.source = detector or model.layout
         self.edges = model.layout.edge_indices()
         self._map = KeypointMap(self.source, model.layout)
         self._lifter = Lifter(model, lifting)

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deep_nrsfm_ros.configuration import option, to_arguments
-from deep_nrsfm_ros.nrsfm.keypoints import layout
-from deep_nrsfm_ros.nrsfm.model_file import check_name
+from deep_nrsfm_ros.node.pipeline import MODEL_ORDER
+from deep_nrsfm_ros.nrsfm.fine_tuning import start_from
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
+from deep_nrsfm_ros.nrsfm.model_file import check_name, load_model
+from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
 
@@ -17,34 +20,76 @@ class TrainingOptions:
 
     bags: tuple[str, ...] = option((), "rosbag2 folders or files to train on")
     topic: str = option("", "topic in the bags; empty: the one that the lifter listens to")
-    object: str = option("", "layout of the new model; empty: that of the present one")
+    object: str = option(
+        "",
+        "layout of the new model: a preset, the path of an object file or of a model file, or "
+        "'numbered' for points without names; empty: that of train.from, or of the present model",
+    )
+    keypoint_layout: str = option(
+        "",
+        "order of the keypoints in the bags; empty: as the parameter keypoint_layout says, and "
+        "where that is 'model', that of train.object if it is set",
+    )
+    from_: str = option(
+        "",
+        "model to start from, by name or path, its keypoints matched by name; empty: from chance",
+    )
     name: str = option("trained", "name of the new model; an old one of this name is replaced")
     threads: int = option(1, "threads that the training may use", low=1, high=1024)
     activate: bool = option(True, "switch to the new model when the training has finished")
 
 
+def layouts(wanted: TrainingOptions, heard: str, model: Path, start: str) -> tuple[str, str]:
+    """Return source and target of a request, as `TrainingRequest` has them.
+
+    heard: the lifter's parameter keypoint_layout. model: the file of the present model. start:
+    that of the model to start from, or "".
+    """
+    target = wanted.object or start or str(model)
+    if wanted.keypoint_layout or target == NUMBERED:
+        return wanted.keypoint_layout, target
+    return (wanted.object or str(model)) if heard == MODEL_ORDER else heard, target
+
+
 @dataclass(frozen=True)
 class TrainingRequest:
-    """Everything that a training is told."""
+    """Everything that a training is told.
+
+    source_layout, target_layout: those of the bags and of the new model, each as `find_layout`
+        takes it; the target may be "numbered", the source is then empty.
+    start: the file of the model to start from, or "".
+    """
 
     options: TrainingOptions
     recipe: Recipe
     topic: str
     source_layout: str
     target_layout: str
+    start: str
     min_confidence: float
     output: Path
 
-    def check(self) -> None:
-        """Raise ValueError that says what is missing or wrong."""
+    def check(self) -> str:
+        """Return what should be known before, or ""; raise ValueError that says what is wrong."""
         if not self.options.bags:
             raise ValueError("no bags to train on; set the parameter train.bags")
         for bag in self.options.bags:
             if not Path(bag).expanduser().exists():
                 raise ValueError(f"train.bags names {bag}, which does not exist")
         check_name("train.name", self.options.name)
-        for name in (self.source_layout, self.target_layout):
-            layout(name)
+        if self.target_layout == NUMBERED:
+            if self.source_layout:
+                raise ValueError(
+                    f"train.object is {NUMBERED!r}: its points come as they are in the bags; "
+                    "empty train.keypoint_layout, or name an object"
+                )
+            return KeypointLayout(NUMBERED, ()).warning
+        source = find_layout("train.keypoint_layout", self.source_layout)
+        target = find_layout("train.object", self.target_layout)
+        KeypointMap(source, target)
+        if self.start:
+            start_from(load_model(Path(self.start)), target)
+        return target.warning
 
     def arguments(self) -> list[str]:
         """Return the arguments of the training command."""
@@ -52,6 +97,7 @@ class TrainingRequest:
             "--topic": self.topic,
             "--keypoint-layout": self.source_layout,
             "--object": self.target_layout,
+            "--from": self.start,
             "--min-confidence": str(self.min_confidence),
             "--name": self.options.name,
             "--output": str(self.output),

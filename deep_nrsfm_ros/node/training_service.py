@@ -61,7 +61,7 @@ class TrainingService:
                     "~/cancel_training"
                 )
             request = self._request()
-            request.check()
+            warning = request.check()
             self._job = TrainingJob(
                 request.arguments(), self._hear, threads=request.options.threads
             )
@@ -72,6 +72,9 @@ class TrainingService:
         data = f"{request.topic} of {', '.join(request.options.bags)}"
         response.success = True
         response.message = f"training {self._wanted.name!r} on {data}"
+        if warning:
+            response.message += f"; {warning}"
+            self._node.get_logger().warning(warning)
         self._tell(Progress("starting", f"starting on {data}", {}))
         return response
 

@@ -1,11 +1,13 @@
 """Keypoint layouts: names in order, edges for drawing, and what fixes the right way round.
 
-A layout is the contract between a detector, a model and a viewer. `LAYOUTS` holds the presets;
-`KeypointMap` takes points from a detector's layout to a model's by name.
+A layout is the contract between a detector, a model and a viewer. `LAYOUTS` holds the presets,
+`object_file` reads those of anything else; `KeypointMap` takes points from a detector's layout to
+a model's by name.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -26,6 +28,8 @@ class KeypointLayout:
     reference: the pair of keypoints whose distance is the reference length. None: the RMS
         radius of the shape takes its place.
     derived: keypoints that a source without them can give as the mean of others.
+    reference_length: length of the reference pair on the real object, in metres, for the output
+        to be in metres. None: it is not known.
     """
 
     name: str
@@ -34,6 +38,7 @@ class KeypointLayout:
     handedness: tuple[str, str, str, str] | None = None
     reference: Edge | None = None
     derived: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    reference_length: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse a layout that repeats a keypoint or names one that it does not have."""
@@ -48,10 +53,28 @@ class KeypointLayout:
         for what, size, group in groups:
             if isinstance(group, str) or len(group) != size:
                 raise ValueError(f"layout {self.name!r}: {what} {group!r} must be {size} names")
+            if len(set(group)) != size:
+                raise ValueError(f"layout {self.name!r}: {what} {group!r} repeats a name")
         named = [*(n for edge in self.edges for n in edge), *(self.handedness or ())]
-        for keypoint in [*named, *(self.reference or ())]:
+        for keypoint in [*named, *(self.reference or ()), *self.derived]:
             if keypoint not in seen:
                 raise ValueError(f"layout {self.name!r} has no keypoint {keypoint!r}")
+        for keypoint, parts in self.derived.items():
+            if isinstance(parts, str) or not parts:
+                raise ValueError(
+                    f"layout {self.name!r}: derived {keypoint!r} is a mean of no names"
+                )
+        if self.reference_length is not None:
+            self._check_reference_length(self.reference_length)
+
+    def _check_reference_length(self, length: float) -> None:
+        """Raise ValueError unless the length is one, and of something."""
+        if not 0 < length < math.inf:
+            raise ValueError(f"layout {self.name!r}: reference_length is {length}, not above 0 m")
+        if not self.reference:
+            raise ValueError(
+                f"layout {self.name!r}: reference_length is of no pair; name reference"
+            )
 
     def __len__(self) -> int:
         """Return p, the number of keypoints."""
@@ -63,6 +86,16 @@ class KeypointLayout:
             return self.keypoints.index(keypoint)
         except ValueError:
             raise KeyError(f"layout {self.name!r} has no keypoint {keypoint!r}") from None
+
+    @property
+    def warning(self) -> str:
+        """Return what somebody who trains on this layout should know, or ""."""
+        if self.handedness:
+            return ""
+        return (
+            f"layout {self.name!r} names no handedness: depth may come out mirrored as a whole; "
+            "an object file can name it"
+        )
 
     def edge_indices(self) -> list[tuple[int, int]]:
         """Return the edges as pairs of places."""

@@ -57,10 +57,11 @@ class LiftingOptions:
         4, "objects with fewer visible keypoints are not lifted", low=3, high=1000
     )
     reference_length: float = option(
-        1.0,
+        0.0,
         "length of the layout's reference pair (of people: neck to mid-hip) in the output; about "
-        "0.5 makes the points of an adult metres. Layouts without one: RMS radius of the shape",
-        low=1e-6,
+        "0.5 makes the points of an adult metres. Layouts without one: RMS radius of the shape. "
+        "0: the length in metres that the model's object file gave, or 1 if it gave none",
+        low=0.0,
         high=1e6,
     )
 
@@ -94,6 +95,7 @@ class Lifter:
         turn = np.kron(np.eye(p), model.object_frame)
         learned = self.options.correction == "learned"
         self._covariance = turn.T @ model.error_covariance @ turn if learned else np.eye(3 * p)
+        self._length = self.options.reference_length or model.layout.reference_length or 1.0
         self._reference = pair and (model.layout.index(pair[0]), model.layout.index(pair[1]))
 
     def __call__(self, points: Float32, confidence: Float32) -> Lifted:
@@ -118,7 +120,7 @@ class Lifter:
                 fitted = self._fit(filled, whole, visible)
         S, R, residual, _, _ = fitted
         S = centre(S)
-        S *= self.options.reference_length / self._reference_size(S)
+        S *= self._length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
         lifted = Lifted(S, R, scale, translation, residual, self._sure(confidence, residual))
         lost = on_one_line(points, visible)

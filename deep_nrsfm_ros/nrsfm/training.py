@@ -56,19 +56,24 @@ class Trainer:
     checkpoint goes on exactly as if it had not stopped.
     """
 
-    def __init__(self, frames: Frames, preset: Preset, seed: int) -> None:
-        """Initialise the network from `seed`."""
+    def __init__(
+        self, frames: Frames, preset: Preset, seed: int, start: Network | None = None
+    ) -> None:
+        """Initialise the network from `seed`, or take that of `start`.
+
+        Either is whitened by the frames, unless it has a whitening already.
+        """
         architecture, normaliser, recipe = preset
         self.frames, self.preset, self.seed, self.step = frames, preset, seed, 0
         self.cpu_seconds = 0.0
         device = frames.points.device
-        initial = initialise(
+        initial = start or initialise(
             architecture,
             frames.points.shape[1],
             np.random.default_rng(seed),
             as_released=recipe.as_released,
         )
-        if architecture.whitening:
+        if architecture.whitening and np.array_equal(initial.L, np.eye(initial.p)):
             moment = second_moment(frames, normaliser)
             exponent, floor = architecture.whitening, architecture.whitening_floor
             L, L_inverse = whitening(moment, exponent, floor)
@@ -126,7 +131,7 @@ class Trainer:
     def state(self) -> dict[str, Tensor]:
         """Return everything that `restore` needs, as named tensors."""
         tensors = {name: torch.tensor(getattr(self, name)) for name in _COUNTS}
-        tensors["weights"] = self.weights.detach()
+        tensors |= {"weights": self.weights.detach(), "L": self.initial.L}
         if self.shapes is not None:
             tensors["shapes"] = self.shapes
         moments = self.optimiser.state.get(self.weights, {})
@@ -137,6 +142,9 @@ class Trainer:
         saved = tensors.get("weights")
         if saved is None or saved.shape != self.weights.shape or not _COUNTS <= tensors.keys():
             raise ValueError("the checkpoint is not of a training of this network; delete it")
+        L: Tensor = self.initial.L
+        if not torch.allclose(tensors.get("L", L).to(L.device), L, 1e-3, 1e-3):
+            raise ValueError("the checkpoint is of other data or another model to start from")
         self.step, self.seed = int(tensors["step"]), int(tensors["seed"])
         self.cpu_seconds = float(tensors["cpu_seconds"])
         device = self.weights.device
@@ -185,14 +193,16 @@ def train(
     should_stop: Callable[[], bool] = lambda: False,
     checkpoint: Path | None = None,
     checkpoint_seconds: float = 30.0,
+    start: Network | None = None,
 ) -> Trainer:
     """Train on keypoints (f, p, 2) with visibility (f, p), any unit, x right and y down.
 
     Returns the trainer at its last step, earlier if `should_stop`. With `checkpoint`, goes on
     from that file if it exists and writes it every `checkpoint_seconds` and when it stops early.
-    `on_step` sees the trainer when its seed is chosen and after each step from then on;
-    `on_progress` hears of all steps now and then. Raises ValueError for data that cannot be
-    trained on or a checkpoint that does not fit.
+    `start` is the network to begin with instead of a random one (see `fine_tuning`), of the
+    preset's architecture; there are no seeds to choose from then. `on_step` sees the trainer when
+    its seed is chosen and after each step from then on; `on_progress` hears of all steps now and
+    then. Raises ValueError for data that cannot be trained on or a checkpoint that does not fit.
     """
     for config in preset:
         check(config)
@@ -233,10 +243,10 @@ def train(
             saved = time.monotonic()
 
     if checkpoint is not None and checkpoint.exists():
-        trainer = Trainer(frames, preset, recipe.seed)
+        trainer = Trainer(frames, preset, recipe.seed, start)
         trainer.restore(read_checkpoint(checkpoint))
-    elif recipe.seeds == 1:
-        trainer = Trainer(frames, preset, recipe.seed)
+    elif recipe.seeds == 1 or start is not None:
+        trainer = Trainer(frames, preset, recipe.seed, start)
     else:
         trainer = chosen()
         if should_stop():  # no checkpoint: going on from here would skip seeds

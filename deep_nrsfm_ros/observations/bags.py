@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +26,7 @@ from deep_nrsfm_ros.observations.messages import (
     POLYGON,
     MessageError,
     Observation,
+    count_keypoints,
     pack_points,
     read,
 )
@@ -33,6 +36,7 @@ Progress = Callable[[int, int], None]
 """Called with the number of messages read so far and the number there are."""
 
 _BLOCK = 4096  # messages mapped and stored together
+_SAMPLE = 256  # messages of a bag that tell how many keypoints there are
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -93,6 +97,32 @@ def read_bags(
         raise BagError(f"no readable message in {names} ({messages} found); {reason or 'empty'}")
     ensemble = frames.ensemble(f"bags {names}")
     return BagReading(ensemble, messages, unreadable, reason, tuple(warnings))
+
+
+def most_keypoints(paths: Sequence[Path], topic: str) -> int:
+    """Return how many keypoints the objects in the bags have, for an object nobody has described.
+
+    Looks at the first messages of each bag and takes the number that most of them have, since a
+    detector may send others while it sees nothing. Raises BagError if no message tells.
+    """
+    counts: Counter[int] = Counter()
+    reason = ""
+    for path in paths:
+        with closing(open_bag(Path(path))) as bag:
+            chosen = _choose(bag, topic)
+            for raw in islice(bag.messages(chosen), _SAMPLE):
+                try:
+                    message = _STORE.deserialize_cdr(raw, chosen.type)
+                    count = count_keypoints(message, chosen.input_type)
+                    if count:
+                        read(message, chosen.input_type, count)  # a damaged one may say anything
+                        counts[count] += 1
+                except Exception as error:  # as in read_bags
+                    reason = reason or _text(error)
+    if not counts:
+        names = ", ".join(path.name for path in map(Path, paths))
+        raise BagError(f"no message in {names} tells how many keypoints there are; {reason}")
+    return counts.most_common(1)[0][0]
 
 
 class _Frames:

@@ -61,6 +61,28 @@ def read(message: Any, input_type: str, keypoints: int, min_confidence: float = 
     return observation(values, min_confidence)
 
 
+def count_keypoints(message: Any, input_type: str) -> int:
+    """Return how many keypoints each object in `message` has; 0 if there is no object in it.
+
+    Raises MessageError for an array of plain numbers that may be pairs or triples.
+    """
+    if input_type == POINT_CLOUD:
+        return int(message.width) if int(message.height) else 0
+    if input_type == POLYGON:
+        return len(message.polygon.points)
+    shape = [int(dimension.size) for dimension in message.layout.dim]
+    if len(shape) > 1:
+        return shape[-2] if math.prod(shape) else 0
+    numbers = max(len(message.data) - int(message.layout.data_offset), 0)
+    fits = [numbers // size for size in (2, 3) if numbers % size == 0]
+    if not numbers or len(fits) == 1:
+        return fits[0]
+    raise MessageError(
+        f"data has {numbers} numbers and no layout; give it one, so that (x, y) can be told from "
+        "(x, y, confidence)"
+    )
+
+
 def observation(values: NDArray[np.floating], min_confidence: float = 0.0) -> Observation:
     """Return values (n, q, 2: x, y or 3: x, y, confidence) with missing keypoints marked.
 
@@ -178,7 +200,8 @@ def _check_keypoints(count: int, keypoints: int, where: str) -> None:
     """Raise MessageError naming both numbers when they differ."""
     if count != keypoints:
         raise MessageError(
-            f"message has {count} keypoints ({where}); the keypoint layout has {keypoints}"
+            f"message has {count} keypoints ({where}); the keypoint layout has {keypoints}: "
+            "name the layout in which the detector gives them"
         )
 
 

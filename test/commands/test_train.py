@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -21,7 +22,8 @@ from deep_nrsfm_ros.commands import train
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.keypoints import COCO17, HUMAN17
 from deep_nrsfm_ros.nrsfm.lifting import Lifter
-from deep_nrsfm_ros.nrsfm.model_file import Model, load_model
+from deep_nrsfm_ros.nrsfm.model_file import Model, load_model, save_model
+from deep_nrsfm_ros.nrsfm.object_file import read_object
 from deep_nrsfm_ros.nrsfm.training import Trainer
 from deep_nrsfm_ros.observations.bags import frames, write_bag
 from deep_nrsfm_ros.observations.ensemble import Ensemble
@@ -224,6 +226,29 @@ BAD: dict[str, tuple[list[str], str]] = {
         ["--bag", "BAG", "--keypoint-layout", "coco17", "--object", "cmu31"],
         "at least 4",
     ),
+    "unknown object": (["--bag", "BAG", "--object", "horse"], "--object is 'horse'; name a preset"),
+    "unknown layout": (
+        ["--bag", "BAG", "--keypoint-layout", "horse"],
+        "--keypoint-layout is 'horse'; name a preset",
+    ),
+    "absent object file": (["--bag", "BAG", "--object", "FOLDER/a.yaml"], "a.yaml: cannot be read"),
+    "numbered with names": (
+        ["--bag", "BAG", "--object", "numbered", "--keypoint-layout", "coco17"],
+        "leave out --keypoint-layout",
+    ),
+    "numbered motion capture": (
+        ["--cmu", "FOLDER", "--object", "numbered"],
+        "--object numbered takes the points of bags",
+    ),
+    "absent start": (["--bag", "BAG", "--from", "nowhere"], "no model 'nowhere'; there are"),
+    "start of another shape": (
+        ["--bag", "BAG", "--from", "human", "--widths", "8"],
+        "widths is (8,); model 'human', from which to start, has",
+    ),
+    "start of another object": (
+        ["--bag", "BAG", "--from", "cmu31", "--object", "coco17"],
+        "model 'cmu31' knows 0 of the 17 keypoints",
+    ),
     "out of range": (["--bag", "BAG", "--learning-rate", "7"], "learning_rate is 7.0"),
     "no dictionary": (["--bag", "BAG", "--widths"], "widths"),
     "output is a file": (
@@ -253,7 +278,7 @@ def test_bad_input_is_named_and_ends_with_2(
     assert not list(tmp_path.glob("models/*"))
 
 
-@pytest.mark.parametrize("words", [("--object", "horse"), ("--steps", "many"), ("--unknown",)])
+@pytest.mark.parametrize("words", [("--steps", "many"), ("--unknown",)])
 def test_a_wrong_command_line_ends_with_2(
     words: tuple[str, ...], in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -296,3 +321,100 @@ def test_the_ground_truth_is_not_read(
     pairs = zip(found[0].network.named(), found[1].network.named(), strict=True)
     for (name, a), (_, b) in pairs:
         np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+PAW = """
+name: paw
+keypoints: [heel, toe_1, toe_2, toe_3, toe_4]
+edges: [[heel, toe_1], [heel, toe_4]]
+handedness: {left: toe_1, right: toe_4, up: heel, front: toe_2}
+reference: [toe_1, toe_4]
+reference_length: 0.04
+"""
+
+
+def write_paws(folder: Path, name: str = "paws") -> Path:
+    """Write a bag of five points that move."""
+    points, confidence = people()
+    write_bag(folder / name, "/paws", frames(points[:, :5], confidence[:, :5]))
+    return folder / name
+
+
+def test_an_object_file_makes_a_model_in_metres(
+    tmp_path: Path, models: Path, in_process: Callable[..., int]
+) -> None:
+    (tmp_path / "paw.yaml").write_text(PAW)
+    words = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"))
+    assert in_process(*words, *QUICK, "--steps", "3", "--output", str(models)) == 0
+    model = assert_lifts(models / "mine.safetensors")
+    assert model.layout == read_object(tmp_path / "paw.yaml")
+    points, confidence = people(4)
+    shapes = Lifter(model)(points[:, :5], confidence[:, :5]).shapes
+    np.testing.assert_allclose(np.linalg.norm(shapes[:, 1] - shapes[:, 4], axis=1), 0.04, rtol=1e-4)
+    # A layout that is no preset goes on by its model.
+    words = (*words[:2], "--object", str(models / "mine.safetensors"), *QUICK, "--name", "next")
+    assert in_process(*words, "--steps", "3", "--output", str(models)) == 0
+    assert load_model(models / "next.safetensors").layout == model.layout
+
+
+def test_points_that_nobody_described_are_numbered(
+    tmp_path: Path,
+    models: Path,
+    in_process: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ("--bag", str(write_paws(tmp_path)), "--object", "numbered", "--steps", "3", *QUICK)
+    assert in_process(*words, "--output", str(models)) == 0
+    model = assert_lifts(models / "mine.safetensors")
+    assert model.layout.keypoints == tuple(f"point_{i}" for i in range(5))
+    assert not model.layout.edges
+    said = capsys.readouterr().err
+    assert "'points5' names no handedness: depth may come out mirrored as a whole" in said
+
+
+def test_it_goes_on_from_another_model(
+    bag: Path,
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert in_process(*arguments, "--steps", "3") == 0
+    first = load_model(models / "mine.safetensors")
+    assert time.strptime(first.provenance["date"], "%Y-%m-%d")
+    # Weights that hardly move show where they come from.
+    still = ("--bag", str(bag), "--keypoint-layout", "coco17", "--from", "mine", "--threads", "1")
+    still += ("--steps", "1", "--learning-rate", "1e-7", "--output", str(models))
+    assert in_process(*still, "--name", "same") == 0
+    same = load_model(models / "same.safetensors")
+    assert same.layout == first.layout == HUMAN17
+    assert same.provenance["from"]["model"] == "mine"
+    for (name, a), (_, b) in zip(same.network.named(), first.network.named(), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6, err_msg=name)
+    capsys.readouterr()
+    assert in_process(*still, "--name", "other", "--object", "coco17") == 0
+    other = load_model(models / "other.safetensors")
+    assert other.layout == COCO17
+    np.testing.assert_array_equal(other.object_frame, first.object_frame)
+    assert "handedness" not in capsys.readouterr().err  # that is inherited
+
+
+def test_it_does_not_resume_what_started_elsewhere(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert in_process(*arguments, "--steps", "3") == 0
+    start = (*arguments[: -len(QUICK)], "--name", "next", "--steps", "12", "--batch", "8")
+    with monkeypatch.context() as cancelled:
+        cancelled.setattr(train, "stop_on_signals", stop_after(5))
+        assert in_process(*start, "--from", "mine") == 0
+    # The same data, but the whitening of another training.
+    path = models / "mine.safetensors"
+    model = load_model(path)
+    twice = dataclasses.replace(model.network, L=2 * model.network.L)
+    save_model(path, dataclasses.replace(model, network=twice))
+    assert in_process(*start, "--from", "mine", "--resume") == 2
+    assert "another model to start from" in capsys.readouterr().err

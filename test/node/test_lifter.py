@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from geometry_msgs.msg import Point32, PolygonStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2, PointField
@@ -212,7 +213,7 @@ def test_parameters_change_what_the_next_message_gets(start_lifter, connect):
     }.items():
         assert reason in client.set_parameters(model=refused)
     assert "share" in client.set_parameters(model="joints", keypoint_layout="coco17")
-    assert "one of" in client.set_parameters(keypoint_layout="martian")
+    assert "name a preset" in client.set_parameters(keypoint_layout="martian")
     assert "read-only" in client.set_parameters(models_dir="/tmp")
     assert "read-only" in client.set_parameters(input_type=POLYGON)
     assert "at most 1" in client.set_parameters(min_confidence=2)
@@ -231,6 +232,45 @@ def test_parameters_change_what_the_next_message_gets(start_lifter, connect):
     assert lifter.process.poll() is None
 
 
+def test_a_model_is_changed_and_changed_back_by_one_parameter(start_lifter, connect):
+    start_lifter()
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    human, cmu = cloud(pixels(1)), cloud(pixels(1, 31))
+    first = unpack(client.exchange(publisher, human)).copy()
+    for _ in range(2):
+        assert client.set_parameters(model="joints") == ""
+        assert unpack(client.exchange(publisher, cmu)).shape == (1, 31, 4)
+        reason = client.set_parameters(model="nobody")
+        assert "no model 'nobody'; there are" in reason and "person" in reason
+        assert "damaged" in client.set_parameters(model="broken")
+        client.wait_for_health(lambda _, v: v["model"] == "joints")
+        assert unpack(client.exchange(publisher, cmu)).shape == (1, 31, 4)
+        assert client.set_parameters(model="person") == ""
+        np.testing.assert_array_equal(unpack(client.exchange(publisher, human)), first)
+
+
+def test_the_detectors_order_may_come_from_an_object_file(start_lifter, connect, tmp_path):
+    # The model's own keypoints backwards, and one that it does not know.
+    path = tmp_path / "backwards.yaml"
+    names = [*reversed(HUMAN17.keypoints), "hat"]
+    path.write_text(yaml.safe_dump({"name": "backwards", "keypoints": names}))
+    start_lifter(keypoint_layout=str(path))
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    points = np.concatenate([pixels(1)[:, ::-1], pixels(1, 1)], 1)
+    backwards = unpack(client.exchange(publisher, cloud(points))).copy()
+    path.unlink()  # read at the start, and not again
+    assert client.set_parameters(min_visible=5) == ""
+    np.testing.assert_array_equal(unpack(client.exchange(publisher, cloud(points))), backwards)
+    assert "cannot be read" in client.set_parameters(keypoint_layout=str(path))
+    path.write_text("name: x\nkeypionts: [a, b, c, d]")
+    assert "no field 'keypionts'" in client.set_parameters(keypoint_layout=str(path))
+    assert client.set_parameters(keypoint_layout="model") == ""
+    own_order = unpack(client.exchange(publisher, cloud(pixels(1))))
+    np.testing.assert_allclose(own_order, backwards, atol=1e-4)
+
+
 def test_parameters_describe_themselves(start_lifter, connect):
     start_lifter()
     client = connect()
@@ -242,7 +282,7 @@ def test_parameters_describe_themselves(start_lifter, connect):
         0.0,
         1.0,
     )
-    assert "mediapipe33" in layout.additional_constraints
+    assert "object file" in layout.description
     assert not model.read_only
 
 

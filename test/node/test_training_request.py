@@ -5,11 +5,16 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deep_nrsfm_ros.commands.train import arguments
 from deep_nrsfm_ros.configuration import override
-from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest
+from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest, layouts
+from deep_nrsfm_ros.nrsfm.keypoints import COCO17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
 
@@ -20,6 +25,7 @@ def request(recipe: Recipe | None = None, **options: object) -> TrainingRequest:
         topic="/camera/keypoints",
         source_layout="coco17",
         target_layout="human17",
+        start="",
         min_confidence=0.25,
         output=Path("folder"),
     )
@@ -41,6 +47,7 @@ def test_the_training_command_understands_every_word(tmp_path):
     given = arguments().parse_args(wanted.arguments())
     assert given.bag == [tmp_path, Path("second bag")]
     assert (given.topic, given.keypoint_layout) == ("/camera/keypoints", "coco17")
+    assert given.start == ""
     assert (given.object, given.name, given.threads) == ("human17", "mine", 3)
     assert (given.output, given.min_confidence) == (Path("folder"), 0.25)
     assert given.json_progress
@@ -59,3 +66,62 @@ def test_bags_must_be_named_and_exist(tmp_path):
     with pytest.raises(ValueError, match="nowhere"):
         request(bags=(str(tmp_path), str(tmp_path / "nowhere"))).check()
     request(bags=(str(tmp_path),)).check()
+
+
+MODEL = Path("present.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("options", "heard", "start", "expected"),
+    [
+        ({}, "model", "", (str(MODEL), str(MODEL))),
+        ({}, "coco17", "", ("coco17", str(MODEL))),
+        ({}, "model", "old.safetensors", (str(MODEL), "old.safetensors")),
+        ({}, "coco17", "old.safetensors", ("coco17", "old.safetensors")),
+        ({"object": "dog.yaml"}, "model", "", ("dog.yaml", "dog.yaml")),
+        ({"object": "dog.yaml"}, "coco17", "", ("coco17", "dog.yaml")),
+        ({"object": "dog.yaml"}, "model", "old.safetensors", ("dog.yaml", "dog.yaml")),
+        (
+            {"object": "human17", "keypoint_layout": "body25"},
+            *("model", ""),
+            ("body25", "human17"),
+        ),
+        ({"keypoint_layout": "body25"}, "coco17", "", ("body25", str(MODEL))),
+        ({"object": "numbered"}, "coco17", "", ("", "numbered")),
+    ],
+)
+def test_layouts_are_what_was_said_or_what_the_lifter_hears_and_has(
+    options: dict[str, str], heard: str, start: str, expected: tuple[str, str]
+) -> None:
+    assert layouts(TrainingOptions(**options), heard, MODEL, start) == expected
+
+
+def save(path: Path, layout: KeypointLayout) -> Path:
+    network = initialise(Architecture(widths=(4,)), len(layout), np.random.default_rng(0))
+    save_model(path, Model("m", network, layout, Normaliser(), np.eye(3, dtype=np.float32)))
+    return path
+
+
+def test_layouts_and_start_are_checked_before_anything_starts(tmp_path):
+    wanted = request(bags=(str(tmp_path),))
+    assert wanted.check() == ""
+    assert (
+        "'coco17' names no handedness"
+        in dataclasses.replace(wanted, target_layout="coco17").check()
+    )
+    numbered = dataclasses.replace(wanted, target_layout="numbered", source_layout="")
+    assert "'numbered' names no handedness" in numbered.check()
+    coco = save(tmp_path / "coco.safetensors", COCO17)
+    points = save(tmp_path / "points.safetensors", KeypointLayout.numbered(5))
+    assert dataclasses.replace(wanted, start=str(coco)).check() == ""
+    for changes, complaint in (
+        ({"target_layout": "horse"}, "train.object is 'horse'; name a preset"),
+        ({"source_layout": "horse"}, "train.keypoint_layout is 'horse'; name a preset"),
+        ({"target_layout": "cmu31"}, "share 0 keypoints"),
+        ({"target_layout": str(tmp_path / "a.yaml")}, "a.yaml: cannot be read"),
+        ({"target_layout": "numbered"}, "empty train.keypoint_layout"),
+        ({"start": str(points)}, "knows 0 of the 17 keypoints"),
+        ({"start": str(tmp_path / "gone.safetensors")}, "cannot read model"),
+    ):
+        with pytest.raises(ValueError, match=complaint):
+            dataclasses.replace(wanted, **changes).check()

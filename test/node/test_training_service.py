@@ -15,7 +15,10 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import Float32MultiArray
 
-from deep_nrsfm_ros.nrsfm.model_file import load_model
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.nrsfm.model_file import Model, load_model, save_model
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 
 P = 17
 STAND_IN = (str(Path(__file__).with_name("lifter_with_stand_in_training.py")),)
@@ -25,8 +28,8 @@ def values(status: Any) -> dict[str, str]:
     return {pair.key: pair.value for pair in status.values}
 
 
-def keypoints(seed: int = 0) -> Float32MultiArray:
-    points = np.random.default_rng(seed).uniform(50, 600, P * 2)
+def keypoints(seed: int = 0, p: int = P) -> Float32MultiArray:
+    points = np.random.default_rng(seed).uniform(50, 600, p * 2)
     return Float32MultiArray(data=array("f", points.astype(np.float32)))
 
 
@@ -121,19 +124,21 @@ def test_a_killed_lifter_leaves_no_training_behind(lifter, connect, models):
     assert_ends(training)
 
 
-def write_bag(path: Path, frames: int) -> None:
+def write_bag(path: Path, frames: int, p: int = P) -> None:
     """Write a bag of 2D keypoints of a deforming object seen by random cameras."""
     types, rng = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(0)
     array_type = types.types["std_msgs/msg/Float32MultiArray"]
     layout_type = types.types["std_msgs/msg/MultiArrayLayout"]
-    basis = rng.standard_normal((3, P, 3))
+    size_type = types.types["std_msgs/msg/MultiArrayDimension"]
+    basis = rng.standard_normal((3, p, 3))
     with Writer(path, version=9) as bag:
         topic = bag.add_connection("/keypoints", array_type.__msgtype__, typestore=types)
         for i in range(frames):
             shape = np.tensordot(rng.uniform(0.5, 1, 3), basis, 1)
             camera = np.linalg.qr(rng.standard_normal((3, 3)))[0][:, :2]
             data = (300 + 100 * shape @ camera).astype(np.float32).ravel()
-            message = array_type(layout_type([], 0), data)
+            sizes = [size_type("", size, 0) for size in (p, 2)]
+            message = array_type(layout_type(sizes, 0), data)
             bag.write(topic, i * 10**7, types.serialize_cdr(message, array_type.__msgtype__))
 
 
@@ -156,3 +161,46 @@ def test_the_real_training_turns_a_bag_into_the_model_in_use(
     client.wait_for_health(lambda _, v: v["model"] == "fresh")
     assert client.exchange(publisher, keypoints()).data != before
     assert "torch" not in Path(f"/proc/{lifter.process.pid}/maps").read_text()
+
+
+PAW = KeypointLayout("paw", ("heel", "toe_1", "toe_2", "toe_3", "toe_4"))
+
+
+def test_an_object_that_is_no_preset_is_trained_anew_from_its_model_and_by_number(
+    start_lifter, connect, models, tmp_path
+):
+    write_bag(tmp_path / "bag", 200, len(PAW))
+    network = initialise(Architecture(widths=(8, 4)), len(PAW), np.random.default_rng(0))
+    eyes = (np.eye(n, dtype=np.float32) for n in (3, 3 * len(PAW)))
+    paw = Model("paw", network, PAW, Normaliser(), *eyes)
+    save_model(models / "paw.safetensors", paw)
+    train = {"bags": [str(tmp_path / "bag")], "topic": "/keypoints", "steps": 5, "name": "anew"}
+    start_lifter(input_type="std_msgs/Float32MultiArray", model="paw", train=train)
+    client = connect()
+    publisher = client.publisher(Float32MultiArray)
+    before = client.exchange(publisher, keypoints(p=len(PAW))).data
+
+    def trained(name: str, warning: str) -> Model:
+        client.heard["/lifter/training_status"].clear()
+        accepted = client.call("/lifter/train")
+        assert accepted.success and warning in accepted.message, accepted.message
+        assert "in use" in client.wait_for_training("finished").message
+        client.wait_for_health(lambda _, v: v["model"] == name)
+        return load_model(models / f"{name}.safetensors")
+
+    mirrored = "no handedness: depth may come out mirrored"
+    anew = trained("anew", mirrored)
+    assert anew.layout == PAW and "from" not in anew.provenance
+
+    client.set_parameters(train__from="nobody")
+    refused = client.call("/lifter/train")
+    assert not refused.success and "no model 'nobody'; there are" in refused.message
+    client.set_parameters(train__from="paw", train__name="tuned")
+    tuned = trained("tuned", mirrored)
+    assert tuned.layout == PAW and tuned.provenance["from"]["model"] == "paw"
+    assert tuned.network.architecture == paw.network.architecture
+
+    client.set_parameters(train__from="", train__object="numbered", train__name="counted")
+    assert trained("counted", mirrored).layout == KeypointLayout.numbered(len(PAW))
+    assert client.set_parameters(model="paw") == ""
+    assert client.exchange(publisher, keypoints(p=len(PAW))).data == before

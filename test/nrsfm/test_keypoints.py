@@ -91,11 +91,21 @@ def test_presets_go_by_name() -> None:
         ({"edges": (("a", "x"),)}, "no keypoint 'x'"),
         ({"handedness": ("a", "b", "c", "x")}, "no keypoint 'x'"),
         ({"reference": ("x", "a")}, "no keypoint 'x'"),
+        ({"derived": {"x": ("a", "b")}}, "no keypoint 'x'"),
+        ({"derived": {"a": ()}}, "'a' is a mean of no names"),
+        ({"edges": (("a", "a"),)}, "repeats a name"),
+        ({"reference_length": 1.0}, "name reference"),
+        ({"reference": ("a", "b"), "reference_length": -1.0}, "-1.0, not above 0 m"),
     ],
 )
 def test_a_layout_names_what_it_has(fields: dict[str, tuple[str, ...]], complaint: str) -> None:
     with pytest.raises(ValueError, match=f"'thing'.*{complaint}"):
         KeypointLayout(**({"name": "thing", "keypoints": ("a", "b", "c")} | fields))  # type: ignore[arg-type]
+
+
+def test_only_a_layout_without_handedness_warns() -> None:
+    assert layout("human17").warning == ""
+    assert "'points3' names no handedness" in KeypointLayout.numbered(3).warning
 
 
 def test_unknown_keypoints_have_no_place() -> None:

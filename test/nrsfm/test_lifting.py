@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import subprocess
 import sys
@@ -216,6 +217,20 @@ def test_reference_length(length: float) -> None:
     nameless = random_model(layout=KeypointLayout.numbered(17))
     shapes = Lifter(nameless, options)(*pixels()).shapes
     np.testing.assert_allclose((shapes**2).sum(2).mean(1) ** 0.5, length, rtol=1e-4)
+
+
+def test_the_reference_length_is_that_of_the_object_unless_another_is_asked_for() -> None:
+    described = dataclasses.replace(HUMAN17, reference_length=0.52)
+    pair = [HUMAN17.index(name) for name in HUMAN17.reference or ()]
+    for layout, length, expected in (
+        *((described, 0.0, 0.52), (described, 2.0, 2.0)),
+        (HUMAN17, 0.0, 1.0),
+    ):
+        options = LiftingOptions(reference_length=length)
+        neck, hip = (
+            Lifter(random_model(layout=layout), options)(*pixels()).shapes[:, pair].swapaxes(0, 1)
+        )
+        np.testing.assert_allclose(np.linalg.norm(neck - hip, axis=1), expected, rtol=1e-4)
 
 
 def test_confidence_is_the_detectors_less_what_the_residual_takes(

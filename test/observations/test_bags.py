@@ -10,7 +10,14 @@ from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.nrsfm.keypoints import BODY25, COCO17, HUMAN17, KeypointLayout, KeypointMap
 from deep_nrsfm_ros.observations.bag_files import BagError
-from deep_nrsfm_ros.observations.bags import STORAGES, Frame, frames, read_bags, write_bag
+from deep_nrsfm_ros.observations.bags import (
+    STORAGES,
+    Frame,
+    frames,
+    most_keypoints,
+    read_bags,
+    write_bag,
+)
 from deep_nrsfm_ros.observations.messages import INPUT_TYPES, MULTI_ARRAY
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -209,3 +216,27 @@ def test_float_array_bag_needs_no_layout_of_its_own(tmp_path: Path) -> None:
     write_raw(tmp_path / "bag", {TOPIC: (kind, [bytes(raw)])})
     ensemble = read_bags([tmp_path / "bag"], "", COCO17, COCO17).ensemble
     np.testing.assert_array_equal(ensemble.points, flat.reshape(1, 17, 2))
+
+
+@pytest.mark.parametrize("input_type", INPUT_TYPES)
+def test_bags_tell_how_many_keypoints_there_are(tmp_path: Path, input_type: str) -> None:
+    for name, layout, count in (("a", COCO17, 3), ("b", BODY25, 5)):
+        found = frames(*detections(count, layout))
+        write_bag(tmp_path / name, TOPIC, found, input_type=input_type)
+    assert most_keypoints([tmp_path / "a"], TOPIC) == 17
+    assert most_keypoints([tmp_path / "a", tmp_path / "b"], "") == 25  # what most messages have
+
+
+def test_messages_without_objects_or_sense_do_not_count(tmp_path: Path) -> None:
+    nobody = Frame(0, np.zeros((0, 4, 2)), np.zeros((0, 4)))
+    write_bag(tmp_path / "empty", TOPIC, [nobody] * 5)
+    with pytest.raises(BagError, match="no message in empty tells how many keypoints"):
+        most_keypoints([tmp_path / "empty"], TOPIC)
+    (good,) = raw_messages(1)
+    width = good.index(b"\x19\0\0\0")  # 25
+    huge = good[:width] + b"\xff\xff\xff\x7f" + good[width + 4 :]
+    write_raw(tmp_path / "bag", {TOPIC: ("sensor_msgs/msg/PointCloud2", [huge, b"", huge, good])})
+    assert most_keypoints([tmp_path / "empty", tmp_path / "bag"], TOPIC) == 25
+    write_raw(tmp_path / "huge", {TOPIC: ("sensor_msgs/msg/PointCloud2", [huge])})
+    with pytest.raises(BagError, match="no message in huge tells .*points need"):
+        most_keypoints([tmp_path / "huge"], TOPIC)

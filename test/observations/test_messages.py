@@ -22,6 +22,7 @@ from deep_nrsfm_ros.observations.messages import (
     POINT_STEP,
     POLYGON,
     MessageError,
+    count_keypoints,
     observation,
     pack_points,
     read,
@@ -313,3 +314,31 @@ def test_message_of_another_type_is_refused(input_type: str) -> None:
 def test_unknown_input_type_lists_the_known() -> None:
     with pytest.raises(ValueError, match="no input type 'a/B'; choose one of sensor_msgs/Point"):
         read(None, "a/B", 5)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "numbers", "count"),
+    [
+        ((), 0, 0),
+        ((), 10, 5),
+        ((), 9, 3),
+        ((10,), 10, 5),
+        ((5, 2), 10, 5),
+        ((5, 3), 15, 5),
+        ((2, 5, 3), 30, 5),
+        ((0, 5, 3), 0, 0),
+    ],
+)
+def test_arrays_tell_how_many_keypoints_they_have(
+    sizes: tuple[int, ...], numbers: int, count: int
+) -> None:
+    message = Float32MultiArray(data=array("f", range(numbers)))
+    message.layout.dim = [MultiArrayDimension(size=size) for size in sizes]
+    assert count_keypoints(message, MULTI_ARRAY) == count
+
+
+@pytest.mark.parametrize("numbers", [7, 12])
+def test_plain_numbers_that_fit_twice_or_never_tell_nothing(numbers: int) -> None:
+    message = Float32MultiArray(data=array("f", range(numbers)))
+    with pytest.raises(MessageError, match=f"{numbers} numbers and no layout; give it one"):
+        count_keypoints(message, MULTI_ARRAY)

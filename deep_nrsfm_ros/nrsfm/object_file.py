@@ -1,0 +1,191 @@
+"""Object files: a keypoint layout in a few lines of YAML, for objects that have no preset.
+
+`config/objects/` has examples that explain each field.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, Edge, KeypointLayout
+from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, load_model
+
+OBJECT_SUFFIXES = (".yaml", ".yml")
+FIELDS = (
+    *("name", "keypoints", "edges", "handedness"),
+    *("reference", "reference_length", "derived"),
+)
+HANDEDNESS = ("left", "right", "up", "front")
+NUMBERED = "numbered"
+"""Stands for an object that nobody has described, where its points tell how many they are."""
+
+_MAX_BYTES = 64 * 2**10
+_FEWEST = 4  # W = S M has a unique shape from four points on
+
+
+class ObjectFileError(ValueError):
+    """An object file that is missing or says something that no layout can: names file and mend."""
+
+
+def find_layout(option: str, word: str) -> KeypointLayout:
+    """Return the layout that `word`, given by `option`, stands for.
+
+    word: the name of a preset, the path of an object file, or that of a model file, which gives
+        the layout of its model. Raises ValueError for anything else, or for a damaged file.
+    """
+    if word in LAYOUTS:
+        return LAYOUTS[word]
+    path = Path(word).expanduser()
+    if path.suffix in OBJECT_SUFFIXES:
+        return read_object(path)
+    if path.suffix == MODEL_SUFFIX:
+        return load_model(path).layout
+    raise ValueError(
+        f"{option} is {word!r}; name a preset ({', '.join(LAYOUTS)}), "
+        f"an object file ({OBJECT_SUFFIXES[0]}) or a model file ({MODEL_SUFFIX})"
+    )
+
+
+def read_object(path: Path) -> KeypointLayout:
+    """Return the layout that an object file describes; raise ObjectFileError if it is none."""
+    try:
+        return _Description(_parse(path)).layout()
+    except ObjectFileError as error:
+        raise ObjectFileError(f"object file {path}: {error}") from None
+    except ValueError as error:
+        raise ObjectFileError(f"object file {path}: {error}") from error
+
+
+def _parse(path: Path) -> dict[Any, Any]:
+    """Return the fields of a file, its size and its form checked."""
+    try:
+        if path.exists() and not path.is_file():  # reading a pipe would wait for ever
+            raise ObjectFileError("is not a regular file")
+        with path.open("rb") as file:
+            text = file.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise ObjectFileError(f"cannot be read: {error.strerror or error}") from error
+    if len(text) > _MAX_BYTES:
+        raise ObjectFileError(f"is larger than {_MAX_BYTES >> 10} KiB: not a description")
+    try:
+        root = yaml.compose(text, yaml.SafeLoader)
+        fields = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ObjectFileError(f"is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(root, yaml.MappingNode) or not isinstance(fields, dict):
+        raise ObjectFileError(f"is {_words(fields)}; it must hold fields like 'name: hand'")
+    ((name, times),) = Counter(str(key.value) for key, _ in root.value).most_common(1) or [("", 0)]
+    if times > 1:  # YAML itself would keep the last and forget the others
+        raise ObjectFileError(f"has the field {_words(name)} {times} times")
+    return fields
+
+
+class _Description:
+    """The fields of an object file, each checked when it is asked for.
+
+    Every complaint names the field and shows what was found there.
+    """
+
+    def __init__(self, fields: dict[Any, Any]) -> None:
+        """Refuse fields that do not exist, and the lack of those that must."""
+        unknown = [name for name in fields if name not in FIELDS]
+        if unknown:
+            raise ObjectFileError(
+                f"has no field {_words(unknown[0])}; the fields are {', '.join(FIELDS)}"
+            )
+        # A field without a value, as a template leaves it, is as good as none.
+        self._fields = {name: value for name, value in fields.items() if value is not None}
+        for name in ("name", "keypoints"):
+            if name not in self._fields:
+                raise ObjectFileError(f"lacks the field '{name}'")
+
+    def layout(self) -> KeypointLayout:
+        """Return the layout; raise ValueError for what it cannot be."""
+        name = self._text("name", self._fields["name"])
+        if name in LAYOUTS:
+            raise ObjectFileError(f"name {name!r} is that of a preset; choose another")
+        keypoints = self._names("keypoints", self._fields["keypoints"])
+        if len(keypoints) < _FEWEST:
+            raise ObjectFileError(f"has {len(keypoints)} keypoints; at least {_FEWEST} are needed")
+        reference = self._fields.get("reference")
+        return KeypointLayout(
+            name,
+            keypoints,
+            edges=self._edges(),
+            handedness=self._handedness(),
+            reference=None if reference is None else self._pair("reference", reference),
+            derived=self._derived(),
+            reference_length=self._reference_length(),
+        )
+
+    def _edges(self) -> tuple[Edge, ...]:
+        edges = self._list("edges", self._fields.get("edges", []))
+        return tuple(self._pair(f"edges[{i}]", edge) for i, edge in enumerate(edges))
+
+    def _handedness(self) -> tuple[str, str, str, str] | None:
+        if "handedness" not in self._fields:
+            return None
+        given = self._mapping("handedness")
+        if set(given) != set(HANDEDNESS):
+            raise ObjectFileError(
+                f"handedness names {', '.join(map(_words, given)) or 'nothing'}; "
+                f"it must name {', '.join(HANDEDNESS)}"
+            )
+        left, right, up, front = (self._text(f"handedness.{s}", given[s]) for s in HANDEDNESS)
+        return left, right, up, front
+
+    def _derived(self) -> dict[str, tuple[str, ...]]:
+        given = self._mapping("derived") if "derived" in self._fields else {}
+        return {
+            self._text("a name in derived", name): self._names(f"derived.{name}", parts)
+            for name, parts in given.items()
+        }
+
+    def _reference_length(self) -> float | None:
+        length = self._fields.get("reference_length")
+        if length is None:
+            return None
+        if isinstance(length, bool) or not isinstance(length, (int, float)):
+            raise ObjectFileError(f"reference_length is {_words(length)}; it must be in metres")
+        return float(length)
+
+    def _pair(self, where: str, value: Any) -> Edge:
+        names = self._names(where, value)
+        if len(names) != 2:
+            raise ObjectFileError(f"{where} has {len(names)} names; it must have 2")
+        return names[0], names[1]
+
+    def _names(self, where: str, value: Any) -> tuple[str, ...]:
+        items = self._list(where, value)
+        return tuple(self._text(f"{where}[{i}]", item) for i, item in enumerate(items))
+
+    def _list(self, where: str, value: Any) -> list[Any]:
+        if not isinstance(value, list):
+            raise ObjectFileError(f"{where} is {_words(value)}; it must be a list")
+        return value
+
+    def _mapping(self, where: str) -> dict[Any, Any]:
+        value = self._fields[where]
+        if not isinstance(value, dict):
+            raise ObjectFileError(f"{where} is {_words(value)}; it must be a mapping")
+        return value
+
+    def _text(self, where: str, value: Any) -> str:
+        if isinstance(value, str) and value.strip():
+            return value
+        # YAML reads `on`, `no` and 1 as something else than text.
+        raise ObjectFileError(
+            f"{where} is {_words(value)}; it must be a name, in quotes if need be"
+        )
+
+
+def _words(value: Any) -> str:
+    """Return a value as a complaint shows it: short, whatever a file holds."""
+    if isinstance(value, (list, dict)):
+        return "a list" if isinstance(value, list) else "a mapping"
+    text = "empty" if value is None else repr(value)
+    return text if len(text) <= 60 else f"{text[:60]}..."

@@ -1,0 +1,131 @@
+"""The list of models: all there are, where, how good, from what; damaged ones with the reason."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.commands import models
+from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+
+PROVENANCE = {"data": "bags kitchen, yard", "frames": 321, "step": 4000, "date": "2025-03-04"}
+QUALITY = {"reprojection_error": 0.1234, "cycle_error": 0.5678}
+
+
+def save(path: Path, layout: KeypointLayout = HUMAN17, **fields: Any) -> Path:
+    network = initialise(Architecture(widths=(4,)), len(layout), np.random.default_rng(0))
+    frame = np.eye(3, dtype=np.float32)
+    covariance = np.eye(3 * len(layout), dtype=np.float32)
+    model = Model("any", network, layout, Normaliser(), frame, covariance, PROVENANCE, QUALITY)
+    save_model(path, dataclasses.replace(model, **fields))
+    return path
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """Return a user's own folder and that of an installation; there are no others."""
+    own, shared = tmp_path / "own", tmp_path / "shared"
+    monkeypatch.setattr(models, "model_folders", lambda models_dir: [models_dir, shared])
+    return own, shared
+
+
+def listing(capsys: pytest.CaptureFixture[str], own: Path) -> list[str]:
+    models.main(["--models-dir", str(own)])
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_model_is_listed_with_all_that_is_known_of_it(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = save(folders[0] / "mine.safetensors")
+    head, row, where, origin, *_ = listing(capsys, folders[0])
+    assert tuple(head.split()) == models.COLUMNS
+    assert row.split() == ["mine", "human17", "17", "0.123", "0.568", "2025-03-04"]
+    assert where.strip() == str(path)
+    assert origin.strip() == "bags kitchen, yard; 321 frames; 4000 steps"
+
+
+def test_what_a_model_was_started_from_is_said(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    tuned = PROVENANCE | {"from": {"model": "human", "data": "CMU"}}
+    save(folders[0] / "tuned.safetensors", provenance=tuned)
+    assert any(
+        line.endswith("4000 steps; from model human") for line in listing(capsys, folders[0])
+    )
+
+
+def test_a_model_that_says_little_is_listed_too(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = save(folders[0] / "old.safetensors", provenance={}, quality={"cycle_error": "good"})
+    row, _, origin, *_ = listing(capsys, folders[0])[1:]
+    assert row.split()[:5] == ["old", "human17", "17", "-", "-"]
+    assert row.split()[5].startswith("~20") and path.exists()  # the day of the file
+    assert origin.strip() == "of unknown data"
+
+
+def test_own_models_hide_those_of_the_package(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, shared = folders
+    for path in (own / "human.safetensors", shared / "human.safetensors"):
+        save(path)
+    save(shared / "dog.safetensors", KeypointLayout.numbered(5))
+    (own / "again.safetensors").symlink_to(own / "human.safetensors")
+    (own / "dog.safetensors").symlink_to(shared / "dog.safetensors")
+    lines = listing(capsys, own)
+    rows = lines[1 : lines.index("")]
+    names = [row.split()[:3] for row in rows if not row.startswith(" ")]
+    assert names == [
+        ["again", "human17", "17"],
+        ["dog", "points5", "5"],
+        ["human", "human17", "17"],
+        ["human", "human17", "17"],
+    ]
+    hidden = lines.index("    hidden by the one of this name above")
+    assert lines[hidden - 2].strip() == str(shared / "human.safetensors")
+
+
+def test_damaged_files_are_listed_with_the_reason(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, shared = folders
+    save(shared / "human.safetensors")
+    own.mkdir()
+    (own / "broken.safetensors").write_bytes(b"\0" * 100)
+    (own / "lost.safetensors").symlink_to(own / "nowhere")
+    (own / "notes.txt").write_text("no model")
+    lines = listing(capsys, own)
+    assert [line.split() for line in lines if "damaged" in line and line[0] != " "] == [
+        ["broken", "damaged"],
+        ["lost", "damaged"],
+    ]
+    text = " ".join(" ".join(lines).split())
+    assert f"{own / 'broken.safetensors'} is damaged or no safetensors file" in text
+    assert f"cannot read model {own / 'lost.safetensors'}: No such file" in text
+    assert any(line.startswith("human ") for line in lines) and "notes" not in text
+
+
+def test_no_models_are_said_to_be_none(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        models.main(["--models-dir", str(folders[0])])
+    assert end.value.code == 2
+    assert f"no models in {folders[0]}, {folders[1]}" in capsys.readouterr().err
+
+
+def test_the_default_is_the_lifters_folder(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    models.main([])
+    lines = capsys.readouterr().out.splitlines()
+    assert {"human", "cmu31"} <= {line.split()[0] for line in lines if line}
