@@ -46,6 +46,7 @@ from deep_nrsfm_ros.node.training_service import TrainingService
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.observations.curation import Curation
 from deep_nrsfm_ros.observations.messages import MULTI_ARRAY, POINT_CLOUD, POLYGON
 
 MESSAGES: dict[str, Any] = {
@@ -74,6 +75,7 @@ class LifterNode(Node):
         parameters.declare(self, LiftingOptions)
         parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
+        parameters.declare(self, Curation, _TRAIN)
         self._models_dir = Path(self._inputs.models_dir).expanduser()
         self._pipeline = self._proposed = self._prepare(())
 
@@ -177,7 +179,7 @@ class LifterNode(Node):
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
-        for checked in (TrainingOptions, Recipe):
+        for checked in (TrainingOptions, Recipe, Curation):
             parameters.read(self, checked, _TRAIN, changes)
         if changes and not any(change.name == "model" for change in changes):
             model = self._pipeline.model
@@ -210,6 +212,7 @@ class LifterNode(Node):
             target_layout=wanted.object or self._pipeline.model.layout.name,
             min_confidence=parameters.read(self, InputOptions).min_confidence,
             output=self._models_dir,
+            curation=parameters.read(self, Curation, _TRAIN),
         )
 
     def _activate(self, path: str) -> None:

@@ -9,6 +9,7 @@ from deep_nrsfm_ros.configuration import option, to_arguments
 from deep_nrsfm_ros.nrsfm.keypoints import layout
 from deep_nrsfm_ros.nrsfm.model_file import check_name
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.observations.curation import Curation
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class TrainingRequest:
     target_layout: str
     min_confidence: float
     output: Path
+    curation: Curation = Curation()
 
     def check(self) -> None:
         """Raise ValueError that says what is missing or wrong."""
@@ -60,4 +62,4 @@ class TrainingRequest:
         words = [word for pair in named.items() for word in pair]
         for bag in self.options.bags:
             words += ["--bag", str(Path(bag).expanduser())]
-        return [*words, *to_arguments(self.recipe), "--json-progress"]
+        return [*words, *to_arguments(self.recipe), *to_arguments(self.curation), "--json-progress"]

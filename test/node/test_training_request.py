@@ -11,6 +11,7 @@ from deep_nrsfm_ros.commands.train import arguments
 from deep_nrsfm_ros.configuration import override
 from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.observations.curation import Curation
 
 
 def request(recipe: Recipe | None = None, **options: object) -> TrainingRequest:
@@ -37,7 +38,9 @@ def test_the_training_command_understands_every_word(tmp_path):
             for field in dataclasses.fields(Recipe)
         }
     )
+    curation = Curation(min_visible=7, thin=0.25, outliers=3.5)
     wanted = request(recipe, bags=(str(tmp_path), "second bag"), name="mine", threads=3)
+    wanted = dataclasses.replace(wanted, curation=curation)
     given = arguments().parse_args(wanted.arguments())
     assert given.bag == [tmp_path, Path("second bag")]
     assert (given.topic, given.keypoint_layout) == ("/camera/keypoints", "coco17")
@@ -45,6 +48,7 @@ def test_the_training_command_understands_every_word(tmp_path):
     assert (given.output, given.min_confidence) == (Path("folder"), 0.25)
     assert given.json_progress
     assert override(Recipe(), given) == recipe
+    assert override(Curation(), given) == curation
 
 
 @pytest.mark.parametrize("name", ["", ".", "../up", "a/b", "-x", "a b", "x" * 101])
