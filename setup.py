@@ -14,7 +14,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed"]},
+    package_data={NAME: ["py.typed", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]},
     # data_files, because `pip install` ignores setup.cfg's install_scripts and `ros2 run` needs
     # the executables in lib/deep_nrsfm_ros.
     data_files=[
@@ -34,6 +34,7 @@ setup(
         "torch>=2.2",  # training only; the node lifts without it
         "rosbags",  # reads and writes rosbag2 without a ROS installation
         "pyyaml",  # object files, parameter files and bag metadata
+        "jinja2",  # the training's report: a template that escapes whatever comes from data
         "tqdm",  # progress of training and evaluation
         "ros-jazzy-rclpy",  # the node
         "ros-jazzy-common-interfaces",  # the messages it hears and speaks

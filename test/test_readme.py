@@ -14,6 +14,7 @@ from deep_nrsfm_ros.node.training_request import TrainingOptions
 from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.observations.curation import Curation
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
@@ -31,7 +32,13 @@ def parameter_rows(cls: type, prefix: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("cls", "prefix"),
-    [(InputOptions, ""), (LiftingOptions, ""), (TrainingOptions, "train."), (Recipe, "train.")],
+    [
+        (InputOptions, ""),
+        (LiftingOptions, ""),
+        (TrainingOptions, "train."),
+        (Recipe, "train."),
+        (Curation, "train."),
+    ],
 )
 def test_lists_every_parameter(cls: type, prefix: str) -> None:
     for row in parameter_rows(cls, prefix):

@@ -18,6 +18,7 @@ from typing import Any
 from tqdm import tqdm
 
 from deep_nrsfm_ros.commands.evaluate import read_split
+from deep_nrsfm_ros.commands.preparation import prepare
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.node.model_folders import model_folders
 from deep_nrsfm_ros.nrsfm.fine_tuning import inherit, keep_what_is_fixed, start_from
@@ -35,7 +36,9 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.observations.bags import most_keypoints, read_bags
+from deep_nrsfm_ros.observations.curation import Curation
 from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.reporting.page import Training, write_report
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -82,7 +85,7 @@ def arguments() -> argparse.ArgumentParser:
     run.add_argument("--threads", type=int, default=0, help="threads of torch (0: all cores)")
     run.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
     run.add_argument("--json-progress", action="store_true", help="one JSON object a line")
-    for config in (Recipe, Architecture, Normaliser):
+    for config in (Recipe, Architecture, Normaliser, Curation):
         add_arguments(parser, config)
     return parser
 
@@ -143,6 +146,7 @@ class Reporter:
         self._bar: tqdm[Any] | None = None
         self._state = ""
         self._last = 0.0
+        self.curves: list[Any] = []
 
     def reading(self, done: int, total: int) -> None:
         """Report that `done` of `total` messages or trials are read."""
@@ -150,7 +154,8 @@ class Reporter:
             self._show("reading", done, total, {})
 
     def training(self, progress: Any) -> None:
-        """Report a `nrsfm.training.Progress`."""
+        """Report a `nrsfm.training.Progress`, and keep it for the curves."""
+        self.curves.append(progress)
         values = progress._asdict()
         step, steps = values.pop("step"), values.pop("steps")
         self._show("training", step, steps, values)
@@ -191,6 +196,20 @@ class Reporter:
     def _print(values: dict[str, Any]) -> None:
         rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in values.items()}
         print(json.dumps(rounded), flush=True)
+
+
+def write_page(training: Training, report: Reporter, *, compare: bool) -> str:
+    """Write the HTML report next to the model; return its path, "" if it could not be written.
+
+    The model stands, whatever becomes of it. compare: with the other models that are there, which
+    takes a second for each; who cancels a training does not wait for that.
+    """
+    folders = model_folders(training.path.parent) if compare else []
+    try:
+        return str(write_report(training, folders))
+    except (ValueError, OSError) as error:
+        report.say(f"no report was written: {error}")
+        return ""
 
 
 def stop_on_signals() -> Callable[[], bool]:
@@ -234,7 +253,8 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     check_name("--name", given.name)
     if importlib.util.find_spec("torch") is None:
         raise ValueError("training needs torch, which is not installed: pip install torch")
-    ensemble = read_data(given, report)
+    curated, variation = prepare(given, read_data(given, report), report.say)
+    ensemble = curated.ensemble
     if ensemble.layout.warning and not start:
         report.say(ensemble.layout.warning)
     network = start_from(start, ensemble.layout) if start else None
@@ -271,6 +291,8 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     if start:
         model = inherit(model, start)
     save_model(model_path, model)
+    whole = Training(model, model_path, ensemble, curated, variation, report.curves)
+    html = write_page(whole, report, compare=trainer.step == preset.recipe.steps)
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
     if trainer.step < preset.recipe.steps:
         state, message = "cancelled", "cancelled; the model holds what was learned so far"
@@ -278,7 +300,8 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
             message += ", --resume goes on"
     else:
         checkpoint.unlink(missing_ok=True)
-    report.end(state, message, model=str(model_path), **model.quality)
+    message += f"; report {html}" if html else ""
+    report.end(state, message, model=str(model_path), report=html, **model.quality)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

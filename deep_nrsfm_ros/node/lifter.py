@@ -48,6 +48,7 @@ from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.observations.curation import Curation
 from deep_nrsfm_ros.observations.messages import MULTI_ARRAY, POINT_CLOUD, POLYGON
 
 MESSAGES: dict[str, Any] = {
@@ -76,6 +77,7 @@ class LifterNode(Node):
         parameters.declare(self, LiftingOptions)
         parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
+        parameters.declare(self, Curation, _TRAIN)
         self._models_dir = Path(self._inputs.models_dir).expanduser()
         self._pipeline = self._proposed = self._prepare(())
 
@@ -179,7 +181,7 @@ class LifterNode(Node):
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
-        for checked in (TrainingOptions, Recipe):
+        for checked in (TrainingOptions, Recipe, Curation):
             parameters.read(self, checked, _TRAIN, changes)
         # Files are read again only when they are named again: they may be gone by now.
         changed = {change.name for change in changes} or {"model", "keypoint_layout"}
@@ -231,6 +233,7 @@ class LifterNode(Node):
             start=start,
             min_confidence=inputs.min_confidence,
             output=self._models_dir,
+            curation=parameters.read(self, Curation, _TRAIN),
         )
 
     def _activate(self, path: str) -> None:

@@ -12,6 +12,7 @@ from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.model_file import check_name, load_model
 from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.observations.curation import Curation
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ class TrainingRequest:
     start: str
     min_confidence: float
     output: Path
+    curation: Curation = Curation()
 
     def check(self) -> str:
         """Return what should be known before, or ""; raise ValueError that says what is wrong."""
@@ -106,4 +108,4 @@ class TrainingRequest:
         words = [word for pair in named.items() for word in pair]
         for bag in self.options.bags:
             words += ["--bag", str(Path(bag).expanduser())]
-        return [*words, *to_arguments(self.recipe), "--json-progress"]
+        return [*words, *to_arguments(self.recipe), *to_arguments(self.curation), "--json-progress"]

@@ -144,12 +144,13 @@ def test_from_bag_to_model(
     assert any("60 frames of 17 keypoints (bags bag)" in line.get("message", "") for line in lines)
     path = models / "mine.safetensors"
     assert lines[-1]["model"] == str(path) and str(path) in lines[-1]["message"]
+    assert lines[-1]["report"] == str(models / "mine.html")
     model = assert_lifts(path)
     assert (model.name, model.layout) == ("mine", HUMAN17)
     assert model.network.architecture.widths == (8, 4)
     assert model.provenance["recipe"]["steps"] == 30 and model.provenance["step"] == 30
     assert lines[-1]["cycle_error"] == model.quality["cycle_error"]
-    assert [f.name for f in models.iterdir()] == ["mine.safetensors"]
+    assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
 
 
 @pytest.mark.parametrize("how", ["SIGTERM", "end of standard input"])
@@ -197,7 +198,7 @@ def test_resume_goes_on_where_it_was_cancelled(
     assert taken == list(range(5, 12))
     for name, weight in load_model(models / "mine.safetensors").network.named():
         np.testing.assert_array_equal(weight, whole[name])
-    assert [f.name for f in models.iterdir()] == ["mine.safetensors"]
+    assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
 
 
 def test_without_resume_it_begins_anew(
@@ -418,3 +419,49 @@ def test_it_does_not_resume_what_started_elsewhere(
     save_model(path, dataclasses.replace(model, network=twice))
     assert in_process(*start, "--from", "mine", "--resume") == 2
     assert "another model to start from" in capsys.readouterr().err
+
+
+def write_people(path: Path, points: np.ndarray) -> tuple[str, ...]:
+    write_bag(path, "/keypoints", frames(points, np.full(points.shape[:2], 0.9, np.float32)))
+    return ("--bag", str(path), "--keypoint-layout", "coco17", *QUICK, "--output", str(path.parent))
+
+
+def test_data_that_cannot_work_is_refused_before_training(
+    tmp_path: Path, in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    flat = people(1)[0][0] * rng.uniform(0.5, 2, (60, 1, 1))
+    flat += rng.standard_normal(flat.shape)
+    words = write_people(tmp_path / "flat", flat.astype(np.float32))
+    assert in_process(*words, "--thin", "0") == 2
+    assert "the views are flat" in capsys.readouterr().err
+    assert in_process(*words) == 2  # thinned to next to nothing
+    assert "at least 10 that differ are needed" in capsys.readouterr().err
+    assert not list(tmp_path.glob("mine*"))
+
+
+def test_what_the_data_was_spared_is_said_and_an_option_turns_it_off(
+    tmp_path: Path, in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = write_people(tmp_path / "twice", np.repeat(people()[0], 2, axis=0))
+    assert in_process(*words, "--steps", "2") == 0
+    said = capsys.readouterr()
+    assert "of 120 frames, left out 60 near-duplicates" in said.err
+    assert "warning: 60 frames are few" in said.err
+    assert "60 frames are few" in (tmp_path / "mine.html").read_text()
+    assert load_model(tmp_path / "mine.safetensors").provenance["frames"] == 60
+    assert in_process(*words, "--steps", "2", "--thin", "0") == 0
+    assert load_model(tmp_path / "mine.safetensors").provenance["frames"] == 120
+
+
+def test_a_report_that_cannot_be_written_costs_no_model(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (models / "mine.html").mkdir(parents=True)
+    assert in_process(*arguments, "--steps", "3") == 0
+    assert "no report was written" in capsys.readouterr().err
+    assert_lifts(models / "mine.safetensors")
+    assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]

@@ -16,6 +16,7 @@ from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.observations.curation import Curation
 
 
 def request(recipe: Recipe | None = None, **options: object) -> TrainingRequest:
@@ -43,7 +44,9 @@ def test_the_training_command_understands_every_word(tmp_path):
             for field in dataclasses.fields(Recipe)
         }
     )
+    curation = Curation(min_visible=7, thin=0.25, outliers=3.5)
     wanted = request(recipe, bags=(str(tmp_path), "second bag"), name="mine", threads=3)
+    wanted = dataclasses.replace(wanted, curation=curation)
     given = arguments().parse_args(wanted.arguments())
     assert given.bag == [tmp_path, Path("second bag")]
     assert (given.topic, given.keypoint_layout) == ("/camera/keypoints", "coco17")
@@ -52,6 +55,7 @@ def test_the_training_command_understands_every_word(tmp_path):
     assert (given.output, given.min_confidence) == (Path("folder"), 0.25)
     assert given.json_progress
     assert override(Recipe(), given) == recipe
+    assert override(Curation(), given) == curation
 
 
 @pytest.mark.parametrize("name", ["", ".", "../up", "a/b", "-x", "a b", "x" * 101])

@@ -1,0 +1,29 @@
+"""What is done with an ensemble before a training: curated, then looked at for variation."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+
+from deep_nrsfm_ros.configuration import override
+from deep_nrsfm_ros.observations.curation import AS_IT_IS, Curated, Curation, curate
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.variation import Variation, examine
+
+
+def prepare(
+    given: argparse.Namespace, ensemble: Ensemble, say: Callable[[str], None]
+) -> tuple[Curated, Variation]:
+    """Return what is fit to be trained on and how it varies; raise ValueError if nothing is.
+
+    Motion capture is clean and is left as it is, unless the arguments say otherwise.
+    """
+    curated = curate(ensemble, override(AS_IT_IS if given.cmu else Curation(), given))
+    if curated.summary:
+        say(curated.summary)
+    variation = examine(curated.ensemble)
+    if variation.refusal:
+        raise ValueError(f"a model cannot be learned from this: {variation.refusal}")
+    for warning in (*curated.warnings, *variation.warnings):
+        say(f"warning: {warning}")
+    return curated, variation

@@ -1,0 +1,193 @@
+"""The report of a training: one HTML file, with all it needs inside."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
+from deep_nrsfm_ros.observations.curation import Curated, apart
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.variation import Variation
+from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
+from deep_nrsfm_ros.reporting.shapes import LiftedFrames, fit, lift_sample, shape_space
+
+if TYPE_CHECKING:
+    from deep_nrsfm_ros.nrsfm.training import Progress
+
+REPORT_SUFFIX = ".html"
+
+_OTHERS = 12  # models that are compared with
+_FRAMES = 6  # best and worst frames that are shown
+_APART = 0.005  # of the data, by which they are
+_CURVES = {
+    "loss": "reprojection error",
+    "cycle_error": "cycle error",
+    "coherence": "coherence of the final dictionary",
+}
+_QUALITY = ("combined", "reprojection_error", "cycle_error", "coherence")
+_CAMERA_TO_SCREEN = np.array([1, -1, -1])  # x right, y down, z forward to x right, y up, z back
+
+
+@dataclass(frozen=True)
+class Training:
+    """What there is to report.
+
+    model: as it was saved at `path`. ensemble: what it was trained on, of which `curated` tells
+    where it comes from. progress: every report of the training, in order. warnings: whatever else
+    its user should know.
+    """
+
+    model: Model
+    path: Path
+    ensemble: Ensemble
+    curated: Curated
+    variation: Variation
+    progress: Sequence[Progress]
+    warnings: Sequence[str] = ()
+
+
+def write_report(training: Training, folders: Sequence[Path]) -> Path:
+    """Write the report next to the model and return its path; whole or not at all.
+
+    folders: where the models are that this one is compared with. Raises OSError, and ValueError
+    when the model lifts none of the frames.
+    """
+    path = training.path.with_suffix(REPORT_SUFFIX)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        partial.write_text(page(training, folders), encoding="utf-8")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def page(training: Training, folders: Sequence[Path] = ()) -> str:
+    """Return the report as HTML; names and other data are escaped."""
+    model, ensemble, variation = training.model, training.ensemble, training.variation
+    found = lift_sample(model, ensemble)
+    scenes: list[dict[str, Any]] = []
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    shapes = _shapes(model, found, scenes)
+    order = np.argsort(found.lifted.residual, kind="stable")
+    gap = _APART * len(ensemble)
+    frames = {
+        "Best": _frames(apart(order, found.frames, gap, _FRAMES), found, training, scenes),
+        "Worst": _frames(apart(order[::-1], found.frames, gap, _FRAMES), found, training, scenes),
+    }
+    return environment.from_string(_resource("report.html.j2")).render(
+        model=model,
+        name=training.path.stem,
+        path=shlex.quote(str(training.path.resolve())),
+        warnings=[*training.warnings, *training.curated.warnings, *variation.warnings],
+        curves=[_curve(training.progress, field, label) for field, label in _CURVES.items()],
+        comparison=_comparison(training, folders),
+        shapes=shapes,
+        frames=frames,
+        looked_at=len(found.frames),
+        residual=float(found.lifted.residual.mean()),
+        variation=variation,
+        spectrum=bars(variation.spectrum[:12], "spectrum of the stacked keypoints, %"),
+        curated=training.curated,
+        hidden=sorted(
+            (row for row in training.curated.hidden_by_name if row[1]), key=lambda row: -row[1]
+        ),
+        suspects=[
+            (suspect, skeleton(suspect.points, suspect.visible, model.layout, suspect.outliers))
+            for suspect in training.curated.suspects
+        ],
+        provenance=_rows(model.provenance),
+        scenes=Markup(_json(scenes)),
+        style=Markup(_resource("report.css")),
+        script=Markup(_resource("viewer.js")),
+    )
+
+
+def _resource(name: str) -> str:
+    """Return a file of this package."""
+    return (files(__package__) / name).read_text(encoding="utf-8")
+
+
+def _json(value: Any) -> str:
+    """Return JSON that cannot end the script element it stands in."""
+    return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
+
+
+def _curve(progress: Sequence[Progress], field: str, label: str) -> Markup:
+    """Return the chart of one figure over the steps, a line for each seed."""
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for record in progress:
+        lines.setdefault(f"seed {record.seed}", []).append((record.step, getattr(record, field)))
+    return curve(lines, label)
+
+
+def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, Any]]:
+    """Return a row of label-free figures for this model and the others that are there."""
+    models = [training.model]
+    seen = {training.path.resolve()}
+    for file in (f for folder in folders for f in sorted(folder.glob(f"*{MODEL_SUFFIX}"))):
+        if file.resolve() not in seen and len(models) <= _OTHERS:
+            seen.add(file.resolve())
+            try:
+                models.append(load_model(file))
+            except ModelFileError:
+                continue  # somebody else's file; this report is not about it
+    rows = []
+    for model in models:
+        here = None
+        if model.layout.keypoints == training.ensemble.layout.keypoints:
+            try:
+                here = fit(model, training.ensemble)
+            except ValueError:
+                pass  # it lifts none of these frames
+        quality = [model.quality.get(key) for key in _QUALITY]
+        rows.append({"model": model, "quality": quality, "here": here})
+    return rows
+
+
+def _shapes(model: Model, found: LiftedFrames, scenes: list[dict[str, Any]]) -> list[Any]:
+    """Return (caption, index of the scene) of the mean shape and of each mode."""
+    space = shape_space(model, found.lifted)
+    shown: list[Any] = [("mean shape", len(scenes))]
+    scenes.append(scene(space.mean, model.layout, turn=30))
+    for k, (mode, share) in enumerate(zip(space.modes, space.shares, strict=True), 1):
+        shown.append((f"mode {k}: {100 * share:.0f} %", len(scenes)))
+        scenes.append(scene(space.mean, model.layout, mode, turn=30))
+    return shown
+
+
+def _frames(
+    chosen: Sequence[int], found: LiftedFrames, training: Training, scenes: list[dict[str, Any]]
+) -> list[Any]:
+    """Return (frame, residual, detections, index of the lifted scene) of the chosen places."""
+    shown = []
+    ensemble, layout = training.ensemble, training.model.layout
+    for k in chosen:
+        frame = int(found.frames[k])
+        drawing = skeleton(ensemble.points[frame], ensemble.visible[frame], layout)
+        place = int(training.curated.frames[frame])
+        shown.append((place, float(found.lifted.residual[k]), drawing, len(scenes)))
+        scenes.append(scene(found.lifted.shapes[k] * _CAMERA_TO_SCREEN, layout, turn=60))
+    return shown
+
+
+def _rows(values: Any, prefix: str = "") -> list[tuple[str, str]]:
+    """Return nested values as (dotted name, text)."""
+    if not isinstance(values, dict):
+        return [(prefix, str(values))]
+    return [
+        row
+        for key, value in values.items()
+        for row in _rows(value, f"{prefix}.{key}" if prefix else str(key))
+    ]

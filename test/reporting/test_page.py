@@ -1,0 +1,179 @@
+"""The report stands alone, shows what there is, and takes nothing from data for HTML."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.observations.curation import Curation, curate
+from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.variation import examine
+from deep_nrsfm_ros.reporting.page import Training, page, write_report
+
+EVIL = '</script><img src=x onerror="alert(1)">&'
+
+
+class Progress(NamedTuple):
+    """As `nrsfm.training` reports it, without torch."""
+
+    step: int
+    steps: int
+    seed: int
+    loss: float
+    cycle_error: float
+    coherence: float
+    seconds_left: float
+
+
+def model_of(layout: KeypointLayout, name: str = "mine", seed: int = 0) -> Model:
+    net = initialise(Architecture(widths=(8, 4)), len(layout), np.random.default_rng(seed))
+    quality = {"combined": 0.1234, "reprojection_error": 0.1, "cycle_error": 0.2, "coherence": 0.5}
+    provenance = {"data": "bags b", "frames": 300, "recipe": {"steps": 7}}
+    frame = np.eye(3, dtype=np.float32)
+    return Model(name, net, layout, Normaliser(), frame, provenance, quality)
+
+
+def training_of(
+    layout: KeypointLayout = HUMAN17, f: int = 300, model: Model | None = None, **changes: Any
+) -> Training:
+    rng, p = np.random.default_rng(0), len(layout)
+    S = centre(rng.standard_normal((p, 3)) + 0.2 * rng.standard_normal((f, p, 3)))
+    points = (100 * S @ random_cameras(f, rng) + 300).astype(np.float32)
+    points[::40, 3] += 900
+    visible = np.ones((f, p), bool)
+    visible[7, 2:] = False
+    curated = curate(Ensemble(points, visible, layout, "bags b"), Curation())
+    progress = [Progress(s, 30, k, 1 / s, 0.3, 0.4, 0.0) for k in (0, 1) for s in (5, 10, 30)]
+    fields: dict[str, Any] = {
+        "model": model or model_of(layout),
+        "path": Path("folder") / "mine.safetensors",
+        "ensemble": curated.ensemble,
+        "curated": curated,
+        "variation": examine(curated.ensemble),
+        "progress": progress,
+    }
+    return Training(**(fields | changes))
+
+
+class Tags(HTMLParser):
+    """Every tag with its attributes, and the text of the scripts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.scripts: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "br"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1:] == ["script"]:
+            self.scripts.append(data)
+
+
+def scenes_of(text: str) -> list[dict[str, Any]]:
+    scenes: list[dict[str, Any]] = json.loads(Tags(text).scripts[0])
+    return scenes
+
+
+@pytest.fixture(scope="module")
+def text() -> str:
+    return page(training_of())
+
+
+def test_it_is_sound_and_fetches_nothing(text: str) -> None:
+    tags = Tags(text)
+    assert tags.open == []
+    assert not {tag for tag, _ in tags.tags} & {"link", "img", "iframe", "object", "embed"}
+    assert not [a for _, a in tags.tags if {"src", "href", "onerror", "onclick"} & a.keys()]
+    assert "http://" not in text and "https://" not in text and "url(" not in text
+    for drawing in re.findall(r"<svg.*?</svg>", text, re.DOTALL):
+        ElementTree.fromstring(drawing)
+
+
+def test_every_canvas_has_its_scene(text: str) -> None:
+    scenes = scenes_of(text)
+    places = [int(a["data-scene"] or "") for tag, a in Tags(text).tags if tag == "canvas"]
+    assert sorted(places) == list(range(len(scenes)))
+    assert len(scenes) == 5 + 6 + 6  # the mean and four modes, the best, the worst
+    for scene in scenes:
+        assert np.shape(scene["points"]) == (17, 3) and np.isfinite(scene["points"]).all()
+        assert len(scene["edges"]) == len(scene["colours"]) == len(HUMAN17.edges)
+
+
+def test_it_tells_what_was_left_out_and_hidden(text: str) -> None:
+    curated = training_of().curated
+    for count in (curated.given, curated.few_visible, curated.mended, len(curated.ensemble)):
+        assert f'<td class="figure">{count}</td>' in text
+    assert curated.mended > 0 and HUMAN17.keypoints[3] in text
+    assert "times the usual: points hidden" in " ".join(text.split())
+
+
+def test_warnings_come_first() -> None:
+    text = page(training_of(f=60, warnings=["the end may be lost"]))
+    assert (
+        text.index("the end may be lost") < text.index("59 frames are few") < text.index("Use it")
+    )
+
+
+def test_each_seed_has_its_curve(text: str) -> None:
+    assert text.count("<title>seed 0</title></polyline>") == 3
+    assert text.count("<title>seed 1</title></polyline>") == 3
+
+
+@pytest.mark.parametrize("progress", [[], [Progress(1, 1, 0, math.nan, math.inf, 0.0, 0.0)]])
+def test_curves_bear_what_a_failed_training_leaves(progress: list[Progress]) -> None:
+    assert "nan" not in "".join(re.findall(r"<svg.*?</svg>", page(training_of(progress=progress))))
+
+
+def test_names_from_data_stay_text() -> None:
+    names = (EVIL, *(f"{EVIL}{i}" for i in range(1, 9)))
+    layout = KeypointLayout(EVIL, names, edges=((names[0], names[1]),))
+    model = model_of(layout, name=EVIL)
+    model.provenance[EVIL] = {EVIL: EVIL}
+    whole = training_of(
+        layout, model=model, warnings=[EVIL], path=Path(f"{EVIL[2:8]} x.safetensors")
+    )
+    tags = Tags(page(whole))
+    assert tags.open == [] and len(tags.scripts) == 2
+    assert "img" not in {tag for tag, _ in tags.tags}
+    assert json.loads(tags.scripts[0])[0]["names"][0] == EVIL
+
+
+def test_other_models_are_compared_with(tmp_path: Path) -> None:
+    save_model(tmp_path / "other.safetensors", model_of(HUMAN17, "other", seed=1))
+    points = KeypointLayout.numbered(5)
+    save_model(tmp_path / "hand.safetensors", model_of(points, "hand"))
+    (tmp_path / "broken.safetensors").write_bytes(b"nothing")
+    whole = training_of(path=tmp_path / "mine.safetensors")
+    save_model(whole.path, whole.model)
+    assert write_report(whole, [tmp_path, tmp_path]) == tmp_path / "mine.html"
+    text = (tmp_path / "mine.html").read_text()
+    rows = re.findall(r"<tr[^>]*><td>(mine|other|hand|broken)</td>(.*?)</tr>", text, re.DOTALL)
+    assert [name for name, _ in rows] == ["mine", "hand", "other"]
+    figures = [len(re.findall(r"\d\.\d{3}", cells)) for _, cells in rows]
+    assert figures == [7, 4, 7]
+    assert sorted(f.name for f in tmp_path.glob("*mine*")) == ["mine.html", "mine.safetensors"]
