@@ -101,7 +101,7 @@ def test_other_keypoints_are_matched_by_name_and_new_ones_learned(
     start, end = (tuned(source, layout, points, steps) for steps in (0, 100))
     assert not np.array_equal(start.net.L.numpy(), np.eye(kept + 1))  # whitened by the new data
     fresh = train(points, np.ones(points.shape[:2], bool), end.preset)
-    assert sum(end.measure()) < 0.5 * sum(start.measure())
+    assert sum(end.measure()) < 0.6 * sum(start.measure())
     assert sum(end.measure()) < 0.7 * sum(fresh.measure())
 
 
@@ -126,7 +126,7 @@ def test_strangers_are_refused(source: Model, figure: Any) -> None:
     ("part", "changes", "complaint"),
     [
         ("architecture", {"widths": (64, 32)}, r"widths is \(64, 32\); model 'source'"),
-        ("architecture", {"whitening": 0.5}, "whitening is 0.5; .* has 0.75: leave"),
+        ("architecture", {"whitening": 0.5}, "whitening is 0.5; .* has 1.0: leave"),
         ("normaliser", {"scale": "none"}, "scale is none"),
         ("recipe", {"steps": 5}, ""),
     ],
