@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -10,32 +9,26 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
+from benchmarks.ablation import STEPS, trained
 from benchmarks.harness import Session, command
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, evaluate
 from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 SUBJECTS = ("01", "05", "127")
 GUIDES = ("coherence", "combined", "reprojection_error", "cycle_error")
 PRESETS = ("default", "paper")
-VARIANT_STEPS = 10_000
-VARIANTS: dict[str, tuple[dict[str, object], dict[str, object]]] = {
-    "no cycle loss": ({}, {"cycle": 0.0}),
-    "no whitening": ({"whitening": 0.0}, {}),
-    "neither": ({"whitening": 0.0}, {"cycle": 0.0}),
-    "paper's widths": ({"widths": PAPER_WIDTHS}, {}),
-}
-"""What is changed in the default, architecture and recipe, for models of every quality."""
+VARIANTS = ("no cycle loss", "no whitening", "no cycle loss, no whitening", "paper's widths")
+"""Models of every quality, from the ablation."""
 LEGEND = {
     "figures": "Spearman's rank correlation of the guide with the error: +1 if the guide falls "
-    "exactly when the error falls; the network alone, no back-projection",
+    "exactly when the error falls; the network alone",
     "coherence": "largest |cos| between two atoms of the final dictionary, the paper's guide",
     "combined": "sqrt(reprojection error^2 + cycle error^2)",
     "along": "snapshots at each tenth of one training",
     "across": f"the results of all trainings of a subject: {', '.join(PRESETS)}, and the default "
-    f"of {VARIANT_STEPS} steps with {', '.join(VARIANTS)}",
+    f"of {STEPS} steps with {'; '.join(VARIANTS)}",
     "chosen by": "error of the snapshot (or model) that has the lowest coherence, the lowest "
     "combined measure, or the lowest error, which takes the truth to know",
     "shape %": CONVENTIONS["shape %"],
@@ -74,20 +67,11 @@ def benchmark(session: Session) -> Table:
                 _correlate(table, (subject, f"along, {preset}"), points, seed)
                 cloud.setdefault(f"along, {preset}", []).extend(points)
                 results.append(points[-1])
-            models = [_variant(session, subject, ensemble, name, seed) for name in VARIANTS]
+            models = [trained(session, subject, ensemble, name, seed) for name in VARIANTS]
             results += [measure(model, ensemble) for model in models]
         _correlate(table, (subject, "across"), results, None)
         cloud["across"] = results
     return table
-
-
-def _variant(session: Session, subject: str, ensemble: Ensemble, name: str, seed: int) -> Model:
-    architecture, recipe = VARIANTS[name]
-    preset = session.preset("default", seed, steps=VARIANT_STEPS, **recipe)
-    preset = preset._replace(
-        architecture=dataclasses.replace(preset.architecture, **architecture)  # type: ignore[arg-type]
-    )
-    return session.trained(f"{subject} {name} seed {seed}", ensemble, preset)
 
 
 def measure(model: Model, ensemble: Ensemble, every: int = 10) -> Point:

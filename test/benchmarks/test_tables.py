@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import batches, coherence, missing, noise, nrsfm_on_cmu, unseen
+from benchmarks import ablation, batches, coherence, missing, noise, nrsfm_on_cmu, unseen
 from benchmarks.harness import Session
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import ALONE
@@ -19,7 +19,7 @@ from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 LONE = ("--subjects", "01", "--seeds", "0", "1", "--steps", "3")
-ALL_TABLES = [nrsfm_on_cmu, unseen, noise, missing, coherence]
+ALL_TABLES = [nrsfm_on_cmu, ablation, unseen, noise, missing, coherence]
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,6 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         small = dataclasses.replace(preset.architecture, widths=(8, 4))
         monkeypatch.setitem(PRESETS, name, preset._replace(architecture=small))
     monkeypatch.setattr(batches, "RANKS", (2,))
-    monkeypatch.setattr(coherence, "VARIANT_STEPS", 3)
     monkeypatch.setattr(unseen, "TRAINED_ON", {"86": ("86",), "union": ("01", "86")})
 
 
@@ -182,3 +181,15 @@ def test_correlation_has_its_sign_and_choice_its_error() -> None:
     assert shape["coherence"] == pytest.approx(-1) and shape["combined"] == pytest.approx(1)
     assert (shape["chosen by coherence"], shape["chosen by combined"]) == (10.0, 2.0)
     assert (shape["best"], proper["best"]) == (2.0, 3.0)
+
+
+@pytest.mark.parametrize("name", list(ablation.VARIANTS))
+def test_a_variant_is_the_default_but_for_what_it_changes(
+    few: None, session: Session, ensemble: Ensemble, name: str
+) -> None:
+    model = ablation.trained(session, "01", ensemble, name, 0)
+    architecture, recipe = ablation.VARIANTS[name]
+    default = session.preset("default", 0)
+    assert model.network.architecture == dataclasses.replace(default.architecture, **architecture)
+    expected = dataclasses.asdict(dataclasses.replace(default.recipe, **recipe))
+    assert model.provenance["recipe"] == expected
