@@ -21,6 +21,7 @@ from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, random_cameras, rotati
 
 _ROUNDS = 2
 _FLOOR = 1e-4  # variance of every direction, relative to the mean: any keypoints can be met
+_BLOCK = 64  # frames at a time: more do not fit the cache, and take five times as long
 _UNKNOWN = 1e4  # variance of what is not known at all, relative to that of the errors
 
 
@@ -39,12 +40,18 @@ def correct(
     which may be any. Missing keypoints follow the others.
     """
     n, p, _ = S.shape
+    noise = np.broadcast_to(noise, n)
+    if n > _BLOCK:
+        blocks = (slice(i, i + _BLOCK) for i in range(0, n, _BLOCK))
+        return np.concatenate(
+            [correct(S[b], M[b], W[b], visible[b], covariance, noise[b]) for b in blocks]
+        )
     M = M.astype(np.float64)
     CH = (covariance.reshape(-1, 3) @ M).reshape(n, p, 3, 2 * p)
     A = M[:, None].swapaxes(-1, -2) @ CH  # H Sigma H^T
     unknown = _UNKNOWN * np.trace(covariance) / (3 * p)
     # Not quite zero, so that there is an answer even where M is no camera.
-    spread = np.where(visible, np.square(noise)[..., None] + 1e-12 * unknown, unknown)  # (n, p)
+    spread = np.where(visible, np.square(noise)[:, None] + 1e-12 * unknown, unknown)  # (n, p)
     A = A.reshape(n, p, 2, p, 2)
     for axis in range(2):
         A[:, :, axis, :, axis] += unknown  # of the translation, the same for all points

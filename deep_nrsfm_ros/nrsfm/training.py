@@ -160,7 +160,7 @@ class Trainer:
         self.probe = self.sample(1024)
 
 
-_COVARIANCE_FRAMES = 4096
+_COVARIANCE_FRAMES = 2048
 _COUNTS = {"step", "seed", "cpu_seconds"}
 
 
