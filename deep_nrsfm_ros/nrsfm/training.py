@@ -320,7 +320,7 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         seen = normaliser.encode(W, np.ones_like(W[..., :1]))
         return *reconstruct(net, seen.W), seen.W
 
-    sample = trainer.sample(_COVARIANCE_FRAMES)
+    sample = trainer.sample(min(_COVARIANCE_FRAMES, 4 * len(trainer.frames.points)))
     W, _ = complete(net, sample.points.cpu().numpy(), sample.mask.cpu().numpy())
     S, _, _ = lift(W)
     covariance = error_covariance(lift, W, np.random.default_rng(trainer.seed))
