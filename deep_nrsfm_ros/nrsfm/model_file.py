@@ -38,8 +38,9 @@ class Model:
     object_frame: (3, 3) orthonormal A that takes the network's axes to the object's (S A, A^T M).
         det -1 undoes a mirrored depth; the axes are x front, y left, z up where the layout has
         a handedness.
-    error_covariance: (3p, 3p) of the network's errors, in its own axes; see `correction`.
     provenance: data, recipe and versions; quality: label-free figures.
+    error_covariance: (3p, 3p) of the network's errors, in its own axes; see `correction`. Equal
+        and apart from each other if nothing is known.
     """
 
     name: str
@@ -47,9 +48,15 @@ class Model:
     layout: KeypointLayout
     normaliser: Normaliser
     object_frame: NDArray[np.float32]
-    error_covariance: NDArray[np.float32]
     provenance: dict[str, Any] = field(default_factory=dict)
     quality: dict[str, Any] = field(default_factory=dict)
+    error_covariance: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+    def __post_init__(self) -> None:
+        """Fill in a covariance that is not given."""
+        if not self.error_covariance.size:
+            unknown = np.eye(3 * len(self.layout), dtype=np.float32)
+            object.__setattr__(self, "error_covariance", unknown)
 
 
 def save_model(path: Path, model: Model) -> None:
@@ -124,9 +131,9 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
         layout,
         normaliser,
         frame,
-        covariance,
         dict(header["provenance"]),
         dict(header["quality"]),
+        covariance,
     )
 
 

@@ -330,7 +330,7 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         layout,
         normaliser,
         object_frame(S, layout),
-        covariance,
+        error_covariance=covariance,
         provenance={
             "data": source,
             "frames": len(trainer.frames.points),

@@ -80,8 +80,7 @@ def start(tmp_path: Path, ring: list[Camera], write_session: Any) -> Start:
     """Return a function that starts the demo on a made-up session with an untrained model."""
     write_session(tmp_path / WHEEL, ring, ring, [0.0] * 4)
     network = initialise(Architecture(widths=(16, 8)), len(HUMAN17), np.random.default_rng(0))
-    eyes = (np.eye(n, dtype=np.float32) for n in (3, 3 * 17))
-    model = Model("untrained", network, HUMAN17, Normaliser(), *eyes)
+    model = Model("untrained", network, HUMAN17, Normaliser(), np.eye(3, dtype=np.float32))
     save_model(tmp_path / "untrained.safetensors", model)
 
     def run(**options: Any) -> subprocess.Popen[str]:

@@ -22,8 +22,7 @@ QUALITY = {"reprojection_error": 0.1234, "cycle_error": 0.5678}
 def save(path: Path, layout: KeypointLayout = HUMAN17, **fields: Any) -> Path:
     network = initialise(Architecture(widths=(4,)), len(layout), np.random.default_rng(0))
     frame = np.eye(3, dtype=np.float32)
-    covariance = np.eye(3 * len(layout), dtype=np.float32)
-    model = Model("any", network, layout, Normaliser(), frame, covariance, PROVENANCE, QUALITY)
+    model = Model("any", network, layout, Normaliser(), frame, PROVENANCE, QUALITY)
     save_model(path, dataclasses.replace(model, **fields))
     return path
 

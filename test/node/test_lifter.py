@@ -275,7 +275,7 @@ def test_parameters_describe_themselves(start_lifter, connect):
     start_lifter()
     client = connect()
     model, share, layout, bags = client.describe_parameters(
-        "model", "back_projection", "keypoint_layout", "train.bags"
+        "model", "noise", "keypoint_layout", "train.bags"
     )
     assert all(d.description for d in (model, share, layout, bags))
     assert (share.floating_point_range[0].from_value, share.floating_point_range[0].to_value) == (

@@ -171,8 +171,7 @@ def test_an_object_that_is_no_preset_is_trained_anew_from_its_model_and_by_numbe
 ):
     write_bag(tmp_path / "bag", 200, len(PAW))
     network = initialise(Architecture(widths=(8, 4)), len(PAW), np.random.default_rng(0))
-    eyes = (np.eye(n, dtype=np.float32) for n in (3, 3 * len(PAW)))
-    paw = Model("paw", network, PAW, Normaliser(), *eyes)
+    paw = Model("paw", network, PAW, Normaliser(), np.eye(3, dtype=np.float32))
     save_model(models / "paw.safetensors", paw)
     train = {"bags": [str(tmp_path / "bag")], "topic": "/keypoints", "steps": 5, "name": "anew"}
     start_lifter(input_type="std_msgs/Float32MultiArray", model="paw", train=train)

@@ -109,9 +109,7 @@ def test_a_network_that_is_not_whitened_is_taken_as_it_is(figure: Any) -> None:
     architecture = Architecture(widths=(8, 4), whitening=0.0)
     network = initialise(architecture, 12, np.random.default_rng(0))
     frame = np.eye(3, dtype=np.float32)
-    plain = Model(
-        "plain", network, figure.layout, Normaliser(), frame, np.eye(36, dtype=np.float32)
-    )
+    plain = Model("plain", network, figure.layout, Normaliser(), frame)
     net = tuned(plain, figure.layout, figure.points, steps=0).net
     np.testing.assert_array_equal(net.L.numpy(), np.eye(12))
 

@@ -42,7 +42,7 @@ def random_model(
     B = np.random.default_rng(3).standard_normal((3 * len(layout), 3 * len(layout)))
     covariance = (0.01 * np.eye(len(B)) + 0.003 * B @ B.T / len(B)).astype(np.float32)
     frame = frame.astype(np.float32)
-    return Model("random", network, layout, Normaliser(scale), frame, covariance)
+    return Model("random", network, layout, Normaliser(scale), frame, error_covariance=covariance)
 
 
 def pixels(n: int = N, p: int = 17, missing: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -45,7 +45,7 @@ def model(
     quality = {"cycle_error": 0.25, "coherence": 0.5}
     covariance = np.diag(rng.uniform(1, 2, 3 * len(layout))).astype(np.float32)
     return Model(
-        "mine", network, layout, Normaliser("none"), MIRROR, covariance, provenance, quality
+        "mine", network, layout, Normaliser("none"), MIRROR, provenance, quality, covariance
     )
 
 
