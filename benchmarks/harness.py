@@ -22,7 +22,8 @@ from deep_nrsfm_ros.nrsfm.keypoints import CMU31
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
-from deep_nrsfm_ros.nrsfm.training import Progress, Trainer, finish, train
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
+from deep_nrsfm_ros.nrsfm.training import Progress, finish, train
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 SNAPSHOTS = 10

@@ -23,6 +23,7 @@ from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.node.model_folders import model_folders
 from deep_nrsfm_ros.nrsfm.fine_tuning import inherit, keep_what_is_fixed, start_from
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.limits import WHOLE, Limits
 from deep_nrsfm_ros.nrsfm.model_file import (
     MODEL_SUFFIX,
     Model,
@@ -85,7 +86,7 @@ def arguments() -> argparse.ArgumentParser:
     run.add_argument("--threads", type=int, default=0, help="threads of torch (0: all cores)")
     run.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
     run.add_argument("--json-progress", action="store_true", help="one JSON object a line")
-    for config in (Recipe, Architecture, Normaliser, Curation):
+    for config in (Recipe, Limits, Architecture, Normaliser, Curation):
         add_arguments(parser, config)
     return parser
 
@@ -250,6 +251,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     )
     if start:
         keep_what_is_fixed(start, preset)
+    limits = override(WHOLE if given.cmu else Limits(), given)
     check_name("--name", given.name)
     if importlib.util.find_spec("torch") is None:
         raise ValueError("training needs torch, which is not installed: pip install torch")
@@ -278,6 +280,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         ensemble.points,
         ensemble.visible,
         preset,
+        limits=limits,
         on_progress=report.training,
         should_stop=should_stop,
         checkpoint=checkpoint,
@@ -292,9 +295,11 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         model = inherit(model, start)
     save_model(model_path, model)
     whole = Training(model, model_path, ensemble, curated, variation, report.curves)
-    html = write_page(whole, report, compare=trainer.step == preset.recipe.steps)
+    html = write_page(whole, report, compare=bool(trainer.ended))
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
-    if trainer.step < preset.recipe.steps:
+    if trainer.step < preset.recipe.steps and trainer.ended:
+        message += f"; after {trainer.step} of {preset.recipe.steps} steps {trainer.ended}"
+    if not trainer.ended:
         state, message = "cancelled", "cancelled; the model holds what was learned so far"
         if checkpoint.exists():
             message += ", --resume goes on"

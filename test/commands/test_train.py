@@ -24,7 +24,7 @@ from deep_nrsfm_ros.nrsfm.keypoints import COCO17, HUMAN17
 from deep_nrsfm_ros.nrsfm.lifting import Lifter
 from deep_nrsfm_ros.nrsfm.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.object_file import read_object
-from deep_nrsfm_ros.nrsfm.training import Trainer
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
 from deep_nrsfm_ros.observations.bags import frames, write_bag
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
