@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from deep_nrsfm_ros.nrsfm.distributed import ALONE, Team
 from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
 from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
@@ -21,19 +22,30 @@ class Trainer:
     """One initialisation in training: network, optimiser and step, all of it resumable.
 
     The randomness of a step depends on the seed and the step alone, so a training resumed from a
-    checkpoint goes on exactly as if it had not stopped.
+    checkpoint goes on exactly as if it had not stopped. In a team it depends on the process too,
+    and all go on with the shapes of the first one's last batch.
     """
 
     def __init__(
-        self, frames: Frames, preset: Preset, seed: int, start: Network | None = None
+        self,
+        frames: Frames,
+        preset: Preset,
+        seed: int,
+        start: Network | None = None,
+        team: Team = ALONE,
     ) -> None:
         """Initialise the network from `seed`, or take that of `start`.
 
-        Either is whitened by the frames, unless it has a whitening already.
+        Either is whitened by the frames, unless it has a whitening already. `frames` are those of
+        this process; all processes of a team make their trainers and take their steps together.
         """
         architecture, normaliser, recipe = preset
         self.frames, self.preset, self.seed, self.step = frames, preset, seed, 0
+        self.team, self.batch = team, team.share(preset.recipe.batch)
         self.cpu_seconds = 0.0
+        count = torch.tensor(len(frames.points), device=frames.points.device)
+        team.total(count)
+        self.frames_in_all = int(count)
         self.time_gone = 0.0  # share of the time there is, if that is limited
         self.kept: int | None = None  # the step of the weights, where that is not the last one
         self.ended = ""  # why there is nothing left to be done; "" if it was stopped
@@ -45,7 +57,7 @@ class Trainer:
             as_released=recipe.as_released,
         )
         if architecture.whitening and np.array_equal(initial.L, np.eye(initial.p)):
-            moment = second_moment(frames, normaliser)
+            moment = second_moment(frames, normaliser, team)
             exponent, floor = architecture.whitening, architecture.whitening_floor
             L, L_inverse = whitening(moment, exponent, floor)
             initial = dataclasses.replace(initial, L=L, L_inverse=L_inverse)
@@ -76,7 +88,7 @@ class Trainer:
 
     def sample(self, size: int, step: int = -1) -> Frames:
         """Return the random batch of a step; leaves the generator ready for its cameras."""
-        self.generator.manual_seed((self.seed << 32) + step + 1)
+        self.generator.manual_seed((self.seed << 32) + (self.team.rank << 24) + step + 1)
         f = len(self.frames.points)
         device = self.frames.points.device
         chosen = torch.randint(f, (size,), generator=self.generator, device=device)
@@ -87,26 +99,34 @@ class Trainer:
         began = time.process_time()
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.preset.recipe, self.step, self.time_gone)
-        batch = self.sample(self.preset.recipe.batch, self.step)
+        batch = self.sample(self.batch, self.step)
         losses = self.objective(self.net, batch, self.shapes, self.generator)
         self.shapes = losses.shapes
         self.optimiser.zero_grad(set_to_none=True)
         losses.total.backward()  # type: ignore[no-untyped-call]
+        if self.team.size > 1 and self.weights.grad is not None:
+            self.team.total(self.weights.grad.mul_(self.batch / self.preset.recipe.batch))
         self.optimiser.step()
         self.step += 1
         self.cpu_seconds += time.process_time() - began
 
     @torch.no_grad()
     def measure(self) -> tuple[float, float]:
-        """Return (reprojection error, cycle error) on fixed frames without augmentation."""
+        """Return (reprojection error, cycle error) on fixed frames without augmentation.
+
+        The frames are those of this process.
+        """
         self.generator.manual_seed(self.seed)
         shapes = self.plain_objective(self.net, self.probe, None, self.generator).shapes
         losses = self.plain_objective(self.net, self.probe, shapes, self.generator)
         return float(losses.reprojection), float(losses.cycle)
 
     def quality(self) -> float:
-        """Return the label-free quality, less being better: both errors of `measure` combined."""
-        return math.hypot(*self.measure())
+        """Return the label-free quality, less being better: both errors of `measure` combined.
+
+        The errors are means over the team, so all processes of it ask together.
+        """
+        return math.hypot(*self.team.mean(self.measure()))
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that `restore` needs, as named tensors."""
@@ -143,14 +163,20 @@ class Trainer:
 _COUNTS = {"step", "seed", "cpu_seconds"}
 
 
-def second_moment(frames: Frames, normaliser: Normaliser) -> NDArray[np.float64]:
-    """Return E[W W^T] (p, p), each entry over the frames in which both points are visible."""
+def second_moment(
+    frames: Frames, normaliser: Normaliser, team: Team = ALONE
+) -> NDArray[np.float64]:
+    """Return E[W W^T] (p, p), each entry over the frames in which both points are visible.
+
+    The frames are those of all processes.
+    """
     total = seen = torch.zeros(())
     for start in range(0, len(frames.points), 16384):
         points, mask = (tensor[start : start + 16384] for tensor in frames)
         W = normaliser.encode(points, mask).W.double()
         total = total + (W @ W.swapaxes(-1, -2)).sum(0)
         seen = seen + (mask @ mask.swapaxes(-1, -2)).double().sum(0)
+    team.total(total, seen)
     moment = (total / seen.clamp(min=1)).cpu().numpy()
     return np.asarray(moment, np.float64)
 

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.nrsfm.best import Best
 from deep_nrsfm_ros.nrsfm.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.nrsfm.correction import error_covariance
+from deep_nrsfm_ros.nrsfm.distributed import ALONE, Team
 from deep_nrsfm_ros.nrsfm.geometry import Floats
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.limits import WHOLE, Limits
@@ -26,23 +26,12 @@ from deep_nrsfm_ros.nrsfm.losses import Frames, visible_centre
 from deep_nrsfm_ros.nrsfm.metrics import object_frame
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Network, coherence, complete, reconstruct
+from deep_nrsfm_ros.nrsfm.progress import Clock, Progress
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
 
 _COVARIANCE_FRAMES = 2048
 _SCREENING_SHARE = 0.1  # of the time, at most
-
-
-class Progress(NamedTuple):
-    """State of a training, means over the steps since the last report."""
-
-    step: int
-    steps: int
-    seed: int
-    loss: float  # relative reprojection error
-    cycle_error: float  # relative error of shapes reconstructed again from another camera
-    coherence: float  # of the final dictionary
-    seconds_left: float
 
 
 def train(
@@ -57,6 +46,7 @@ def train(
     checkpoint: Path | None = None,
     checkpoint_seconds: float = 30.0,
     start: Network | None = None,
+    team: Team = ALONE,
 ) -> Trainer:
     """Train on keypoints (f, p, 2) with visibility (f, p), any unit, x right and y down.
 
@@ -68,18 +58,30 @@ def train(
     screened goes on there too, and returns the best seed so far. `start` is the network to begin
     with instead of a random one (see `fine_tuning`), of the preset's architecture; there are no
     seeds to choose from then. `on_step` sees the trainer when its seed is chosen and after each
-    step from then on; `on_progress` hears of all steps now and then. Raises ValueError for data
-    that cannot be trained on or a checkpoint that does not fit.
+    step from then on; `on_progress` hears of all steps now and then. Every process of a `team`
+    calls this with the same arguments, all frames included, and keeps its shard; the first alone
+    calls `on_progress` and uses the checkpoint. Raises ValueError for data that cannot be trained
+    on or a checkpoint that does not fit.
     """
     for config in (*preset, limits):
         check(config)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    frames = Frames(*(tensor.to(device) for tensor in _usable(points, visible)))
-    run = _Run(frames, preset, limits, start)
+    usable = _usable(points, visible)
+    if team.size > min(len(usable.points), preset.recipe.batch):
+        raise ValueError(
+            f"{team.size} processes are more than the {len(usable.points)} frames or the batch of "
+            f"{preset.recipe.batch} can be shared out to"
+        )
+    frames = Frames(*(team.shard(tensor).to(device) for tensor in usable))
+    run = _Run(frames, preset, limits, start, team)
     run.on_progress, run.should_stop = on_progress, should_stop
     run.checkpoint, run.checkpoint_seconds = checkpoint, checkpoint_seconds
-    if checkpoint is not None and checkpoint.exists():
-        run.restore(read_checkpoint(checkpoint))
+    if team.rank:
+        run.checkpoint = None
+    file = run.checkpoint
+    saved = team.tell(read_checkpoint(file) if file is not None and file.exists() else None)
+    if saved is not None:
+        run.restore(saved)
     return run.train(on_step)
 
 
@@ -96,19 +98,20 @@ class _Run:
     checkpoint_seconds: float
 
     def __init__(
-        self, frames: Frames, preset: Preset, limits: Limits, start: Network | None
+        self, frames: Frames, preset: Preset, limits: Limits, start: Network | None, team: Team
     ) -> None:
         recipe = preset.recipe
-        self.frames, self.preset, self.limits = frames, preset, limits
+        self.frames, self.preset, self.team = frames, preset, team
         self.screening = recipe.seeds > 1 and start is None
         self.first_seed = recipe.seed * (recipe.seeds if self.screening else 1)
-        self.trainer = Trainer(frames, preset, self.first_seed, start)
+        self.trainer = Trainer(frames, preset, self.first_seed, start, team)
         self.leader: Trainer | None = None
         self.leader_error = math.inf
         self.best = Best(limits, recipe)
-        self.clock = _Clock(recipe.steps, limits.minutes * 60)
+        self.clock = Clock(recipe.steps, limits.minutes * 60)
         self.saved = time.monotonic()
-        self.stopped = False
+        self.stopped, self.time_gone = False, 0.0
+        self.asked = 0
 
     def train(self, on_step: Callable[[Trainer], None]) -> Trainer:
         if self.screening:
@@ -126,7 +129,8 @@ class _Run:
             finished = trainer.step == self.preset.recipe.steps
             trainer.ended = "all steps were taken" if finished else "its time was up"
         self.best.put_back(trainer)
-        self.on_progress(self.clock.progress(trainer))
+        if not self.team.rank:
+            self.on_progress(self.clock.progress(trainer))
         return trainer
 
     def _screen(self) -> None:
@@ -140,13 +144,16 @@ class _Run:
             self._take(until, _SCREENING_SHARE * done / recipe.seeds)
             if self.stopped:
                 return
-            error = self.trainer.measure()[1]
+            _, error = self.team.mean(self.trainer.measure())
             if self.leader is None or error < self.leader_error:
                 self.leader, self.leader_error = self.trainer, error
             if done < recipe.seeds:
-                self.trainer = Trainer(self.frames, self.preset, self.first_seed + done)
+                self.trainer = self._fresh(self.first_seed + done)
         assert self.leader is not None
         self.trainer, self.leader, self.screening = self.leader, None, False
+
+    def _fresh(self, seed: int) -> Trainer:
+        return Trainer(self.frames, self.preset, seed, team=self.team)
 
     def _take(
         self,
@@ -163,8 +170,11 @@ class _Run:
         self.clock.restart(trainer.step)
         on_step(trainer)
         while trainer.step < steps and not (best and best.standstill):
-            trainer.time_gone = self.clock.gone()
-            self.stopped = self.should_stop()
+            if self.asked % self.team.settle_every == 0:
+                said = self.should_stop(), self.clock.gone()
+                self.stopped, self.time_gone = self.team.agree(*said)
+            self.asked += 1
+            trainer.time_gone = self.time_gone
             if self.stopped or (trainer.step and trainer.time_gone >= time_share):
                 return
             trainer.advance()
@@ -172,7 +182,7 @@ class _Run:
                 best.look(trainer)
             on_step(trainer)
             self._save_now_and_then()
-            if self.clock.due():
+            if not self.team.rank and self.clock.due():
                 self.on_progress(self.clock.progress(trainer))
 
     def _save_now_and_then(self) -> None:
@@ -208,7 +218,7 @@ class _Run:
             if name.startswith("leader.")
         }
         if self.screening and leader:
-            self.leader = Trainer(self.frames, self.preset, self.first_seed)
+            self.leader = self._fresh(self.first_seed)
             self.leader.restore(leader)
             self.leader_error = float(tensors["screening"])
 
@@ -225,40 +235,6 @@ def _usable(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> Frames:
     if not usable.any():
         raise ValueError(f"none of the {len(points)} frames shows two keypoints apart")
     return Frames(tensor[usable], mask[usable])
-
-
-class _Clock:
-    """When to report, how long is left, and how much of the time there is is gone."""
-
-    def __init__(self, steps: int, limit: float, every_seconds: float = 5.0) -> None:
-        """Take the limit in seconds; 0 is none."""
-        self.steps, self.limit, self.every = steps, limit, every_seconds
-        self.start, self.before = time.monotonic(), 0.0
-        self.restart(0)
-
-    def restart(self, step: int) -> None:
-        self.began = self.reported = time.monotonic()
-        self.first = step
-
-    def seconds(self) -> float:
-        """Return how long the training has taken, what it goes on with included."""
-        return self.before + time.monotonic() - self.start
-
-    def gone(self) -> float:
-        return self.seconds() / self.limit if self.limit else 0.0
-
-    def due(self) -> bool:
-        return time.monotonic() - self.reported >= self.every
-
-    def progress(self, trainer: Trainer) -> Progress:
-        self.reported = time.monotonic()
-        pace = (self.reported - self.began) / max(trainer.step - self.first, 1)
-        loss, cycle = trainer.measure()
-        sharpness = coherence(trainer.net.map(lambda w: w.detach().cpu().numpy()))
-        left = 0.0 if trainer.ended else pace * (self.steps - trainer.step)
-        if self.limit:
-            left = min(left, max(self.limit - self.seconds(), 0.0))
-        return Progress(trainer.step, self.steps, trainer.seed, loss, cycle, sharpness, left)
 
 
 def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> Model:
@@ -284,12 +260,13 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         covariance,
         provenance={
             "data": source,
-            "frames": len(trainer.frames.points),
+            "frames": trainer.frames_in_all,
             "recipe": dataclasses.asdict(trainer.preset.recipe),
             "seed": trainer.seed,
             "step": trainer.step,
             **({} if trainer.kept is None else {"kept_step": trainer.kept}),
-            "cpu_seconds": round(trainer.cpu_seconds, 2),
+            "cpu_seconds": round(trainer.cpu_seconds, 2),  # of the first process
+            **({} if trainer.team.size == 1 else {"processes": trainer.team.size}),
             "versions": {"deep_nrsfm_ros": __version__, "torch": torch.__version__},
         },
         quality={

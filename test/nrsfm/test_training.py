@@ -19,9 +19,10 @@ from deep_nrsfm_ros.nrsfm.losses import Frames
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors, signed_volumes
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.progress import Progress
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.nrsfm.trainer import Trainer, learning_rate
-from deep_nrsfm_ros.nrsfm.training import Progress, finish, train
+from deep_nrsfm_ros.nrsfm.training import finish, train
 
 SMALL = Preset(
     Architecture(widths=(8, 4)),
