@@ -21,8 +21,10 @@ from deep_nrsfm_ros.commands.evaluate import evaluate, figures, read_split
 from deep_nrsfm_ros.nrsfm.keypoints import CMU31
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, load_model, save_model
+from deep_nrsfm_ros.nrsfm.progress import Progress
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
-from deep_nrsfm_ros.nrsfm.training import Progress, Trainer, finish, train
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
+from deep_nrsfm_ros.nrsfm.training import finish, train
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 SNAPSHOTS = 10

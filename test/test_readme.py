@@ -13,6 +13,7 @@ from deep_nrsfm_ros.node.pipeline import InputOptions
 from deep_nrsfm_ros.node.training_request import TrainingOptions
 from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.observations.curation import Curation
 
@@ -37,6 +38,7 @@ def parameter_rows(cls: type, prefix: str) -> list[str]:
         (LiftingOptions, ""),
         (TrainingOptions, "train."),
         (Recipe, "train."),
+        (Limits, "train."),
         (Curation, "train."),
     ],
 )

@@ -21,8 +21,10 @@ from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.commands.preparation import prepare
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.node.model_folders import model_folders
+from deep_nrsfm_ros.nrsfm.distributed import join, rank
 from deep_nrsfm_ros.nrsfm.fine_tuning import inherit, keep_what_is_fixed, start_from
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.limits import WHOLE, Limits
 from deep_nrsfm_ros.nrsfm.model_file import (
     MODEL_SUFFIX,
     Model,
@@ -85,7 +87,7 @@ def arguments() -> argparse.ArgumentParser:
     run.add_argument("--threads", type=int, default=0, help="threads of torch (0: all cores)")
     run.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
     run.add_argument("--json-progress", action="store_true", help="one JSON object a line")
-    for config in (Recipe, Architecture, Normaliser, Curation):
+    for config in (Recipe, Limits, Architecture, Normaliser, Curation):
         add_arguments(parser, config)
     return parser
 
@@ -154,7 +156,7 @@ class Reporter:
             self._show("reading", done, total, {})
 
     def training(self, progress: Any) -> None:
-        """Report a `nrsfm.training.Progress`, and keep it for the curves."""
+        """Report a `nrsfm.progress.Progress`, and keep it for the curves."""
         self.curves.append(progress)
         values = progress._asdict()
         step, steps = values.pop("step"), values.pop("steps")
@@ -196,6 +198,21 @@ class Reporter:
     def _print(values: dict[str, Any]) -> None:
         rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in values.items()}
         print(json.dumps(rounded), flush=True)
+
+
+class SilentReporter(Reporter):
+    """Leaves the talking to the first process, but for what went wrong in this one."""
+
+    def say(self, message: str) -> None:
+        """Say nothing."""
+
+    def end(self, state: str, message: str, **values: Any) -> None:
+        """Report a failure, which may be of this machine alone."""
+        if state == "failed":
+            print(f"process {rank()} {state}: {message}", file=sys.stderr)
+
+    def _show(self, state: str, done: int, total: int, values: dict[str, Any]) -> None:
+        pass
 
 
 def write_page(training: Training, report: Reporter, *, compare: bool) -> str:
@@ -250,6 +267,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     )
     if start:
         keep_what_is_fixed(start, preset)
+    limits = override(WHOLE if given.cmu else Limits(), given)
     check_name("--name", given.name)
     if importlib.util.find_spec("torch") is None:
         raise ValueError("training needs torch, which is not installed: pip install torch")
@@ -269,20 +287,27 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
 
     if given.threads:
         torch.set_num_threads(given.threads)
+    team = join()
     model_path = given.output / f"{given.name}{MODEL_SUFFIX}"
-    given.output.mkdir(parents=True, exist_ok=True)
     checkpoint = given.output / f".{given.name}.checkpoint"
-    if not given.resume:
-        checkpoint.unlink(missing_ok=True)
+    if not team.rank:
+        given.output.mkdir(parents=True, exist_ok=True)
+        if not given.resume:
+            checkpoint.unlink(missing_ok=True)
     trainer = train(
         ensemble.points,
         ensemble.visible,
         preset,
+        limits=limits,
         on_progress=report.training,
         should_stop=should_stop,
         checkpoint=checkpoint,
         start=network,
+        team=team,
     )
+    team.leave()
+    if team.rank:
+        return
     if not trainer.step:
         report.end("cancelled", "cancelled before anything was learned; nothing was written")
         return
@@ -292,9 +317,11 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         model = inherit(model, start)
     save_model(model_path, model)
     whole = Training(model, model_path, ensemble, curated, variation, report.curves)
-    html = write_page(whole, report, compare=trainer.step == preset.recipe.steps)
+    html = write_page(whole, report, compare=bool(trainer.ended))
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
-    if trainer.step < preset.recipe.steps:
+    if trainer.step < preset.recipe.steps and trainer.ended:
+        message += f"; after {trainer.step} of {preset.recipe.steps} steps {trainer.ended}"
+    if not trainer.ended:
         state, message = "cancelled", "cancelled; the model holds what was learned so far"
         if checkpoint.exists():
             message += ", --resume goes on"
@@ -307,7 +334,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command; exit code 2 says that the input was at fault."""
     given = arguments().parse_args(argv)
-    report = Reporter(given.json_progress)
+    report = (SilentReporter if rank() else Reporter)(given.json_progress)
     should_stop = stop_on_signals()
     if given.json_progress:
         should_stop = stop_with_parent(should_stop)

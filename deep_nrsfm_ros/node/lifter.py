@@ -45,6 +45,7 @@ from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingReques
 from deep_nrsfm_ros.node.training_service import TrainingService
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
@@ -77,6 +78,7 @@ class LifterNode(Node):
         parameters.declare(self, LiftingOptions)
         parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
+        parameters.declare(self, Limits, _TRAIN)
         parameters.declare(self, Curation, _TRAIN)
         self._models_dir = Path(self._inputs.models_dir).expanduser()
         self._pipeline = self._proposed = self._prepare(())
@@ -181,7 +183,7 @@ class LifterNode(Node):
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
-        for checked in (TrainingOptions, Recipe, Curation):
+        for checked in (TrainingOptions, Recipe, Limits, Curation):
             parameters.read(self, checked, _TRAIN, changes)
         # Files are read again only when they are named again: they may be gone by now.
         changed = {change.name for change in changes} or {"model", "keypoint_layout"}
@@ -234,6 +236,7 @@ class LifterNode(Node):
             min_confidence=inputs.min_confidence,
             output=self._models_dir,
             curation=parameters.read(self, Curation, _TRAIN),
+            limits=parameters.read(self, Limits, _TRAIN),
         )
 
     def _activate(self, path: str) -> None:

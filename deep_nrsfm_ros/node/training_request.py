@@ -9,6 +9,7 @@ from deep_nrsfm_ros.configuration import option, to_arguments
 from deep_nrsfm_ros.node.pipeline import MODEL_ORDER
 from deep_nrsfm_ros.nrsfm.fine_tuning import start_from
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
+from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import check_name, load_model
 from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
@@ -70,6 +71,7 @@ class TrainingRequest:
     min_confidence: float
     output: Path
     curation: Curation = Curation()
+    limits: Limits = Limits()
 
     def check(self) -> str:
         """Return what should be known before, or ""; raise ValueError that says what is wrong."""
@@ -108,4 +110,6 @@ class TrainingRequest:
         words = [word for pair in named.items() for word in pair]
         for bag in self.options.bags:
             words += ["--bag", str(Path(bag).expanduser())]
-        return [*words, *to_arguments(self.recipe), *to_arguments(self.curation), "--json-progress"]
+        for config in (self.recipe, self.limits, self.curation):
+            words += to_arguments(config)
+        return [*words, "--json-progress"]

@@ -23,7 +23,7 @@ from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
 from deep_nrsfm_ros.reporting.shapes import LiftedFrames, fit, lift_sample, shape_space
 
 if TYPE_CHECKING:
-    from deep_nrsfm_ros.nrsfm.training import Progress
+    from deep_nrsfm_ros.nrsfm.progress import Progress
 
 REPORT_SUFFIX = ".html"
 

@@ -17,6 +17,7 @@ from deep_nrsfm_ros.commands.evaluate import ALONE
 from deep_nrsfm_ros.nrsfm import training
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.recipe import Preset
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 STEPS = 23  # snapshots do not divide it
@@ -46,18 +47,18 @@ def preset(session: Session) -> Preset:
 def count_steps(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], list[int]]:
     """Return a function that counts steps from now on, and stops training after some of them."""
 
-    advance = training.Trainer.advance
+    advance = Trainer.advance
 
     def count(limit: int = 100) -> list[int]:
         steps: list[int] = []
 
-        def counted(trainer: training.Trainer) -> None:
+        def counted(trainer: Trainer) -> None:
             if len(steps) == limit:
                 raise StoppedError
             steps.append(trainer.step)
             advance(trainer)
 
-        monkeypatch.setattr(training.Trainer, "advance", counted)
+        monkeypatch.setattr(Trainer, "advance", counted)
         return steps
 
     return count

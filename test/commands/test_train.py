@@ -24,7 +24,7 @@ from deep_nrsfm_ros.nrsfm.keypoints import COCO17, HUMAN17
 from deep_nrsfm_ros.nrsfm.lifting import Lifter
 from deep_nrsfm_ros.nrsfm.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.object_file import read_object
-from deep_nrsfm_ros.nrsfm.training import Trainer
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
 from deep_nrsfm_ros.observations.bags import frames, write_bag
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
@@ -65,9 +65,10 @@ def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Start the program with JSON progress; its standard input stays open."""
     started: list[subprocess.Popen[str]] = []
 
-    def run(*words: str) -> subprocess.Popen[str]:
+    def run(*words: str, launcher: tuple[str, ...] = ()) -> subprocess.Popen[str]:
+        command = (*launcher, "-m", "deep_nrsfm_ros.commands.train", *words, "--json-progress")
         process = subprocess.Popen(
-            [sys.executable, "-m", "deep_nrsfm_ros.commands.train", *words, "--json-progress"],
+            [sys.executable, *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -99,6 +100,17 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
         return 0
 
     return run
+
+
+def test_two_processes_write_one_model(
+    arguments: list[str], models: Path, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
+    lines = finish(start(*arguments, "--steps", "20", launcher=launcher))
+    assert [line["state"] for line in lines].count("finished") == 1
+    model = assert_lifts(models / "mine.safetensors")
+    assert model.provenance["frames"] == 60 and model.provenance["processes"] == 2
+    assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
 
 
 def wait_for_training(process: subprocess.Popen[str]) -> list[dict[str, Any]]:
@@ -214,6 +226,42 @@ def test_without_resume_it_begins_anew(
     assert in_process(*arguments, "--steps", "3", "--widths", "6", "3") == 0
     model = load_model(models / "mine.safetensors")
     assert model.provenance["step"] == 3 and model.network.architecture.widths == (6, 3)
+
+
+def test_time_ends_a_training(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    before = time.monotonic()
+    assert in_process(*arguments, *ENDLESS, "--minutes", "0.02") == 0
+    assert time.monotonic() - before < 30
+    said = capsys.readouterr().out
+    assert "finished" in said and "of 1000000 steps its time was up" in said
+    assert_lifts(models / "mine.safetensors")
+    assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
+
+
+def test_a_cancelled_screening_keeps_a_model_and_goes_on(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = [*arguments, "--steps", "50", "--seeds", "3"]
+    assert in_process(*words) == 0
+    whole = load_model(models / "mine.safetensors")
+    capsys.readouterr()
+    with monkeypatch.context() as cancelled:
+        cancelled.setattr(train, "stop_on_signals", stop_after(7))
+        assert in_process(*words) == 0
+    assert "--resume goes on" in capsys.readouterr().out
+    assert assert_lifts(models / "mine.safetensors").provenance["step"] == 5
+    assert in_process(*words, "--resume") == 0
+    again = load_model(models / "mine.safetensors")
+    assert again.provenance["seed"] == whole.provenance["seed"] and again.quality == whole.quality
 
 
 BAD: dict[str, tuple[list[str], str]] = {

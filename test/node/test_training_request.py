@@ -12,6 +12,7 @@ from deep_nrsfm_ros.commands.train import arguments
 from deep_nrsfm_ros.configuration import override
 from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest, layouts
 from deep_nrsfm_ros.nrsfm.keypoints import COCO17, KeypointLayout
+from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
@@ -46,7 +47,8 @@ def test_the_training_command_understands_every_word(tmp_path):
     )
     curation = Curation(min_visible=7, thin=0.25, outliers=3.5)
     wanted = request(recipe, bags=(str(tmp_path), "second bag"), name="mine", threads=3)
-    wanted = dataclasses.replace(wanted, curation=curation)
+    limits = Limits(minutes=2.5, patience=0.25, keep_best=False)
+    wanted = dataclasses.replace(wanted, curation=curation, limits=limits)
     given = arguments().parse_args(wanted.arguments())
     assert given.bag == [tmp_path, Path("second bag")]
     assert (given.topic, given.keypoint_layout) == ("/camera/keypoints", "coco17")
@@ -56,6 +58,7 @@ def test_the_training_command_understands_every_word(tmp_path):
     assert given.json_progress
     assert override(Recipe(), given) == recipe
     assert override(Curation(), given) == curation
+    assert override(Limits(), given) == limits
 
 
 @pytest.mark.parametrize("name", ["", ".", "../up", "a/b", "-x", "a b", "x" * 101])
@@ -102,7 +105,8 @@ def test_layouts_are_what_was_said_or_what_the_lifter_hears_and_has(
 
 def save(path: Path, layout: KeypointLayout) -> Path:
     network = initialise(Architecture(widths=(4,)), len(layout), np.random.default_rng(0))
-    save_model(path, Model("m", network, layout, Normaliser(), np.eye(3, dtype=np.float32)))
+    eyes = (np.eye(n, dtype=np.float32) for n in (3, 3 * len(layout)))
+    save_model(path, Model("m", network, layout, Normaliser(), *eyes))
     return path
 
 

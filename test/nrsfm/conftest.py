@@ -13,7 +13,8 @@ from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
-from deep_nrsfm_ros.nrsfm.training import Trainer, train
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
+from deep_nrsfm_ros.nrsfm.training import train
 
 
 @pytest.fixture(scope="session", autouse=True)

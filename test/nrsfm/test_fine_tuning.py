@@ -15,7 +15,8 @@ from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, forward, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
-from deep_nrsfm_ros.nrsfm.training import Trainer, finish, train
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
+from deep_nrsfm_ros.nrsfm.training import finish, train
 
 RECIPE = Recipe(steps=100, batch=64, learning_rate=1e-3)
 LIGHT = "light"  # a keypoint that no model knows

@@ -17,7 +17,8 @@ from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.nrsfm.training import Trainer, finish
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
+from deep_nrsfm_ros.nrsfm.training import finish
 
 N = 12
 EVERY_MODEL = [

@@ -11,22 +11,18 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from deep_nrsfm_ros.nrsfm import training
 from deep_nrsfm_ros.nrsfm.geometry import align
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
+from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.losses import Frames
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors, signed_volumes
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
-from deep_nrsfm_ros.nrsfm.training import (
-    Progress,
-    Trainer,
-    finish,
-    learning_rate,
-    second_moment,
-    train,
-    write_checkpoint,
-)
+from deep_nrsfm_ros.nrsfm.progress import Progress
+from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
+from deep_nrsfm_ros.nrsfm.trainer import Trainer, learning_rate
+from deep_nrsfm_ros.nrsfm.training import finish, train
 
 SMALL = Preset(
     Architecture(widths=(8, 4)),
@@ -145,10 +141,48 @@ def test_stopping_returns_at_once(figure: Any) -> None:
     assert np.isfinite(Lifter(model)(figure.points[:5], np.ones((5, 12), np.float32)).shapes).all()
 
 
-def test_stopping_a_screening_leaves_no_checkpoint(figure: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("stops", [2, 4, 6, 8, 11, 12])
+def test_a_stopped_screening_keeps_the_best_so_far_and_goes_on(
+    figure: Any, tmp_path: Path, stops: int
+) -> None:
+    preset, file = small(**SCREENED, seed=7), tmp_path / "checkpoint"
+    stopped = run(figure, preset, checkpoint=file, should_stop=stop_after(stops))
+    assert stopped.step == (stops if stops < 4 else 4) and not stopped.ended
+    assert stopped.seed in range(21, 21 + max(stops // 4, 1))
+    went_on = run(figure, preset, checkpoint=file)
+    assert_same(went_on, run(figure, preset))
+    assert went_on.ended
+
+
+def test_a_crash_in_the_screening_loses_one_interval(figure: Any, tmp_path: Path) -> None:
+    preset, file = small(**SCREENED), tmp_path / "checkpoint"
+    steps = iter(range(10**6))
+
+    def crash() -> bool:
+        if next(steps) == 6:
+            raise InterruptedError
+        return False
+
+    with pytest.raises(InterruptedError):
+        run(figure, preset, checkpoint=file, checkpoint_seconds=0.0, should_stop=crash)
+    saved = load_file(file)
+    assert (int(saved["seed"]), int(saved["step"]), int(saved["leader.seed"])) == (1, 2, 0)
+    assert_same(run(figure, preset, checkpoint=file), run(figure, preset))
+
+
+def test_a_screening_of_other_seeds_is_refused(figure: Any, tmp_path: Path) -> None:
     file = tmp_path / "checkpoint"
-    trainer = run(figure, small(**SCREENED), checkpoint=file, should_stop=stop_after(6))
-    assert trainer.step <= 4 and not file.exists()
+    run(figure, small(**SCREENED), checkpoint=file, should_stop=stop_after(6))
+    for other in (small(**SCREENED | {"seeds": 1}), small(**SCREENED, seed=5)):
+        with pytest.raises(ValueError, match="other seeds"):
+            run(figure, other, checkpoint=file)
+
+
+def test_stopping_before_anything_is_learned_leaves_no_checkpoint(
+    figure: Any, tmp_path: Path
+) -> None:
+    run(figure, checkpoint=tmp_path / "checkpoint", should_stop=lambda: True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_screening_goes_on_with_the_lowest_cycle_error(figure: Any) -> None:
@@ -227,23 +261,6 @@ def test_a_damaged_checkpoint_is_refused(figure: Any, tmp_path: Path, kind: str)
         run(figure, checkpoint=file)
 
 
-def test_a_checkpoint_replaces_the_old_one_whole(
-    figure: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "checkpoint"
-    trainer = run(figure, checkpoint=file, should_stop=stop_after(3))
-    before = file.read_bytes()
-
-    def full_disk(tensors: object, path: Path) -> None:
-        path.write_bytes(b"half")
-        raise OSError("no space left")
-
-    monkeypatch.setattr("deep_nrsfm_ros.nrsfm.training.save_file", full_disk)
-    with pytest.raises(OSError, match="no space"):
-        write_checkpoint(file, trainer)
-    assert file.read_bytes() == before
-
-
 @pytest.mark.parametrize("changes", [{"steps": 0}, {"mask": 0.95}, {"schedule": "linear"}])
 def test_options_out_of_range_are_refused(figure: Any, changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(changes))):
@@ -277,31 +294,54 @@ def test_what_a_missing_point_holds_does_not_matter(figure: Any) -> None:
     assert_same(train(garbage, visible, SMALL), train(figure.points, visible, SMALL))
 
 
-@pytest.mark.parametrize("scale", ["rms", "none"])
-def test_second_moment_is_over_the_frames_that_show_both_points(figure: Any, scale: str) -> None:
-    points = figure.points[:200] + np.float32([3, 4])
-    visible = np.random.default_rng(0).random((200, 12)) < 0.7
-    visible[:, :2], visible[:, 2], visible[:100, 3] = True, np.arange(200) >= 100, True
-    visible[100:, 3] = False  # points 2 and 3 are never seen together
-    total, seen = np.zeros((12, 12)), np.zeros((12, 12))
-    for frame, there in zip(points.astype(float), visible, strict=True):
-        W = frame - frame[there].mean(0)
-        if scale == "rms":
-            W /= 2 * (W[there] ** 2).sum(1).mean() ** 0.5
-        for i in np.flatnonzero(there):
-            for j in np.flatnonzero(there):
-                total[i, j] += W[i] @ W[j]
-                seen[i, j] += 1
-    mask = torch.from_numpy(visible[..., None].astype(np.float32))
-    found = second_moment(Frames(torch.from_numpy(points), mask), Normaliser(scale))
-    assert seen[2, 3] == 0 == found[2, 3]
-    np.testing.assert_allclose(found, total / np.maximum(seen, 1), atol=1e-5)
+@pytest.fixture
+def second_a_step(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Make the clock go by one second a step; return the learning rates used."""
+    rates: list[float] = []
+    advance = Trainer.advance
+
+    def timed(trainer: Trainer) -> None:
+        advance(trainer)
+        rates.append(trainer.optimiser.param_groups[0]["lr"])
+
+    monkeypatch.setattr(Trainer, "advance", timed)
+    monkeypatch.setattr(training.time, "monotonic", lambda: float(len(rates)))
+    return rates
 
 
-def test_learning_rates() -> None:
-    cosine = Recipe(steps=1000, learning_rate=0.01)
-    rates = [learning_rate(cosine, step) for step in (0, 500, 1000)]
-    assert rates == pytest.approx([0.01, 0.005, 0.0])
-    paper = PRESETS["paper"].recipe
-    rates = [learning_rate(paper, step) for step in (0, 5000, 10000, 200_000)]
-    assert rates == pytest.approx([1e-3, 1e-3 * 0.95**0.5, 1e-3 * 0.95, 1e-3 * 0.95**20])
+def test_the_learning_rate_ends_with_the_time(figure: Any, second_a_step: list[float]) -> None:
+    reports: list[Progress] = []
+    trainer = run(figure, small(steps=1000), limits=Limits(minutes=0.5), on_progress=reports.append)
+    assert (trainer.step, trainer.ended) == (30, "its time was up")
+    cosine = Recipe(steps=30, learning_rate=SMALL.recipe.learning_rate)
+    assert second_a_step == pytest.approx([learning_rate(cosine, step) for step in range(30)])
+    assert reports[1].seconds_left == 20 and reports[-1].seconds_left == 0
+
+
+def test_steps_may_end_before_the_time(figure: Any, second_a_step: list[float]) -> None:
+    trainer = run(figure, limits=Limits(minutes=0.5))
+    assert (trainer.step, trainer.ended) == (12, "all steps were taken")
+    assert second_a_step == pytest.approx([learning_rate(SMALL.recipe, i) for i in range(12)])
+
+
+def test_time_that_is_gone_stays_gone(
+    figure: Any, tmp_path: Path, second_a_step: list[float]
+) -> None:
+    how = {"limits": Limits(minutes=0.5), "checkpoint": tmp_path / "checkpoint"}
+    assert run(figure, small(steps=1000), **how, should_stop=stop_after(12)).step == 12
+    assert run(figure, small(steps=1000), **how).step == 30
+
+
+def test_the_screening_takes_a_tenth_of_the_time(figure: Any, second_a_step: list[float]) -> None:
+    preset = small(steps=100_000, seeds=3, screening=1000)
+    seen: list[int] = []
+    trainer = run(
+        figure,
+        preset,
+        limits=Limits(minutes=1.05),
+        on_step=lambda trainer: seen.append(trainer.step),
+    )
+    assert len(second_a_step) == 63 and seen[0] in (2, 3)
+    assert trainer.step == 63 - 7 + seen[0]  # 6.3 s are over after the seventh step
+    # There is no time so short that nothing is learned.
+    assert run(figure, preset, limits=Limits(minutes=1e-9)).step == 1

@@ -1,0 +1,27 @@
+"""Checkpoints: named tensors in a file that is whole or not there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+
+def write_checkpoint(path: Path, state: dict[str, Tensor]) -> None:
+    """Write a state whole or not at all; a file that is there is replaced only by a whole one."""
+    partial = path.with_name(f"{path.name}.partial")
+    save_file({name: tensor.contiguous().cpu() for name, tensor in state.items()}, partial)
+    with partial.open("rb") as file:
+        os.fsync(file.fileno())  # or a power cut may leave the new name on an empty file
+    os.replace(partial, path)
+
+
+def read_checkpoint(path: Path) -> dict[str, Tensor]:
+    """Return a saved state; raise ValueError if the file is damaged."""
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"checkpoint {path} cannot be read ({error}); delete it") from error

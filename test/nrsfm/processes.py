@@ -1,0 +1,70 @@
+"""What each process of test_distributed.py does; writes what it found to `rank.safetensors`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+
+from deep_nrsfm_ros.nrsfm.distributed import Team, join, rank
+from deep_nrsfm_ros.nrsfm.limits import Limits
+from deep_nrsfm_ros.nrsfm.losses import Frames
+from deep_nrsfm_ros.nrsfm.network import Architecture
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
+from deep_nrsfm_ros.nrsfm.trainer import Trainer
+from deep_nrsfm_ros.nrsfm.training import train
+
+PRESET = Preset(
+    Architecture(widths=(64, 32, 16)),
+    Normaliser(),
+    Recipe(steps=300, batch=65, learning_rate=1e-2, seeds=2, screening=20),
+)
+
+
+def first_step(points: torch.Tensor, team: Team) -> dict[str, torch.Tensor]:
+    """Return the gradient of one step, what it was asked on, and the whitening."""
+    frames = Frames(*map(team.shard, (points, torch.ones_like(points[..., :1]))))
+    trainer = Trainer(frames, PRESET, 0, team=team)
+    batch = trainer.sample(trainer.batch, 0).points
+    trainer.advance()
+    gradient = trainer.weights.grad
+    assert gradient is not None
+    return {"batch": batch, "gradient": gradient, "L": trainer.initial.L}
+
+
+def main(folder: Path) -> None:
+    """Take one step, train, train until one process wants to stop, and go on."""
+    torch.set_num_threads(1)
+    points = np.load(folder / "points.npy")
+    data = points, np.ones(points.shape[:2], bool), PRESET
+    team = join()
+    found = first_step(torch.from_numpy(points), team)
+    reports: list[object] = []
+    trainer = train(*data, limits=Limits(), team=team, on_progress=reports.append)
+    errors = team.mean(trainer.measure())
+    found |= {"weights": trainer.weights.detach(), "errors": torch.tensor(errors)}
+    found |= {"reports": torch.tensor(len(reports)), "frames": torch.tensor(trainer.frames_in_all)}
+
+    asked = 0
+
+    def stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return rank() == team.size - 1 and asked > 6
+
+    file = folder / "checkpoint"
+    stopped = train(*data, team=team, should_stop=stop, checkpoint=file)
+    found["stopped"] = torch.tensor(stopped.step)
+    first: list[int] = []
+    train(*data, team=team, checkpoint=file, on_step=lambda trainer: first.append(trainer.step))
+    found |= {"resumed": torch.tensor(first[0]), "resumed_to": torch.tensor(first[-1])}
+    team.leave()
+    save_file(found, folder / f"{rank()}.safetensors")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
