@@ -333,6 +333,7 @@ def learn(
         start=network,
     )
     if not trainer.step:
+        checkpoint.unlink(missing_ok=True)
         raise CancelledError
     model = finish(trainer, given.name, ensemble.layout, ensemble.source)
     model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
