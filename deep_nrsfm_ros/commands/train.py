@@ -196,7 +196,7 @@ class Reporter:
     def warn(self, message: str) -> None:
         """Report something that the report of the training shall say too."""
         self.warnings.append(message)
-        self.say(message)
+        self.say(f"warning: {message}")
 
     def end(self, state: str, message: str, **values: Any) -> None:
         """Report how it ended."""

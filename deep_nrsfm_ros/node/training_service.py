@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.health import ERROR, OK
-from deep_nrsfm_ros.node.training_job import ACTIVE, Progress, TrainingJob
+from deep_nrsfm_ros.node.training_job import Progress, TrainingJob
 from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest
 from deep_nrsfm_ros.node.unfinished import find_unfinished, look
 
@@ -147,10 +147,10 @@ class TrainingService:
         if failed:
             self._node.get_logger().error(news)
             self._last_failure = news
-        elif progress.state != self._state and progress.state != "idle":
-            self._node.get_logger().info(news)
-        elif not progress.values and progress.state in ACTIVE:  # no step, but something to say
+        elif not progress.values and progress.message.startswith("warning: "):
             self._node.get_logger().warning(news)
+        elif progress.state != "idle" and (progress.state != self._state or not progress.values):
+            self._node.get_logger().info(news)  # a new state, or no step but something to say
         if progress.state == "finished":
             self._last_failure = "none"
         self._state = progress.state

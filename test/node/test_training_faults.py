@@ -218,5 +218,6 @@ def test_a_cut_bag_is_used_as_far_as_it_goes_and_the_loss_is_told(
     client = connect()
     assert client.call("/lifter/train").success
     client.wait_for_training("finished")
-    assert "messages are lost" in lifter.log
+    (warning,) = (line for line in lifter.log.splitlines() if "messages are lost" in line)
+    assert warning.startswith("[WARN]") and "warning: bag " in warning
     assert "messages are lost" in (models / "fresh.html").read_text()
