@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.commands.program import program
 from deep_nrsfm_ros.node.model_folders import model_folders
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
@@ -104,6 +105,7 @@ def figures(errors: ShapeErrors) -> dict[str, float]:
     return {name: 100 * value for name, value in zip(CONVENTIONS, shown, strict=True)}
 
 
+@program
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per model and way of lifting; exit code 2 says the input was at fault."""
     given = arguments().parse_args(argv)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from deep_nrsfm_ros.commands.program import program
 from deep_nrsfm_ros.node.model_folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 
@@ -113,6 +114,7 @@ def show(listed: Sequence[Listed]) -> str:
     return "\n".join(lines)
 
 
+@program
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the models; exit code 2 says that there are none."""
     given = arguments().parse_args(argv)

@@ -14,11 +14,8 @@ from deep_nrsfm_ros.observations.variation import Variation, examine
 def prepare(
     given: argparse.Namespace, ensemble: Ensemble, say: Callable[[str], None]
 ) -> tuple[Curated, Variation]:
-    """Return what is fit to be trained on and how it varies; raise ValueError if nothing is.
-
-    Motion capture is clean and is left as it is, unless the arguments say otherwise.
-    """
-    curated = curate(ensemble, override(AS_IT_IS if given.cmu else Curation(), given))
+    """Return what is fit to be trained on and how it varies; raise ValueError if nothing is."""
+    curated = curate(ensemble, chosen_curation(given))
     if curated.summary:
         say(curated.summary)
     variation = examine(curated.ensemble)
@@ -27,3 +24,11 @@ def prepare(
     for warning in (*curated.warnings, *variation.warnings):
         say(f"warning: {warning}")
     return curated, variation
+
+
+def chosen_curation(given: argparse.Namespace) -> Curation:
+    """Return how the arguments want it curated.
+
+    Motion capture is clean and is left as it is, unless they say otherwise.
+    """
+    return override(AS_IT_IS if given.cmu else Curation(), given)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib.util
 import json
+import math
 import os
 import signal
 import stat
@@ -12,15 +14,20 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError
 from tqdm import tqdm
 
 from deep_nrsfm_ros.commands.evaluate import read_split
-from deep_nrsfm_ros.commands.preparation import prepare
+from deep_nrsfm_ros.commands.preparation import chosen_curation, prepare
+from deep_nrsfm_ros.commands.program import program
+from deep_nrsfm_ros.commands.resuming import as_asked_before
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.node.model_folders import model_folders
+from deep_nrsfm_ros.node.unfinished import checkpoint_file, under_way, unwritable
 from deep_nrsfm_ros.nrsfm.distributed import join, rank
 from deep_nrsfm_ros.nrsfm.fine_tuning import inherit, keep_what_is_fixed, start_from
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
@@ -38,9 +45,13 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.observations.bags import most_keypoints, read_bags
-from deep_nrsfm_ros.observations.curation import Curation
+from deep_nrsfm_ros.observations.curation import Curated, Curation
 from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.variation import Variation
 from deep_nrsfm_ros.reporting.page import Training, write_report
+
+NOT_ASKED = ("name", "output", "resume", "json_progress")
+"""Arguments that say which training is meant and how to show it, not what is asked of it."""
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -85,7 +96,12 @@ def arguments() -> argparse.ArgumentParser:
     )
     run.add_argument("--preset", default="default", choices=list(PRESETS), help="see below")
     run.add_argument("--threads", type=int, default=0, help="threads of torch (0: all cores)")
-    run.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+    run.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with a training that was cut off: name it (--name, --output); it keeps to its "
+        "data and options",
+    )
     run.add_argument("--json-progress", action="store_true", help="one JSON object a line")
     for config in (Recipe, Limits, Architecture, Normaliser, Curation):
         add_arguments(parser, config)
@@ -102,10 +118,10 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
             given.bag, given.topic, source, target, given.min_confidence, report.reading
         )
         for warning in reading.warnings:
-            report.say(warning)
+            report.warn(warning)
         if reading.unreadable:
             count = f"{reading.unreadable} of {reading.messages}"
-            report.say(f"{count} messages could not be read: {reading.reason}")
+            report.warn(f"{count} messages could not be read: {reading.reason}")
         return reading.ensemble
     return read_split(
         *(given.cmu, given.subjects, "all" if given.all_trials else "train", target),
@@ -139,19 +155,29 @@ def read_start(given: argparse.Namespace) -> Model | None:
     return load_model(path)
 
 
+class CancelledError(Exception):
+    """Somebody stopped the training before it began."""
+
+
 class Reporter:
     """Shows progress to people (a bar) or to a program (JSON lines)."""
 
-    def __init__(self, as_json: bool) -> None:
-        """Start silent; the bar appears with the first progress."""
-        self.as_json = as_json
+    def __init__(self, as_json: bool, should_stop: Callable[[], bool]) -> None:
+        """Start silent; the bar appears with the first progress.
+
+        should_stop: ends reading, which may take minutes, by `CancelledError`.
+        """
+        self.as_json, self._should_stop = as_json, should_stop
         self._bar: tqdm[Any] | None = None
         self._state = ""
         self._last = 0.0
         self.curves: list[Any] = []
+        self.warnings: list[str] = []
 
     def reading(self, done: int, total: int) -> None:
         """Report that `done` of `total` messages or trials are read."""
+        if self._should_stop():
+            raise CancelledError
         if done == total or time.monotonic() - self._last > 0.2:
             self._show("reading", done, total, {})
 
@@ -159,6 +185,7 @@ class Reporter:
         """Report a `nrsfm.progress.Progress`, and keep it for the curves."""
         self.curves.append(progress)
         values = progress._asdict()
+        values["combined"] = math.hypot(progress.loss, progress.cycle_error)
         step, steps = values.pop("step"), values.pop("steps")
         self._show("training", step, steps, values)
 
@@ -168,6 +195,11 @@ class Reporter:
             self._print({"state": self._state or "reading", "message": message})
         else:
             tqdm.write(message, file=sys.stderr)
+
+    def warn(self, message: str) -> None:
+        """Report something that the report of the training shall say too."""
+        self.warnings.append(message)
+        self.say(f"warning: {message}")
 
     def end(self, state: str, message: str, **values: Any) -> None:
         """Report how it ended."""
@@ -197,7 +229,11 @@ class Reporter:
     @staticmethod
     def _print(values: dict[str, Any]) -> None:
         rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in values.items()}
-        print(json.dumps(rounded), flush=True)
+        try:
+            print(json.dumps(rounded), flush=True)
+        except BrokenPipeError:
+            # Who listened is gone: `stop_with_parent` ends the training, which saves first.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class SilentReporter(Reporter):
@@ -252,6 +288,7 @@ def stop_with_parent(stopped: Callable[[], bool]) -> Callable[[], bool]:
         orphaned.set()
 
     threading.Thread(target=watch, daemon=True).start()
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # its output has nobody either: see `_print`
     return lambda: stopped() or orphaned.is_set()
 
 
@@ -268,10 +305,31 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     if start:
         keep_what_is_fixed(start, preset)
     limits = override(WHOLE if given.cmu else Limits(), given)
-    check_name("--name", given.name)
     if importlib.util.find_spec("torch") is None:
         raise ValueError("training needs torch, which is not installed: pip install torch")
     curated, variation = prepare(given, read_data(given, report), report.say)
+    asked = {name: value for name, value in vars(given).items() if name not in NOT_ASKED}
+    for options in (*preset, limits, chosen_curation(given)):
+        asked |= dataclasses.asdict(options)
+    # Of several processes the first keeps the record; the others only know where it is.
+    others = nullcontext(checkpoint_file(given.output, given.name))
+    first = under_way(given.output, given.name, asked, resume=given.resume)
+    with others if rank() else first as checkpoint:
+        learn(given, preset, limits, start, curated, variation, checkpoint, report, should_stop)
+
+
+def learn(
+    given: argparse.Namespace,
+    preset: Preset,
+    limits: Limits,
+    start: Model | None,
+    curated: Curated,
+    variation: Variation,
+    checkpoint: Path,
+    report: Reporter,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Train on what `run` has read and save the model with its report."""
     ensemble = curated.ensemble
     if ensemble.layout.warning and not start:
         report.say(ensemble.layout.warning)
@@ -289,11 +347,6 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         torch.set_num_threads(given.threads)
     team = join()
     model_path = given.output / f"{given.name}{MODEL_SUFFIX}"
-    checkpoint = given.output / f".{given.name}.checkpoint"
-    if not team.rank:
-        given.output.mkdir(parents=True, exist_ok=True)
-        if not given.resume:
-            checkpoint.unlink(missing_ok=True)
     trainer = train(
         ensemble.points,
         ensemble.visible,
@@ -309,14 +362,16 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     if team.rank:
         return
     if not trainer.step:
-        report.end("cancelled", "cancelled before anything was learned; nothing was written")
-        return
+        checkpoint.unlink(missing_ok=True)
+        raise CancelledError
     model = finish(trainer, given.name, ensemble.layout, ensemble.source)
     model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
     if start:
         model = inherit(model, start)
     save_model(model_path, model)
-    whole = Training(model, model_path, ensemble, curated, variation, report.curves)
+    whole = Training(
+        *(model, model_path, ensemble, curated, variation, report.curves, report.warnings)
+    )
     html = write_page(whole, report, compare=bool(trainer.ended))
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
     if trainer.step < preset.recipe.steps and trainer.ended:
@@ -331,15 +386,24 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     report.end(state, message, model=str(model_path), report=html, **model.quality)
 
 
+@program
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command; exit code 2 says that the input was at fault."""
     given = arguments().parse_args(argv)
-    report = (SilentReporter if rank() else Reporter)(given.json_progress)
     should_stop = stop_on_signals()
     if given.json_progress:
         should_stop = stop_with_parent(should_stop)
+    report = (SilentReporter if rank() else Reporter)(given.json_progress, should_stop)
     try:
+        if given.resume:
+            given = as_asked_before(arguments(), argv, given, report.say)
+        check_name("--name", given.name)
         run(given, report, should_stop)
+    except CancelledError:
+        report.end("cancelled", "cancelled before anything was learned; nothing was written")
+    except SafetensorError as error:  # neither OSError nor ValueError, though the disk is full
+        report.end("failed", unwritable(given.output, error))
+        sys.exit(2)
     except (ValueError, OSError) as error:
         report.end("failed", str(error))
         sys.exit(2)

@@ -89,7 +89,9 @@ class LifterNode(Node):
         self._rotation = self.create_publisher(QuaternionStamped, "~/camera_rotation", 10)
         self._markers = self.create_publisher(MarkerArray, "~/markers", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._training = TrainingService(self, self._training_request, self._activate)
+        self._training = TrainingService(
+            *(self, self._training_request, self._activate, self._models_dir)
+        )
         self.create_timer(_REPORT_PERIOD, self._report)
         keypoints = self.create_subscription(
             MESSAGES[self._inputs.input_type],

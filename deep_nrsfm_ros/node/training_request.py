@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from deep_nrsfm_ros.configuration import option, to_arguments
 from deep_nrsfm_ros.node.pipeline import MODEL_ORDER
+from deep_nrsfm_ros.node.unfinished import Unfinished, differences, find_unfinished, look
 from deep_nrsfm_ros.nrsfm.fine_tuning import start_from
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.limits import Limits
@@ -38,6 +41,11 @@ class TrainingOptions:
     )
     name: str = option("trained", "name of the new model; an old one of this name is replaced")
     threads: int = option(1, "threads that the training may use", low=1, high=1024)
+    resume: bool = option(
+        False,
+        "go on with the training of train.name that was cut off, with the bags and options that it "
+        "began with",
+    )
     activate: bool = option(True, "switch to the new model when the training has finished")
 
 
@@ -75,12 +83,16 @@ class TrainingRequest:
 
     def check(self) -> str:
         """Return what should be known before, or ""; raise ValueError that says what is wrong."""
+        check_name("train.name", self.options.name)
+        if self.options.resume and (found := self._unfinished()).asked:
+            now = differences(found.asked, self._asked())
+            said = f"{'; '.join(now)}; it keeps to what it began with" if now else ""
+            return f"goes on with {found}" + (f"; {said}" if said else "")
         if not self.options.bags:
             raise ValueError("no bags to train on; set the parameter train.bags")
         for bag in self.options.bags:
             if not Path(bag).expanduser().exists():
                 raise ValueError(f"train.bags names {bag}, which does not exist")
-        check_name("train.name", self.options.name)
         if self.target_layout == NUMBERED:
             if self.source_layout:
                 raise ValueError(
@@ -97,19 +109,50 @@ class TrainingRequest:
 
     def arguments(self) -> list[str]:
         """Return the arguments of the training command."""
+        words = ["--name", self.options.name, "--output", str(self.output)]
+        words += ["--threads", str(self.options.threads), "--json-progress"]
+        if self.options.resume:
+            words += ["--resume"]
+            if self._unfinished().asked:
+                return words
         named = {
             "--topic": self.topic,
             "--keypoint-layout": self.source_layout,
             "--object": self.target_layout,
             "--from": self.start,
             "--min-confidence": str(self.min_confidence),
-            "--name": self.options.name,
-            "--output": str(self.output),
-            "--threads": str(self.options.threads),
         }
-        words = [word for pair in named.items() for word in pair]
+        words += [word for pair in named.items() for word in pair]
         for bag in self.options.bags:
             words += ["--bag", str(Path(bag).expanduser())]
         for config in (self.recipe, self.limits, self.curation):
             words += to_arguments(config)
-        return [*words, "--json-progress"]
+        return words
+
+    def _unfinished(self) -> Unfinished:
+        """Return the training to go on with; raise ValueError if there is none."""
+        name, others = self.options.name, find_unfinished(self.output)
+        found = look(self.output, name)
+        if found is None:
+            names = ", ".join(other.name for other in others) or "none"
+            raise ValueError(
+                f"train.resume is true, but there is no unfinished training of {name!r} in "
+                f"{self.output} (unfinished: {names}); set train.resume to false to begin one"
+            )
+        if found.running:
+            raise ValueError(f"{found}: {found.advice}")
+        return found
+
+    def _asked(self) -> dict[str, Any]:
+        """Return what the training would be asked for, by the names that its record has."""
+        return {
+            "bag": [Path(bag) for bag in self.options.bags],
+            "topic": self.topic,
+            "keypoint_layout": self.source_layout,
+            "object": self.target_layout,
+            "start": self.start,
+            "min_confidence": self.min_confidence,
+            **dataclasses.asdict(self.recipe),
+            **dataclasses.asdict(self.limits),
+            **dataclasses.asdict(self.curation),
+        }

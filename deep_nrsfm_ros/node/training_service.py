@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from queue import Empty, SimpleQueue
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -14,6 +15,7 @@ from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.health import ERROR, OK
 from deep_nrsfm_ros.node.training_job import Progress, TrainingJob
 from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest
+from deep_nrsfm_ros.node.unfinished import find_unfinished, look
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -30,27 +32,41 @@ class TrainingService:
         node: Node,
         request: Callable[[], TrainingRequest],
         activate: Callable[[str], None],
+        folder: Path,
     ) -> None:
         """Offer the services on `node`.
 
         request: gives the request as the parameters stand; ValueError says what is wrong.
         activate: switches to the model in the file named; ValueError says why it cannot.
+        folder: where models are, and what is left of trainings that were cut off.
         """
         self._node, self._request, self._activate = node, request, activate
+        self._folder = folder
         self._job: TrainingJob | None = None
         self._wanted = TrainingOptions()
-        self._state = "idle"
+        self._state, self._last_failure = "idle", "none"
         self._heard: SimpleQueue[Progress] = SimpleQueue()
         self._wake = node.create_guard_condition(self._report)
         self._publisher = node.create_publisher(DiagnosticStatus, "~/training_status", _LATCHED)
         node.create_service(Trigger, "~/train", self._train)
         node.create_service(Trigger, "~/cancel_training", self._cancel)
-        self._tell(Progress("idle", "no training since the lifter started", {}))
+        self._tell_of_unfinished()
 
     def close(self, timeout: float) -> None:
         """End a training that runs, by force after `timeout` seconds."""
         if self._job:
             self._job.close(timeout)
+
+    def _tell_of_unfinished(self) -> None:
+        """Say what was cut off before the lifter started, and how to go on."""
+        message = "no training since the lifter started"
+        found = find_unfinished(self._folder)
+        for one in found:
+            text = f"{one}: {one.advice}"
+            self._node.get_logger().warning(text)
+            message += f"; {text}"
+        names = {"unfinished": ", ".join(one.name for one in found)} if found else {}
+        self._tell(Progress("idle", message, {**names}))
 
     def _train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start a training and answer at once."""
@@ -70,6 +86,8 @@ class TrainingService:
             return response
         self._wanted = request.options
         data = f"{request.topic} of {', '.join(request.options.bags)}"
+        if self._wanted.resume:
+            data = "the data that it began with"
         response.success = True
         response.message = f"training {self._wanted.name!r} on {data}"
         if warning:
@@ -101,9 +119,18 @@ class TrainingService:
                 return
             if progress.ended:
                 self._job = None
+            if progress.state == "failed":
+                progress = self._with_advice(progress)
             if progress.state == "finished" and self._wanted.activate:
                 progress = self._switch(progress)
             self._tell(progress)
+
+    def _with_advice(self, progress: Progress) -> Progress:
+        """Add to a failure how to go on, if there is something to go on from."""
+        found = look(self._folder, self._wanted.name)
+        if not found:
+            return progress
+        return progress._replace(message=f"{progress.message}\n{found}: {found.advice}")
 
     def _switch(self, progress: Progress) -> Progress:
         """Activate the model of a finished training and say so."""
@@ -119,11 +146,16 @@ class TrainingService:
         news = f"training of {self._wanted.name!r}: {progress.message}"
         if failed:
             self._node.get_logger().error(news)
-        elif progress.state != self._state:
-            self._node.get_logger().info(news)
+            self._last_failure = news
+        elif not progress.values and progress.message.startswith("warning: "):
+            self._node.get_logger().warning(news)
+        elif progress.state != "idle" and (progress.state != self._state or not progress.values):
+            self._node.get_logger().info(news)  # a new state, or no step but something to say
+        if progress.state == "finished":
+            self._last_failure = "none"
         self._state = progress.state
         name = f"{self._node.get_name()}: training"
-        values = {"state": progress.state, **progress.values}
+        values = {"state": progress.state, **progress.values, "last failure": self._last_failure}
         level = ERROR if failed else OK
         self.status = publishing.status(name, level, progress.message, values)
         self._publisher.publish(self.status)

@@ -11,6 +11,7 @@ import pytest
 from deep_nrsfm_ros.commands.train import arguments
 from deep_nrsfm_ros.configuration import override
 from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest, layouts
+from deep_nrsfm_ros.node.unfinished import under_way
 from deep_nrsfm_ros.nrsfm.keypoints import COCO17, KeypointLayout
 from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
@@ -133,3 +134,34 @@ def test_layouts_and_start_are_checked_before_anything_starts(tmp_path):
     ):
         with pytest.raises(ValueError, match=complaint):
             dataclasses.replace(wanted, **changes).check()
+
+
+def test_resuming_keeps_to_what_was_asked_and_tells_what_differs(tmp_path):
+    wanted = dataclasses.replace(request(resume=True, name="mine", threads=2), output=tmp_path)
+    with pytest.raises(ValueError, match=r"no unfinished training of 'mine'.*\(unfinished: none\)"):
+        wanted.check()
+    asked = {"bag": [tmp_path / "bag"], "topic": "/camera/keypoints", "steps": 77}
+    with under_way(tmp_path, "mine", asked, resume=False) as checkpoint:
+        with pytest.raises(ValueError, match="under way in another process: wait"):
+            wanted.check()
+        checkpoint.touch()
+    said = wanted.check()
+    assert "bag was" in said and "steps was 77, is 30000 now; it keeps to" in said
+    assert "topic was" not in said
+    given = arguments().parse_args(wanted.arguments())
+    assert (given.resume, given.name, given.output) == (True, "mine", tmp_path)
+    assert given.threads == 2 and not given.bag and "steps" not in given
+    with pytest.raises(ValueError, match=r"of 'other' in .* \(unfinished: mine\)"):
+        dataclasses.replace(wanted, options=TrainingOptions(resume=True, name="other")).check()
+
+
+def test_a_checkpoint_without_a_record_goes_on_with_the_parameters(tmp_path):
+    (tmp_path / ".mine.checkpoint").touch()
+    wanted = dataclasses.replace(request(resume=True, name="mine"), output=tmp_path)
+    with pytest.raises(ValueError, match=r"train\.bags"):
+        wanted.check()
+    options = dataclasses.replace(wanted.options, bags=(str(tmp_path),))
+    wanted = dataclasses.replace(wanted, options=options)
+    assert wanted.check() == ""
+    given = arguments().parse_args(wanted.arguments())
+    assert given.resume and given.bag == [tmp_path] and given.steps == 30000

@@ -1,0 +1,39 @@
+"""What every program does, as a shell starts it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+
+@pytest.mark.parametrize("name", ["models", "evaluate", "train"])
+def test_a_reader_that_leaves_ends_a_program_silently(name: str, tmp_path: Path) -> None:
+    words = {
+        "models": ["--models-dir", str(tmp_path)],
+        "evaluate": ["human", "--cmu", str(tmp_path)],
+        "train": ["--bag", "absent", "--json-progress"],
+    }
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run(
+            [sys.executable, str(SCRIPTS / name), *words[name]],
+            stdin=subprocess.DEVNULL,
+            stdout=writer,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(SCRIPTS.parent)},
+        )
+    finally:
+        os.close(writer)
+    # evaluate keeps its lines until it has enough of them, and fails before.
+    assert done.stderr.count("\n") <= (name == "evaluate"), done.stderr
+    assert "Traceback" not in done.stderr and "BrokenPipe" not in done.stderr
+    assert done.returncode == -signal.SIGPIPE

@@ -1,0 +1,223 @@
+"""Real trainings that go wrong in all ways, while the lifter goes on lifting."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+
+from deep_nrsfm_ros.node.publishing import PointCloud
+from deep_nrsfm_ros.node.unfinished import record_file
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.nrsfm.lifting import Lifted
+from deep_nrsfm_ros.nrsfm.model_file import load_model
+from deep_nrsfm_ros.observations.bags import frames, write_bag
+
+P = 17
+KILLS = int(os.environ.get("KILLS", "5"))
+RELIABLE = {"reliability": "reliable", "history": "keep_last", "depth": 1000}
+
+
+def views(f: int = 60, flat: bool = False) -> np.ndarray:
+    """Return (f, 17, 2) views of an object that deforms, or of one in the image plane."""
+    rng = np.random.default_rng(0)
+    shapes = centre(rng.standard_normal((P, 3)) + 0.3 * rng.standard_normal((f, P, 3)))
+    if flat:
+        return 100 * (shapes[:1, :, :2] * rng.uniform(0.5, 2, (f, 1, 1)) + 0.01 * shapes[..., :2])
+    return 100 * (shapes @ random_cameras(f, rng)) + [320, 240]
+
+
+def write(path: Path, f: int = 60, storage: str = "sqlite3", flat: bool = False) -> str:
+    write_bag(path, "/keypoints", frames(views(f, flat), np.ones((f, P))), storage)
+    return str(path)
+
+
+def values(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
+
+
+def cloud(number: int) -> PointCloud2:
+    """Return a message of keypoints whose stamp is its number."""
+    zeros = np.zeros(1, np.float32)
+    points = np.concatenate([views(1), np.zeros((1, P, 1))], -1).astype(np.float32)
+    seen = Lifted(points, zeros, zeros, zeros, zeros, confidence=np.ones((1, P), np.float32))
+    header = Header()
+    header.stamp.sec = number
+    return PointCloud().fill(header, seen)
+
+
+class Stream:
+    """Messages that go to the lifter while something else happens, all of which it must answer."""
+
+    def __init__(self, client: Any) -> None:
+        self.client, self.sent, self.last = client, 0, 0.0
+        reliable = QoSProfile(depth=1000)
+        self.publisher = client.publisher(PointCloud2, reliable)
+
+    def go_on(self) -> None:
+        if time.monotonic() - self.last > 0.05:
+            self.publisher.publish(cloud(self.sent))
+            self.sent, self.last = self.sent + 1, time.monotonic()
+
+    def until(self, condition: Any, what: str) -> None:
+        self.client.wait(lambda: (self.go_on(), condition())[1], what)
+
+    def assert_all_answered(self) -> None:
+        heard = self.client.heard["/lifter/points"]
+        self.client.wait(lambda: len(heard) >= self.sent, "all answers")
+        assert [message.header.stamp.sec for message in heard] == [*range(self.sent)]
+
+
+def children_of(pid: int) -> list[int]:
+    return [
+        int(word)
+        for t in Path(f"/proc/{pid}/task").iterdir()
+        for word in (t / "children").read_text().split()
+    ]
+
+
+def test_kills_at_random_moments_cost_no_message_and_no_model(
+    start_lifter, connect, models, tmp_path
+):
+    overrides = {"keypoints": {"subscription": RELIABLE}}
+    (models / "broken.safetensors").unlink()
+    lifter = start_lifter(
+        qos_overrides={f"/{topic}": value for topic, value in overrides.items()},
+        train={"bags": [write(tmp_path / "bag")], "name": "fresh", "steps": 300, "seeds": 1,
+               "batch": 8},
+    )  # fmt: skip
+    client, moments = connect(), random.Random(0)
+    stream = Stream(client)
+    status = client.heard["/lifter/training_status"]
+    ended = ("failed", "finished")
+    for i in range(KILLS):
+        assert client.call("/lifter/train").success
+        if i % 2:  # in the training proper, else anywhere from the start on
+            stream.until(record_file(models, "fresh").exists, "the record")
+        kill_at = time.monotonic() + moments.uniform(0.0, 2.5)
+        stream.until(lambda at=kill_at: time.monotonic() > at, "the moment")
+        status.clear()
+        for pid in children_of(lifter.process.pid):
+            os.kill(pid, signal.SIGKILL)
+        stream.until(lambda: status and values(status[-1])["state"] in ended, "the end")
+        failure = status[-1]
+        if values(failure)["state"] == "failed":
+            assert failure.level == b"\x02" and "SIGKILL" in failure.message
+            if record_file(models, "fresh").exists():
+                assert "train.resume to true" in failure.message
+                assert f"--resume --name fresh --output {models}" in failure.message
+        for path in models.glob("*.safetensors"):
+            load_model(path)
+    if not record_file(models, "fresh").exists():  # the last was killed too early, or too late
+        assert client.call("/lifter/train").success
+        stream.until(record_file(models, "fresh").exists, "the record")
+        for pid in children_of(lifter.process.pid):
+            os.kill(pid, signal.SIGKILL)
+        client.wait_for_training("failed")
+    client.set_parameters(train__resume=True, train__bags=[""], train__steps=7)
+    status.clear()
+    accepted = client.call("/lifter/train")
+    assert accepted.success and "steps was 300, is 7 now; it keeps to" in accepted.message
+    stream.until(lambda: status and values(status[-1])["state"] == "finished", "the model")
+    finished = values(status[-1])
+    assert finished["last failure"] == "none" and float(finished["combined"]) > 0
+    assert finished["report"] == str(models / "fresh.html")
+    assert load_model(models / "fresh.safetensors").provenance["step"] == 300
+    refused = client.call("/lifter/train")
+    assert not refused.success and "set train.resume to false to begin one" in refused.message
+    stream.assert_all_answered()
+
+
+def test_a_new_lifter_finds_what_was_cut_off(start_lifter, connect, models, tmp_path):
+    train = {"bags": [write(tmp_path / "bag")], "name": "fresh", "steps": 1000000, "seeds": 1}
+    first = start_lifter(train=train)
+    client = connect()
+    assert client.call("/lifter/train").success
+    client.wait(record_file(models, "fresh").exists, "the record")
+    (training,) = children_of(first.process.pid)
+    for pid in (training, first.process.pid):  # as a power cut would
+        os.kill(pid, signal.SIGKILL)
+    first.process.wait()
+    second = start_lifter()
+    second.wait_for_log("unfinished training of 'fresh'")
+    later = connect()
+    status = later.wait_for_training("idle")
+    for words in ("steps 1000000", f"bag {tmp_path / 'bag'}", "ago", "train.resume to true",
+                  "ros2 run deep_nrsfm_ros train --resume --name fresh"):  # fmt: skip
+        assert words in status.message and words in second.log
+    assert values(status)["unfinished"] == "fresh"
+
+
+@pytest.mark.parametrize("state", ["starting", "reading", "training"])
+def test_a_training_can_be_cancelled_in_any_state(start_lifter, connect, models, tmp_path, state):
+    bag = write(tmp_path / "bag")
+    start_lifter(train={"bags": [bag], "name": "fresh", "steps": 1000000, "seeds": 1})
+    client = connect()
+    assert client.call("/lifter/train").success
+    if state != "starting":
+        client.wait_for_training(state)
+    second = client.call("/lifter/train")
+    assert not second.success and "under way" in second.message
+    if state == "training":
+        assert float(values(client.wait_for_training("training"))["combined"]) > 0
+    assert client.call("/lifter/cancel_training").success
+    client.wait_for_training("cancelled")
+    assert (models / "fresh.safetensors").exists() == (state == "training")
+    assert record_file(models, "fresh").exists() == (state == "training")
+
+
+def test_data_that_cannot_be_trained_on_is_refused_with_advice(
+    start_lifter, connect, models, tmp_path
+):
+    good = write(tmp_path / "bag")
+    flat = write(tmp_path / "flat", flat=True)
+    start_lifter(train={"name": "fresh", "steps": 5, "seeds": 1, "batch": 8})
+    client = connect()
+    for bag, topic, complaint in [
+        (flat, "/keypoints", "a model cannot be learned from this: the views are flat"),
+        (good, "/elsewhere", "0 topics called /elsewhere; name one of: /keypoints"),
+        (good, "", ""),
+    ]:
+        client.set_parameters(train__bags=[bag], train__topic=topic, train__thin=0.0)
+        client.heard["/lifter/training_status"].clear()
+        assert client.call("/lifter/train").success
+        if complaint:
+            assert complaint in client.wait_for_training("failed").message
+            client.heard["/diagnostics"].clear()
+            diagnosed = client.wait(
+                lambda: [s for m in client.heard["/diagnostics"] for s in m.status
+                         if s.name == "lifter: training"], "the diagnosis"
+            )  # fmt: skip
+            assert diagnosed[0].level == b"\x02"
+            assert complaint in values(diagnosed[0])["last failure"]
+        else:
+            client.wait_for_training("finished")
+    assert not record_file(models, "fresh").exists()
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_cut_bag_is_used_as_far_as_it_goes_and_the_loss_is_told(
+    start_lifter, connect, models, tmp_path, storage
+):
+    bag = write(tmp_path / "bag", 4000 if storage == "mcap" else 400, storage)
+    (file,) = (f for f in (tmp_path / "bag").iterdir() if f.suffix != ".yaml")
+    os.truncate(file, int(0.8 * file.stat().st_size))
+    lifter = start_lifter(
+        train={"bags": [bag], "name": "fresh", "steps": 5, "seeds": 1, "batch": 8}
+    )
+    client = connect()
+    assert client.call("/lifter/train").success
+    client.wait_for_training("finished")
+    (warning,) = (line for line in lifter.log.splitlines() if "messages are lost" in line)
+    assert warning.startswith("[WARN]") and "warning: bag " in warning
+    assert "messages are lost" in (models / "fresh.html").read_text()
