@@ -86,6 +86,12 @@ def children_of(pid: int) -> list[int]:
     ]
 
 
+def recorded(models: Path) -> bool:
+    """Tell whether the training "fresh" has its record; for a moment there is an empty one."""
+    record = record_file(models, "fresh")
+    return record.exists() and record.stat().st_size > 0
+
+
 def test_kills_at_random_moments_cost_no_message_and_no_model(
     start_lifter, connect, models, tmp_path
 ):
@@ -103,7 +109,7 @@ def test_kills_at_random_moments_cost_no_message_and_no_model(
     for i in range(KILLS):
         assert client.call("/lifter/train").success
         if i % 2:  # in the training proper, else anywhere from the start on
-            stream.until(record_file(models, "fresh").exists, "the record")
+            stream.until(lambda: recorded(models), "the record")
         kill_at = time.monotonic() + moments.uniform(0.0, 2.5)
         stream.until(lambda at=kill_at: time.monotonic() > at, "the moment")
         status.clear()
@@ -113,14 +119,14 @@ def test_kills_at_random_moments_cost_no_message_and_no_model(
         failure = status[-1]
         if values(failure)["state"] == "failed":
             assert failure.level == b"\x02" and "SIGKILL" in failure.message
-            if record_file(models, "fresh").exists():
+            if recorded(models):
                 assert "train.resume to true" in failure.message
                 assert f"--resume --name fresh --output {models}" in failure.message
         for path in models.glob("*.safetensors"):
             load_model(path)
-    if not record_file(models, "fresh").exists():  # the last was killed too early, or too late
+    if not recorded(models):  # the last was killed too early, or too late
         assert client.call("/lifter/train").success
-        stream.until(record_file(models, "fresh").exists, "the record")
+        stream.until(lambda: recorded(models), "the record")
         for pid in children_of(lifter.process.pid):
             os.kill(pid, signal.SIGKILL)
         client.wait_for_training("failed")
@@ -143,7 +149,7 @@ def test_a_new_lifter_finds_what_was_cut_off(start_lifter, connect, models, tmp_
     first = start_lifter(train=train)
     client = connect()
     assert client.call("/lifter/train").success
-    client.wait(record_file(models, "fresh").exists, "the record")
+    client.wait(lambda: recorded(models), "the record")
     (training,) = children_of(first.process.pid)
     for pid in (training, first.process.pid):  # as a power cut would
         os.kill(pid, signal.SIGKILL)
