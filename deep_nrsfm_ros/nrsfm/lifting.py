@@ -19,7 +19,8 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     weak_perspective,
 )
 from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.nrsfm.network import complete, reconstruct
+from deep_nrsfm_ros.nrsfm.network import reconstruct
+from deep_nrsfm_ros.nrsfm.normaliser import observe
 
 Float32 = NDArray[np.float32]
 
@@ -112,7 +113,7 @@ class Lifter:
         visible = confidence > 0
         mask = visible[..., None].astype(np.float32)
         whole = np.ones_like(mask)
-        fitted = self._fit(*complete(self.model.network, points, mask), visible)
+        fitted = self._fit(points, mask, visible)
         if not visible.all():
             for _ in range(self.options.refill):
                 S, _, _, unit, origin = fitted
@@ -134,7 +135,8 @@ class Lifter:
 
         The network sees the points (n, p, 2) of mask (n, p, 1); the correction the visible alone.
         """
-        W, gain, unit, origin = self.model.normaliser.encode(points, mask)
+        model = self.model
+        W, gain, unit, origin = observe(model.network, model.normaliser, points, mask)
         S, M, residual = self._average(gain * W, W, visible)
         R = rotation_from_camera(M)
         if self.options.correction != "none":

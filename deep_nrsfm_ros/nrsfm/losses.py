@@ -14,8 +14,8 @@ from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
 from deep_nrsfm_ros.nrsfm.gradient import differentiable
-from deep_nrsfm_ros.nrsfm.network import Network, complete, whiten
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.network import Network, whiten
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser, observe
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
 
@@ -116,5 +116,5 @@ class Objective:
                 (len(points), 1, 1), generator=generator, device=device
             )
             mask = mask * (torch.rand(mask.shape, generator=generator, device=device) >= level)
-        seen = self.normaliser.encode(*complete(net, points, mask))
+        seen = observe(net, self.normaliser, points, mask)
         return seen.W * seen.gain, (frames.points - seen.origin) / seen.unit, seen.unit

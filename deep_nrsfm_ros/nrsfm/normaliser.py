@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.nrsfm.geometry import Array
+from deep_nrsfm_ros.nrsfm.network import Network, complete
 
 
 class Normalised(NamedTuple):
@@ -54,3 +55,11 @@ class Normaliser:
     def decode(W: Array, normalised: Normalised) -> Array:
         """Return the points (n, p, 2) of the image from W: the inverse of `encode`."""
         return W * normalised.unit + normalised.origin
+
+
+def observe(net: Network, normaliser: Normaliser, points: Array, mask: Array) -> Normalised:
+    """Return points (n, p, 2) of mask (n, p, 1) as the network shall see them.
+
+    What is missing is filled as the network expects it, see `complete`; then all is normalised.
+    """
+    return normaliser.encode(*complete(net, points, mask))

@@ -16,6 +16,7 @@ from deep_nrsfm_ros.nrsfm.geometry import (
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import forward
+from deep_nrsfm_ros.nrsfm.normaliser import observe
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 Floats = NDArray[np.float64]
@@ -131,13 +132,13 @@ def fit(model: Model, ensemble: Ensemble, most: int = 128) -> Fit:
 
 def cycle_error(model: Model, ensemble: Ensemble) -> float:
     """Return the mean of ||S' - S|| / ||S||: S' is the network's shape of S seen from elsewhere."""
-    encode, mask = model.normaliser.encode, ensemble.visible[..., None].astype(np.float32)
-    seen = encode(ensemble.points, mask)
+    mask = ensemble.visible[..., None].astype(np.float32)
+    seen = observe(model.network, model.normaliser, ensemble.points, mask)
     S, M = forward(model.network, seen.W * seen.gain)
     residual = (seen.W - S @ M) * mask
     residual -= mask * residual.sum(1, keepdims=True) / np.maximum(mask.sum(1, keepdims=True), 1)
     S = centre(S + residual @ M.swapaxes(1, 2))
-    again = encode(S @ _turns(len(S))[..., :2], np.ones_like(mask))
+    again = model.normaliser.encode(S @ _turns(len(S))[..., :2], np.ones_like(mask))
     S_again, _ = forward(model.network, again.W)
     return _difference(centre(S_again), S / again.unit)
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.network import Architecture, complete, initialise
+from deep_nrsfm_ros.nrsfm.normaliser import Normaliser, observe
 
 some = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -88,3 +91,20 @@ def test_numpy_and_torch_agree(seed: int, scale: str) -> None:
     for array, tensor in zip(arrays, tensors, strict=True):
         assert array.shape == tensor.shape
         np.testing.assert_allclose(tensor.numpy(), array, atol=1e-12)
+
+
+@pytest.mark.parametrize("whitening", [0.0, 1.0])
+def test_what_the_network_sees_is_completed_first(whitening: float) -> None:
+    rng = np.random.default_rng(0)
+    net = initialise(Architecture((4,), whitening=whitening), 6, rng)
+    A = rng.standard_normal((6, 6))
+    L = (np.eye(6) + A @ A.T).astype(np.float32)
+    net = dataclasses.replace(net, L=L, L_inverse=np.linalg.inv(L))
+    points = rng.standard_normal((5, 6, 2)).astype(np.float32)
+    mask = (np.arange(6) != 3)[None, :, None].repeat(5, 0).astype(np.float32)
+    seen = observe(net, Normaliser(), points, mask)
+    for found, expected in zip(
+        seen, Normaliser().encode(*complete(net, points, mask)), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
+    assert (np.abs(seen.W[:, 3]).max() > 0.01) == bool(whitening)
