@@ -66,7 +66,7 @@ class TrainingService:
             self._node.get_logger().warning(text)
             message += f"; {text}"
         names = {"unfinished": ", ".join(one.name for one in found)} if found else {}
-        self._tell(Progress("idle", message, names))
+        self._tell(Progress("idle", message, {**names}))
 
     def _train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start a training and answer at once."""
