@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.commands.program import program
 from deep_nrsfm_ros.node.model_folders import model_folders
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
+from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions, lift_all
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
 from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.observations.ensemble import Ensemble
@@ -84,11 +84,8 @@ def reconstruct(lifter: Lifter, ensemble: Ensemble) -> NDArray[np.float32]:
 
     A frame that cannot be lifted comes out as a point, which is an error of 100 %.
     """
-    chunks = (ensemble[slice(i, i + 1024)] for i in range(0, len(ensemble), 1024))
-    lifted = [lifter(chunk.points, chunk.visible.astype(np.float32)) for chunk in chunks]
-    S: NDArray[np.float32] = np.concatenate(
-        [np.nan_to_num(part.shapes * part.scale[:, None, None]) for part in lifted]
-    )
+    lifted = lift_all(lifter, ensemble.points, ensemble.visible.astype(np.float32))
+    S: NDArray[np.float32] = np.nan_to_num(lifted.shapes * lifted.scale[:, None, None])
     return S
 
 

@@ -24,6 +24,7 @@ from deep_nrsfm_ros.nrsfm.normaliser import observe
 
 Float32 = NDArray[np.float32]
 
+_BLOCK = 64  # objects lifted together by `lift_all`
 _RESIDUAL_SPREAD = 0.02  # squared residual by which a turn loses all but 1/e of its weight
 
 
@@ -192,6 +193,13 @@ class Lifter:
         sure = np.where(seen, confidence, np.float32(0.5) * mean[:, None])
         trust: Float32 = np.clip(sure, 0, 1) * np.clip(1 - residual, 0, 1)[:, None]
         return trust
+
+
+def lift_all(lifter: Lifter, points: Float32, confidence: Float32) -> Lifted:
+    """Lift any number of objects, a few at a time: many at once leave the processor's cache."""
+    starts = range(0, len(points), _BLOCK) or (0,)
+    parts = [lifter(points[i : i + _BLOCK], confidence[i : i + _BLOCK]) for i in starts]
+    return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def _blank(lifted: Lifted, where: NDArray[np.bool_]) -> Lifted:

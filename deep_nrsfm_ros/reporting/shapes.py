@@ -13,7 +13,7 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     random_cameras,
     rotation_from_camera,
 )
-from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter
+from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import forward
 from deep_nrsfm_ros.nrsfm.normaliser import observe
@@ -22,7 +22,6 @@ from deep_nrsfm_ros.observations.ensemble import Ensemble
 Floats = NDArray[np.float64]
 
 _SAMPLE = 500  # frames that are lifted
-_BATCH = 64  # frames lifted together
 _ROUNDS = 3  # of alignment to the mean
 
 
@@ -61,19 +60,11 @@ def lift_sample(model: Model, ensemble: Ensemble, most: int = _SAMPLE) -> Lifted
     """Lift up to `most` frames, evenly spread; raise ValueError if none can be lifted."""
     frames = np.unique(np.linspace(0, len(ensemble) - 1, min(most, len(ensemble))).astype(int))
     chosen = ensemble[frames]
-    lifted = _lift(model, chosen.points, chosen.visible.astype(np.float32))
+    lifted = lift_all(Lifter(model), chosen.points, chosen.visible.astype(np.float32))
     sound = np.isfinite(lifted.shapes).all((1, 2)) & np.isfinite(lifted.residual)
     if not sound.any():
         raise ValueError(f"model {model.name!r} lifts none of the {len(frames)} frames looked at")
     return LiftedFrames(frames[sound], Lifted(*(array[sound] for array in lifted)))
-
-
-def _lift(model: Model, points: NDArray[np.float32], confidence: NDArray[np.float32]) -> Lifted:
-    """Lift a few at a time: large batches leave the processor's cache and take longer."""
-    lifter = Lifter(model)
-    starts = range(0, len(points), _BATCH)
-    parts = [lifter(points[i : i + _BATCH], confidence[i : i + _BATCH]) for i in starts]
-    return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def shape_space(model: Model, lifted: Lifted, modes: int = 4) -> ShapeSpace:
@@ -120,7 +111,7 @@ def fit(model: Model, ensemble: Ensemble, most: int = 128) -> Fit:
     frames, found = lift_sample(model, ensemble, most)
     T = centre(found.shapes) @ _turns(len(frames))
     views, confidence = T[..., :2].astype(np.float32), np.ones(T.shape[:2], np.float32)
-    again = _lift(model, views, confidence)
+    again = lift_all(Lifter(model), views, confidence)
     sound = np.isfinite(again.scale)
     after = again.shapes[sound] * again.scale[sound, None, None]
     return Fit(
