@@ -105,7 +105,6 @@ class LifterNode(Node):
             if not len(seen.confidence):
                 self._health.saw_nothing()
                 return
-            names = source.tracker(seen, started)
             lifted = self._pipeline.lift(seen)
         except Exception as problem:  # whatever it is, the next message may be fine
             self._reject(source, problem)
@@ -115,6 +114,7 @@ class LifterNode(Node):
         if not np.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
         if self._objects.get_subscription_count():
+            names = source.tracker(seen, started)
             self._objects.publish(publishing.objects(header, lifted, names))
         if self._markers.get_subscription_count():
             self._markers.publish(publishing.markers(header, lifted, self._pipeline.edges))
