@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import ablation, batches, coherence, missing, noise, nrsfm_on_cmu, unseen
+from benchmarks import ablation, batches, coherence, mirror, missing, noise, nrsfm_on_cmu, unseen
 from benchmarks.harness import Session
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import ALONE, LIFTING
@@ -19,7 +19,7 @@ from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 LONE = ("--subjects", "01", "--seeds", "0", "1", "--steps", "3")
-ALL_TABLES = [nrsfm_on_cmu, ablation, unseen, noise, missing, coherence]
+ALL_TABLES = [nrsfm_on_cmu, mirror, ablation, unseen, noise, missing, coherence]
 
 
 @pytest.fixture(scope="module")
