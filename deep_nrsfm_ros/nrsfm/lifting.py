@@ -127,7 +127,7 @@ class Lifter:
         lifted = Lifted(S, R, scale, translation, residual, self._sure(confidence, residual))
         lost = on_one_line(points, visible)
         lost |= visible.sum(1) < self.options.min_visible
-        return _blank(lifted, lost) if lost.any() else lifted
+        return blank(lifted, lost) if lost.any() else lifted
 
     def _fit(
         self, points: Float32, mask: Float32, visible: NDArray[np.bool_]
@@ -202,7 +202,7 @@ def lift_all(lifter: Lifter, points: Float32, confidence: Float32) -> Lifted:
     return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def _blank(lifted: Lifted, where: NDArray[np.bool_]) -> Lifted:
+def blank(lifted: Lifted, where: NDArray[np.bool_]) -> Lifted:
     """Return `lifted` with the chosen objects NaN and their confidence 0."""
     for array in lifted:
         array[where] = np.nan
