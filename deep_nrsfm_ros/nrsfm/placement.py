@@ -2,9 +2,9 @@
 
 A weak-perspective camera sees along the optical axis. An object beside the axis is seen
 along another ray, and would come out turned by the angle between the two. So a virtual camera is
-turned towards each object, what it would see is lifted, and the result is turned back. Its scale
-is then that of perspective, 1 / z, from which the place follows: z = 1 / scale, in the unit of
-the reference length.
+turned towards each object, what it would see is lifted, and the result is turned back. The place
+follows from the rays: x + t_x = u (z + t_z) and y + t_y = v (z + t_z) are linear in t, which is in
+the unit of the reference length.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.nrsfm.geometry import weak_perspective
+from deep_nrsfm_ros.nrsfm.geometry import Floats, weak_perspective
 from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
 from deep_nrsfm_ros.nrsfm.lifting import Float32, Lifted, Lifter, blank
 
@@ -54,17 +54,17 @@ def lift_at_place(
     """Lift keypoints (n, p, 2) in pixels as `Lifter` does, with the shapes at their place.
 
     The optical frame's zero is the camera, not the shape's centre; rotations are to that frame.
-    W = scale S[..., :2] + translation holds as well as weak perspective can. Objects whose scale
-    comes out as no scale are NaN.
+    W = scale S[..., :2] + translation holds as well as weak perspective can. Objects that come
+    out behind the camera are NaN.
     """
     aimed = aim(intrinsics, points, confidence)
-    lifted = lifter(aimed.points, aimed.confidence)
-    lost = ~(lifted.scale > 0)
-    z = 1 / np.where(lost, np.float32(np.nan), lifted.scale)
-    place = np.column_stack((z[:, None] * lifted.translation, z))
+    lifted = lifter(aimed.points, aimed.confidence, perspective=True)
+    visible = aimed.confidence > 0
+    place = locate(lifted.shapes, aimed.points, visible)
+    lost = ~(place[:, 2] > 0)
     back = aimed.turns.astype(np.float32)
     S = ((lifted.shapes + place[:, None]) @ back).astype(np.float32)
-    scale, translation = weak_perspective(points, S[..., :2], aimed.confidence > 0)
+    scale, translation = weak_perspective(points, S[..., :2], visible)
     placed = lifted._replace(
         shapes=S,
         rotations=back.swapaxes(1, 2) @ lifted.rotations,
@@ -72,6 +72,23 @@ def lift_at_place(
         translation=translation,
     )
     return blank(placed, lost) if lost.any() else placed
+
+
+def locate(S: Floats, rays: Floats, visible: NDArray[np.bool_]) -> Floats:
+    """Return the places t (n, 3) from which S + t is seen along the rays best.
+
+    Least squares, over the visible points, of x + t_x - u (z + t_z) and the same of y. S: (n, p, 3)
+    in camera axes, which look at the object. rays: (n, p, 2), (u, v) on the plane z = 1.
+    """
+    m = visible.astype(S.dtype)
+    n = np.maximum(m.sum(1), 1)
+    u = (rays * m[..., None]).sum(1) / n[:, None]
+    r = rays * S[..., 2:] - S[..., :2]  # t_x - u t_z = r
+    mean = (r * m[..., None]).sum(1) / n[:, None]
+    U, V = (rays - u[:, None]) * m[..., None], (r - mean[:, None]) * m[..., None]
+    z = -(U * V).sum((1, 2)) / np.maximum((U * U).sum((1, 2)), 1e-12)
+    place: Floats = np.column_stack((mean + u * z[:, None], z))
+    return place
 
 
 def _towards(axis: NDArray[np.float64]) -> NDArray[np.float64]:

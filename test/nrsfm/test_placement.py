@@ -69,6 +69,18 @@ def test_an_object_comes_out_at_its_place_and_turned_with_its_ray(
     assert np.abs(W - seen(shape)).max() < 0.5 * np.ptp(seen(shape), axis=1).max()
 
 
+def test_what_comes_out_is_seen_where_the_keypoints_are(lifter: Lifter) -> None:
+    """By the perspective camera itself, lens and all, of objects as near as two metres."""
+    rng = np.random.default_rng(3)
+    pixels = (rng.uniform(0, 150, (20, P, 2)) + rng.uniform(0, 400, (20, 1, 2))).astype(np.float32)
+    confidence = (rng.random((20, P)) > 0.2).astype(np.float32)
+    lifted = lift_at_place(lifter, LENS, pixels, confidence)
+    ahead = (lifted.shapes[..., 2] > 0).all(1)  # a random model may put points anywhere
+    assert ahead.sum() > 10
+    known = (confidence > 0) & ahead[:, None]
+    np.testing.assert_allclose(seen(lifted.shapes)[known], pixels[known], atol=0.5)
+
+
 def test_the_reference_length_sets_size_and_distance_alike(
     lifter: Lifter, pixels: np.ndarray
 ) -> None:
