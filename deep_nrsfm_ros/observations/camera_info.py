@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from deep_nrsfm_ros.nrsfm.intrinsics import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, Intrinsics
-from deep_nrsfm_ros.observations.messages import MessageError
+from deep_nrsfm_ros.observations.observation import MessageError
 
 
 def read_camera_info(message: Any, *, rectified: bool = False) -> Intrinsics:

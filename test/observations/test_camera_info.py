@@ -10,7 +10,7 @@ import pytest
 
 from deep_nrsfm_ros.nrsfm.intrinsics import EQUIDISTANT, PLUMB_BOB, RATIONAL, Intrinsics
 from deep_nrsfm_ros.observations.camera_info import read_camera_info
-from deep_nrsfm_ros.observations.messages import MessageError
+from deep_nrsfm_ros.observations.observation import MessageError
 
 
 def info(**changes: Any) -> SimpleNamespace:
