@@ -13,7 +13,7 @@ from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.placement import lift_at_place
-from deep_nrsfm_ros.observations.messages import observation
+from deep_nrsfm_ros.observations.observation import observation
 from deep_nrsfm_ros.observations.pose2sim import JOINTS, Session, View
 
 Floats = NDArray[Any]

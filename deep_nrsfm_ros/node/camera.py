@@ -47,8 +47,8 @@ class CameraOptions:
 class CameraListener:
     """What is known of the camera from the last CameraInfo.
 
-    frame: its frame_id. size: width and height of the image, None if they are unknown. intrinsics: None before the first usable message, and always where no
-    CameraInfo is to be heard.
+    frame: its frame_id. size: width and height of the image, None if they are unknown.
+    intrinsics: None before the first usable message, and always where no CameraInfo is wanted.
     """
 
     def __init__(self, node: Node, options: CameraOptions) -> None:
