@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.node.camera import CameraOptions
 from deep_nrsfm_ros.node.parameters import name_of
 from deep_nrsfm_ros.node.pipeline import InputOptions
 from deep_nrsfm_ros.node.training_request import TrainingOptions
@@ -36,6 +37,7 @@ def parameter_rows(cls: type, prefix: str) -> list[str]:
     [
         (InputOptions, ""),
         (LiftingOptions, ""),
+        (CameraOptions, ""),
         (TrainingOptions, "train."),
         (Recipe, "train."),
         (Limits, "train."),

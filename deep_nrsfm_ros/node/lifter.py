@@ -2,13 +2,14 @@
 
 Every message on `keypoints` is answered, with its own header, on
 
-- ~/points: n objects (rows) of p keypoints: x right, y down, z forward, and confidence; centred
-  on each object's keypoints, in units of the parameter reference_length; NaN where too few
-  keypoints are visible,
+- ~/points: n objects (rows) of p keypoints: x right, y down, z forward, and confidence; at their
+  place before the camera if its CameraInfo is known, else centred on each object's keypoints; in
+  units of the parameter reference_length; NaN where too few keypoints are visible,
 - ~/camera_rotation: from the axes of the first object (x front, y left, z up, where its layout
   says which is which) to those of the camera; left out when the first object is NaN,
 - ~/objects: who is in which row, and the rotation of each; made only when someone listens,
-- ~/markers: the same for RViz, made only when someone listens.
+- ~/markers: the same for RViz, made only when someone listens,
+- /tf: a frame for each object, if the parameter tf_prefix asks for it.
 
 It never imports torch: lifting is NumPy, and training is a process of its own.
 """
@@ -36,12 +37,14 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.node import parameters, publishing
+from deep_nrsfm_ros.node.camera import CameraListener, CameraOptions
 from deep_nrsfm_ros.node.health import Health
 from deep_nrsfm_ros.node.listening import Listener, Source
 from deep_nrsfm_ros.node.model_folders import model_folders
 from deep_nrsfm_ros.node.pipeline import MODEL_ORDER, InputOptions, Pipeline
 from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest, layouts
 from deep_nrsfm_ros.node.training_service import TrainingService
+from deep_nrsfm_ros.node.transforms import Broadcaster
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.limits import Limits
@@ -67,6 +70,7 @@ class LifterNode(Node):
         super().__init__("lifter")
         self._inputs = parameters.declare(self, InputOptions)
         parameters.declare(self, LiftingOptions)
+        camera = parameters.declare(self, CameraOptions)
         parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
         parameters.declare(self, Limits, _TRAIN)
@@ -74,6 +78,8 @@ class LifterNode(Node):
         self._models_dir = Path(self._inputs.models_dir).expanduser()
         self._pipeline = self._proposed = self._prepare(())
 
+        self._camera = CameraListener(self, camera)
+        self._tf = Broadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._health = Health()
         self._cloud = publishing.PointCloud()
         self._points = self.create_publisher(PointCloud2, "~/points", 10)
@@ -101,23 +107,29 @@ class LifterNode(Node):
         """Lift one message and publish the result: the hot path."""
         started = time.perf_counter()
         try:
-            seen = self._pipeline.observe(message, source.input_type)
+            intrinsics = self._camera.known()
+            seen = self._pipeline.observe(message, source.input_type, self._camera.size)
             if not len(seen.confidence):
                 self._health.saw_nothing()
                 return
-            lifted = self._pipeline.lift(seen)
+            lifted = self._pipeline.lift(seen, intrinsics)
         except Exception as problem:  # whatever it is, the next message may be fine
             self._reject(source, problem)
             return
         header = getattr(message, "header", None) or self._header()
+        header.frame_id = header.frame_id or self._camera.frame
+        placed = self._camera.wanted
         self._points.publish(self._cloud.fill(header, lifted))
         if not np.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
-        if self._objects.get_subscription_count():
+        if self._tf or self._objects.get_subscription_count():
             names = source.tracker(seen, started)
-            self._objects.publish(publishing.objects(header, lifted, names))
+            self._objects.publish(publishing.objects(header, lifted, names, placed=placed))
+            if self._tf:
+                self._tf.send(header, lifted, names)
         if self._markers.get_subscription_count():
-            self._markers.publish(publishing.markers(header, lifted, self._pipeline.edges))
+            edges = self._pipeline.edges
+            self._markers.publish(publishing.markers(header, lifted, edges, placed=placed))
         self._health.lifted(time.perf_counter() - started, lifted.residual)
 
     def _reject(self, source: Source, problem: Exception) -> None:
@@ -138,7 +150,7 @@ class LifterNode(Node):
         level, message, values = self._health.report()
         model = self._pipeline.model
         values |= {"model": model.name, "topic": ", ".join(self._listener.topics)}
-        values["heard"] = self._listener.heard
+        values |= {"heard": self._listener.heard, "camera": self._camera.status}
         lifting = publishing.status(f"{self.get_name()}: lifting", level, message, values)
         self._diagnostics.publish(
             DiagnosticArray(header=self._header(), status=[lifting, self._training.status])

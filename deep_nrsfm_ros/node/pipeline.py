@@ -9,9 +9,11 @@ import numpy as np
 
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.node.model_folders import default_models_dir
+from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.nrsfm.placement import lift_at_place
 from deep_nrsfm_ros.observations.field_mapping import Size
 from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, InputType, read
 from deep_nrsfm_ros.observations.observation import MessageError, Observation
@@ -94,17 +96,24 @@ class Pipeline:
         seen = read(message, input_type, q, self._min_confidence, size or self._size)
         return Observation(*self._map(seen.points, seen.confidence), seen.ids)
 
-    def lift(self, seen: Observation) -> Lifted:
+    def lift(self, seen: Observation, intrinsics: Intrinsics | None = None) -> Lifted:
         """Return the shapes of the objects, of which there is at least one, all in one pass.
 
+        intrinsics: of the camera, for the shapes to be at their place; None: they are centred.
         Objects that cannot be lifted are NaN, unless all are: then MessageError is raised.
         """
-        confidence = seen.confidence
-        lifted = self._lifter(seen.points, confidence)
+        points, confidence = seen.points, seen.confidence
+        if intrinsics:
+            lifted = lift_at_place(self._lifter, intrinsics, points, confidence)
+        else:
+            lifted = self._lifter(points, confidence)
         if np.isnan(lifted.residual).all():
             most = (confidence > 0).sum(1).max()
             if most >= self._min_visible:
-                raise MessageError("message has its visible keypoints on one line or on one spot")
+                raise MessageError(
+                    "message has its visible keypoints on one line or on one spot"
+                    + ", or where the camera's lens sees nothing" * bool(intrinsics)
+                )
             raise MessageError(
                 f"message has at most {most} visible keypoints of the "
                 f"model's {len(self.model.layout)} in an object; min_visible is {self._min_visible}"

@@ -95,6 +95,24 @@ def test_rotations_are_proper_and_shapes_stand_in_camera_axes(
     np.testing.assert_allclose(lifted.shapes.mean(1), 0, atol=1e-4)
 
 
+def test_the_mirror_image_is_lifted_to_the_mirror_image() -> None:
+    points, confidence = pixels(missing=0.3)
+    lifter = Lifter(random_model(), LiftingOptions(correction="back_projection", mirror=True))
+    partners = np.array(HUMAN17.partners())
+    lifted = lifter(points, confidence)
+    mirrored = lifter((points * [-1, 1]).astype(np.float32)[:, partners], confidence[:, partners])
+    size = np.abs(lifted.shapes).max()
+    np.testing.assert_allclose(
+        mirrored.shapes / size, lifted.shapes[:, partners] * [-1, 1, 1] / size, atol=1e-4
+    )
+    # The object's y axis points to its left.
+    np.testing.assert_allclose(
+        mirrored.rotations, lifted.rotations * [[-1, 1, -1], [1, -1, 1], [1, -1, 1]], atol=1e-4
+    )
+    alone = Lifter(random_model(), LiftingOptions())(points, confidence)
+    assert np.abs(alone.shapes - lifted.shapes).max() > 0.01 * size
+
+
 def test_types_and_shapes() -> None:
     lifted = Lifter(random_model())(*pixels())
     expected = Lifted((N, 17, 3), (N, 3, 3), (N,), (N, 2), (N,), (N, 17))  # type: ignore[arg-type]
