@@ -128,7 +128,8 @@ class LifterNode(Node):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
         if self._markers.get_subscription_count():
             self._markers.publish(publishing.markers(header, lifted, self._pipeline.edges))
-        self._health.lifted(time.perf_counter() - started, lifted.residual)
+        fit = lifted.residual, lifted.object_confidence
+        self._health.lifted(time.perf_counter() - started, *fit)
 
     def _reject(self, problem: Exception) -> None:
         """Count a message that could not be lifted; say why, but not too often."""
