@@ -48,8 +48,10 @@ from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations.curation import Curation
 
+_STEADY = "steady."
 _TRAIN = "train."
 _LOG_PERIOD = 2.0
 _REPORT_PERIOD = 1.0
@@ -67,6 +69,7 @@ class LifterNode(Node):
         super().__init__("lifter")
         self._inputs = parameters.declare(self, InputOptions)
         parameters.declare(self, LiftingOptions)
+        parameters.declare(self, SteadyingOptions, _STEADY)
         parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
         parameters.declare(self, Limits, _TRAIN)
@@ -102,15 +105,16 @@ class LifterNode(Node):
         started = time.perf_counter()
         try:
             seen = self._pipeline.observe(message, source.input_type)
-            if not len(seen.confidence):
-                self._health.saw_nothing()
-                return
             names = source.tracker(seen, started)
-            lifted = self._pipeline.lift(seen)
+            header = getattr(message, "header", None) or self._header()
+            stamp = publishing.seconds(header.stamp) or publishing.seconds(self._header().stamp)
+            lifted, names = self._pipeline.lift(seen, names, source.topic, stamp)
         except Exception as problem:  # whatever it is, the next message may be fine
             self._reject(source, problem)
             return
-        header = getattr(message, "header", None) or self._header()
+        if not names:
+            self._health.saw_nothing()
+            return
         self._points.publish(self._cloud.fill(header, lifted))
         if not np.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
@@ -149,6 +153,7 @@ class LifterNode(Node):
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
+        steadying = parameters.read(self, SteadyingOptions, _STEADY, changes)
         for checked in (TrainingOptions, Recipe, Limits, Curation):
             parameters.read(self, checked, _TRAIN, changes)
         # Files are read again only when they are named again: they may be gone by now.
@@ -165,7 +170,7 @@ class LifterNode(Node):
             detector = None
         else:
             detector = find_layout("keypoint_layout", inputs.keypoint_layout)
-        return Pipeline(model, detector, inputs, lifting)
+        return Pipeline(model, detector, inputs, lifting, steadying)
 
     def _model_file(self, name: str) -> Path:
         """Return the file of a model by name or path; raise ValueError if there is none."""
