@@ -105,7 +105,9 @@ class LifterNode(Node):
         started = time.perf_counter()
         try:
             seen = self._pipeline.observe(message, source.input_type)
-            names = source.tracker(seen, started)
+            told = self._objects.get_subscription_count()
+            wanted = told or self._pipeline.steadies
+            names = source.tracker(seen, started) if wanted else ("",) * len(seen.confidence)
             header = getattr(message, "header", None) or self._header()
             stamp = publishing.seconds(header.stamp) or publishing.seconds(self._header().stamp)
             lifted, names = self._pipeline.lift(seen, names, source.topic, stamp)
@@ -118,7 +120,7 @@ class LifterNode(Node):
         self._points.publish(self._cloud.fill(header, lifted))
         if not np.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
-        if self._objects.get_subscription_count():
+        if told:
             self._objects.publish(publishing.objects(header, lifted, names))
         if self._markers.get_subscription_count():
             self._markers.publish(publishing.markers(header, lifted, self._pipeline.edges))

@@ -51,12 +51,13 @@ class Listener:
         """
         self._node, self._on_message, self._on_trouble = node, on_message, on_trouble
         self._log = node.get_logger()
-        self._type = (
-            None if inputs.input_type == AUTO else find_input("input_type", inputs.input_type)
-        )
-        if self._type:
+        self._type: InputType | None = None
+        if inputs.input_type != AUTO:
+            self._type = find_input("input_type", inputs.input_type)
             message_class(name_of(self._type))
-        self.topics = tuple(self._resolve(name) for name in inputs.topics or (DEFAULT_TOPIC,))
+        self._own = f"{node.get_fully_qualified_name()}/"
+        wanted = map(self._resolve, inputs.topics or (DEFAULT_TOPIC,))
+        self.topics = tuple(dict.fromkeys(wanted))
         self._heard: dict[str, tuple[Source, Subscription]] = {}
         for topic in self.topics:
             if self._type and WILDCARD not in topic:
@@ -77,45 +78,42 @@ class Listener:
 
         idle: nothing has come lately, so see if there are publishers that cannot be heard.
         """
-        waiting = [t for t in self.topics if WILDCARD in t or t not in self._heard]
-        names = (
-            [name for name, _ in self._node.get_topic_names_and_types()]
-            if any(WILDCARD in topic for topic in waiting)
-            else []
-        )
-        for pattern in waiting:
-            for topic in names if WILDCARD in pattern else (pattern,):
-                if match(pattern, topic) is not None:
-                    self._meet(topic, expected=WILDCARD not in pattern)
+        for pattern in self.topics:
+            if WILDCARD in pattern:
+                for topic in self._matching(pattern):
+                    self._meet(topic, idle)
+            elif pattern not in self._heard:
+                self._meet(pattern, idle)
         if idle:
             for source, _ in list(self._heard.values()):
                 self._check(source)
 
-    def _meet(self, topic: str, expected: bool) -> None:
+    def _matching(self, pattern: str) -> list[str]:
+        """Return the topics that a pattern stands for, those of the lifter itself aside."""
+        names = (name for name, _ in self._node.get_topic_names_and_types())
+        return [n for n in names if match(pattern, n) is not None and not n.startswith(self._own)]
+
+    def _meet(self, topic: str, idle: bool) -> None:
         """Listen to a topic if somebody publishes there, and no longer if nobody does."""
         types = self._types(topic)
-        if topic in self._heard:
-            if not types and not expected:
-                self._leave(topic)
-            return
-        if not types:
-            return
         usable = [kind for kind in types if kind in self._usable]
-        if not usable:
-            self._complain(
-                f"{topic} carries {', '.join(types)}; expected {self._expected}: change the "
-                "publisher, or start the lifter with another input_type, which may be the path of "
-                "a field mapping"
-            )
-        elif len(usable) > 1:
-            self._complain(
-                f"{topic} carries {' and '.join(usable)}: start the lifter with one as input_type"
-            )
-        else:
+        if topic in self._heard:
+            if not types:
+                self._leave(topic)
+        elif len(usable) == 1:
             try:
                 self._listen(topic, self._type or find_input("input_type", usable[0]))
             except ValueError as problem:
                 self._complain(f"cannot listen to {topic}: {problem}")
+        elif types and idle:  # what does not hinder others is no trouble
+            mend = (
+                "start the lifter with one as input_type"
+                if usable
+                else "change the publisher, or start the lifter with another input_type, which may "
+                "be the path of a field mapping"
+            )
+            expected = "one type" if usable else " or ".join(self._usable)
+            self._complain(f"{topic} carries {', '.join(types)}; expected {expected}: {mend}")
 
     def _check(self, source: Source) -> None:
         """Say so if messages of another type are published where the lifter listens.
@@ -165,11 +163,6 @@ class Listener:
         """Return the types that would be heard."""
         return (name_of(self._type),) if self._type else INPUT_TYPES
 
-    @property
-    def _expected(self) -> str:
-        """Return them in words."""
-        return " or ".join(self._usable)
-
     def _types(self, topic: str) -> list[str]:
         """Return the types that are published on a topic."""
         found = self._node.get_publishers_info_by_topic(topic)
@@ -181,7 +174,10 @@ class Listener:
         rclpy knows no `*`, so that what has one is not remapped.
         """
         if WILDCARD not in name:
-            return str(self._node.resolve_topic_name(name))
+            try:
+                return str(self._node.resolve_topic_name(name))
+            except RuntimeError:  # of rcl, with a place in its source
+                raise ValueError(f"topics names {name!r}, which is no name of a topic") from None
         return name if name.startswith("/") else f"{self._node.get_namespace().rstrip('/')}/{name}"
 
     def _mend_qos(self, topic: str, event: Any) -> None:

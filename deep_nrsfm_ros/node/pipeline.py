@@ -98,6 +98,11 @@ class Pipeline:
         seen = read(message, input_type, q, self._min_confidence, size or self._size)
         return Observation(*self._map(seen.points, seen.confidence), seen.ids)
 
+    @property
+    def steadies(self) -> bool:
+        """Tell whether objects are filtered over time, for which their names matter."""
+        return self._steadying.enabled
+
     def lift(
         self, seen: Observation, names: tuple[str, ...], topic: str, time: float
     ) -> tuple[Lifted, tuple[str, ...]]:

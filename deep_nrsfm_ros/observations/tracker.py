@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +16,14 @@ _FARTHEST = 1.5  # moves from one message to the next, in sizes of the object
 _NAME = "object"
 
 
-@dataclass
-class _Track:
-    """An object that was seen: points (q, 2), those there (q), size and time of the last time."""
+class _Tracks(NamedTuple):
+    """m objects as they were seen the last time, in arrays, so that all are compared at once."""
 
-    name: str
-    points: NDArray[np.float32]
-    visible: NDArray[np.bool_]
-    size: float
-    time: float
+    names: list[str]
+    points: NDArray[np.float32]  # (m, q, 2)
+    visible: NDArray[np.float32]  # (m, q) 1 or 0
+    size: NDArray[np.float32]  # (m,) distance of the keypoints from their centre, RMS
+    time: NDArray[np.float64]  # (m,) seconds
 
 
 class Tracker:
@@ -42,7 +41,7 @@ class Tracker:
         that, any other "topic/name"; "" if there are no others.
         """
         self._topic, self._memory = topic, memory
-        self._tracks: list[_Track] = []
+        self._tracks: _Tracks | None = None
         self._count = 0
 
     def __call__(self, seen: Observation, now: float) -> tuple[str, ...]:
@@ -63,23 +62,23 @@ class Tracker:
         nameless = [i for i, name in enumerate(names) if not name and seen.confidence[i].any()]
         if not nameless:
             return tuple(names)
-        self._tracks = [t for t in self._tracks if 0 <= now - t.time <= self._memory]
-        new = [_track(seen.points[i], seen.confidence[i] > 0, now) for i in nameless]
-        pairs = sorted(
-            (distance, j, k)
-            for j, track in enumerate(new)
-            for k, old in enumerate(self._tracks)
-            if (distance := _distance(track, old)) < _FARTHEST
-        )
-        taken = set()
-        for _, j, k in pairs:
-            if not new[j].name and k not in taken:
-                new[j].name = self._tracks[k].name
-                taken.add(k)
-        for i, track in zip(nameless, new, strict=True):
-            names[i] = track.name = track.name or self._next(names)
-        kept = [track for k, track in enumerate(self._tracks) if k not in taken]
-        self._tracks = kept + new
+        new = _tracks(seen, nameless, now)
+        old = self._tracks
+        # Another model has other keypoints: there is nothing to compare.
+        if old is not None and old.points.shape[1:] == new.points.shape[1:]:
+            old = _part(old, (now >= old.time) & (now - old.time <= self._memory))
+            distance = _distance(new, old)
+            near = np.argwhere(distance < _FARTHEST)
+            taken = np.zeros(len(old.names), bool)
+            for j, k in near[distance[tuple(near.T)].argsort()].tolist():
+                if not new.names[j] and not taken[k]:
+                    new.names[j], taken[k] = old.names[k], True
+            old = _part(old, ~taken)
+        else:
+            old = None
+        for j, i in enumerate(nameless):
+            names[i] = new.names[j] = new.names[j] or self._next(names)
+        self._tracks = _joined(old, new) if old and old.names else new
         return tuple(names)
 
     def _given(self, seen: Observation) -> list[str]:
@@ -94,16 +93,38 @@ class Tracker:
         return self._next(used) if name in used else name
 
 
-def _track(points: NDArray[np.float32], visible: NDArray[np.bool_], now: float) -> _Track:
-    """Return an object without a name."""
-    spread = points[visible] - points[visible].mean(0)
-    return _Track("", points, visible, float(np.sqrt((spread**2).sum(1).mean())), now)
+def _tracks(seen: Observation, which: list[int], now: float) -> _Tracks:
+    """Return some of the objects, each with a keypoint at least, without names."""
+    points, visible = seen.points[which], (seen.confidence[which] > 0).astype(np.float32)
+    weight = visible[..., None] / visible.sum(1)[:, None, None]
+    spread = points - (points * weight).sum(1, keepdims=True)
+    size = np.sqrt((spread * spread * weight).sum((1, 2)))
+    return _Tracks([""] * len(which), points, visible, size, np.full(len(which), now))
 
 
-def _distance(a: _Track, b: _Track) -> float:
-    """Return how far apart two are, in their size; infinite if no keypoint is in both."""
-    both = a.visible & b.visible
-    if not both.any():
-        return np.inf
-    move = (a.points[both] - b.points[both]).mean(0)
-    return float(np.hypot(*move) / max(a.size, b.size, 1e-9))
+def _part(tracks: _Tracks, which: NDArray[np.bool_]) -> _Tracks:
+    """Return some of the tracks."""
+    names = [name for name, chosen in zip(tracks.names, which.tolist(), strict=True) if chosen]
+    _, points, visible, size, time = tracks
+    return _Tracks(names, points[which], visible[which], size[which], time[which])
+
+
+def _joined(a: _Tracks, b: _Tracks) -> _Tracks:
+    """Return the tracks of both."""
+    return _Tracks(
+        a.names + b.names,
+        np.concatenate([a.points, b.points]),
+        np.concatenate([a.visible, b.visible]),
+        np.concatenate([a.size, b.size]),
+        np.concatenate([a.time, b.time]),
+    )
+
+
+def _distance(a: _Tracks, b: _Tracks) -> NDArray[np.float32]:
+    """Return (m, n) how far apart each two are, in their size; NaN if no keypoint is in both."""
+    both = a.visible[:, None] * b.visible[None]
+    move = ((a.points[:, None] - b.points[None]) * both[..., None]).sum(2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        distance: NDArray[np.float32] = np.hypot(move[..., 0], move[..., 1]) / both.sum(2)
+        distance /= np.maximum(np.maximum(a.size[:, None], b.size[None]), np.float32(1e-9))
+    return distance

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, Point32, PolygonStamped, Pose, PoseArray
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 from std_msgs.msg import Header, String
@@ -73,18 +74,25 @@ def exchange(client: Any, publisher: Any, message: Any) -> tuple[np.ndarray, Mul
         client.listen(OBJECTS, MultiDOFJointState)
         client.wait(lambda: client.node.count_publishers(OBJECTS), "objects' publisher")
 
-    if hasattr(message, "header"):
+    stamped = hasattr(message, "header")
+    if stamped:
         message.header.stamp.sec = next(NUMBERS)
 
     def both() -> Any:
-        points = client.exchange(publisher, message)
-        stamp = points.header.stamp
-        if hasattr(message, "header") and stamp != message.header.stamp:
-            return None  # the answer to an earlier message
-        found = [o for o in client.heard[OBJECTS] if o.header.stamp == stamp]
-        return found and (unpack(points), found[0])
+        client.exchange(publisher, message)
+        # The objects come after their points, and both may be those of an earlier message.
+        points = {str(p.header.stamp): p for p in client.heard["/lifter/points"]}
+        for objects in reversed(client.heard[OBJECTS]):
+            stamp = objects.header.stamp
+            if str(stamp) in points and (not stamped or stamp == message.header.stamp):
+                return unpack(points[str(stamp)]), objects
+        return None
 
     return client.wait(both, "objects")
+
+
+def values(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
 
 
 def mapping(folder: Path, text: str) -> str:
@@ -189,6 +197,27 @@ def test_several_topics_are_told_apart(start_lifter, connect):
         publisher = client.publisher(PointCloud2, topic=f"{side}/keypoints")
         _, objects = exchange(client, publisher, cloud(pixels(0)))
         assert objects.joint_names == [f"{side}/keypoints"]
+
+
+def test_a_wildcard_passes_by_what_is_not_meant(start_lifter, connect):
+    # The lifter's own points are of the same type.
+    start_lifter(listens=False, topics=["/*/points"]).wait_for_log("waiting for")
+    client = connect()
+    client.node.create_publisher(String, "text/points", 1)
+    publisher = client.publisher(PointCloud2, topic="cam/points")
+    _, objects = exchange(client, publisher, cloud(pixels(0)))
+    assert objects.joint_names == ["cam"]
+    sender = client.node.create_timer(0.1, lambda: publisher.publish(cloud(pixels(0))))
+    status = client.wait_for_health(lambda status, v: float(v["rate [Hz]"]) > 0)
+    assert values(status)["heard"] == "/cam/points (sensor_msgs/PointCloud2)"
+    assert "carries" not in status.message
+    client.node.destroy_timer(sender)
+
+
+def test_names_that_are_no_topics_are_refused(start_lifter):
+    lifter = start_lifter(listens=False, topics=["no topic"])
+    assert lifter.process.wait(60) == 1
+    assert "cannot start: topics names 'no topic', which is no name" in lifter.log
 
 
 def test_a_lifter_that_cannot_listen_says_why(start_lifter, tmp_path):

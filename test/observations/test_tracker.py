@@ -41,12 +41,24 @@ def test_a_jump_is_another_object_and_so_is_one_that_was_long_away() -> None:
     assert tracker(seen((100, 100)), 3 * MEMORY)[0] not in (a, b)
 
 
+def test_another_number_of_keypoints_is_another_object() -> None:
+    tracker = Tracker()
+    (a,) = tracker(seen((100, 100)), 0.0)
+    whole = seen((100, 100))
+    fewer = Observation(whole.points[:, :5], whole.confidence[:, :5])
+    (b,) = tracker(fewer, 0.1)
+    assert a != b == tracker(fewer, 0.2)[0]
+
+
 def test_only_keypoints_that_both_show_are_compared() -> None:
     tracker = Tracker()
     (a,) = tracker(seen((100, 100)), 0.0)
     half = seen((100, 100))
     half.points[0, 4:] = half.confidence[0, 4:] = 0
     assert tracker(half, 0.1) == (a,)
+    other = seen((100, 100))
+    other.points[0, :4] = other.confidence[0, :4] = 0
+    assert tracker(other, 0.2) != (a,)
 
 
 def test_the_detectors_names_stay_and_a_second_of_the_same_is_another() -> None:
