@@ -51,8 +51,10 @@ from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations.curation import Curation
 
+_STEADY = "steady."
 _TRAIN = "train."
 _LOG_PERIOD = 2.0
 _REPORT_PERIOD = 1.0
@@ -71,6 +73,7 @@ class LifterNode(Node):
         self._inputs = parameters.declare(self, InputOptions)
         parameters.declare(self, LiftingOptions)
         camera = parameters.declare(self, CameraOptions)
+        parameters.declare(self, SteadyingOptions, _STEADY)
         parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
         parameters.declare(self, Limits, _TRAIN)
@@ -109,28 +112,32 @@ class LifterNode(Node):
         try:
             intrinsics = self._camera.known()
             seen = self._pipeline.observe(message, source.input_type, self._camera.size)
-            if not len(seen.confidence):
-                self._health.saw_nothing()
-                return
-            lifted = self._pipeline.lift(seen, intrinsics)
+            told = self._objects.get_subscription_count()
+            wanted = told or self._tf or self._pipeline.steadies
+            names = source.tracker(seen, started) if wanted else ("",) * len(seen.confidence)
+            header = getattr(message, "header", None) or self._header()
+            header.frame_id = header.frame_id or self._camera.frame
+            stamp = publishing.seconds(header.stamp) or publishing.seconds(self._header().stamp)
+            lifted, names = self._pipeline.lift(seen, intrinsics, names, source.topic, stamp)
         except Exception as problem:  # whatever it is, the next message may be fine
             self._reject(source, problem)
             return
-        header = getattr(message, "header", None) or self._header()
-        header.frame_id = header.frame_id or self._camera.frame
+        if not names:
+            self._health.saw_nothing()
+            return
         placed = self._camera.wanted
         self._points.publish(self._cloud.fill(header, lifted))
         if not np.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
-        if self._tf or self._objects.get_subscription_count():
-            names = source.tracker(seen, started)
+        if told:
             self._objects.publish(publishing.objects(header, lifted, names, placed=placed))
-            if self._tf:
-                self._tf.send(header, lifted, names)
+        if self._tf:
+            self._tf.send(header, lifted, names)
         if self._markers.get_subscription_count():
             edges = self._pipeline.edges
             self._markers.publish(publishing.markers(header, lifted, edges, placed=placed))
-        self._health.lifted(time.perf_counter() - started, lifted.residual)
+        fit = lifted.residual, lifted.object_confidence
+        self._health.lifted(time.perf_counter() - started, *fit)
 
     def _reject(self, source: Source, problem: Exception) -> None:
         """Count a message that could not be lifted; say why, but not too often."""
@@ -160,6 +167,7 @@ class LifterNode(Node):
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
+        steadying = parameters.read(self, SteadyingOptions, _STEADY, changes)
         for checked in (TrainingOptions, Recipe, Limits, Curation):
             parameters.read(self, checked, _TRAIN, changes)
         # Files are read again only when they are named again: they may be gone by now.
@@ -176,7 +184,7 @@ class LifterNode(Node):
             detector = None
         else:
             detector = find_layout("keypoint_layout", inputs.keypoint_layout)
-        return Pipeline(model, detector, inputs, lifting)
+        return Pipeline(model, detector, inputs, lifting, steadying)
 
     def _model_file(self, name: str) -> Path:
         """Return the file of a model by name or path; raise ValueError if there is none."""

@@ -14,6 +14,7 @@ from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.placement import lift_at_place
+from deep_nrsfm_ros.nrsfm.steadying import Steadying, SteadyingOptions
 from deep_nrsfm_ros.observations.field_mapping import Size
 from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, InputType, read
 from deep_nrsfm_ros.observations.observation import MessageError, Observation
@@ -73,6 +74,7 @@ class Pipeline:
         detector: KeypointLayout | None,
         inputs: InputOptions,
         lifting: LiftingOptions,
+        steadying: SteadyingOptions,
     ) -> None:
         """Raise ValueError if the model and the detector's layout do not fit each other.
 
@@ -86,6 +88,8 @@ class Pipeline:
         self._min_confidence = inputs.min_confidence
         self._size = inputs.image_size
         self._min_visible = lifting.min_visible
+        self._steadying = steadying
+        self._steady: dict[str, Steadying] = {}
 
     def observe(self, message: Any, input_type: InputType, size: Size | None = None) -> Observation:
         """Return the objects in `message`, their keypoints as the model orders them.
@@ -96,18 +100,36 @@ class Pipeline:
         seen = read(message, input_type, q, self._min_confidence, size or self._size)
         return Observation(*self._map(seen.points, seen.confidence), seen.ids)
 
-    def lift(self, seen: Observation, intrinsics: Intrinsics | None = None) -> Lifted:
-        """Return the shapes of the objects, of which there is at least one, all in one pass.
+    @property
+    def steadies(self) -> bool:
+        """Tell whether objects are filtered over time, for which their names matter."""
+        return self._steadying.enabled
+
+    def lift(
+        self,
+        seen: Observation,
+        intrinsics: Intrinsics | None,
+        names: tuple[str, ...],
+        topic: str,
+        time: float,
+    ) -> tuple[Lifted, tuple[str, ...]]:
+        """Return the shapes of the objects and their names, all in one pass, steadied if asked for.
 
         intrinsics: of the camera, for the shapes to be at their place; None: they are centred.
-        Objects that cannot be lifted are NaN, unless all are: then MessageError is raised.
+        names: n identities of the objects on their topic, which may be none. time: of the message,
+        in seconds. Objects that are bridged come last; there may be none at all. Objects that
+        cannot be lifted are NaN, unless all are: then MessageError is raised.
         """
         points, confidence = seen.points, seen.confidence
         if intrinsics:
             lifted = lift_at_place(self._lifter, intrinsics, points, confidence)
         else:
             lifted = self._lifter(points, confidence)
-        if np.isnan(lifted.residual).all():
+        steady = self._steady.get(topic)
+        if steady is None:
+            steady = self._steady[topic] = Steadying(self._steadying)
+        lifted, names = steady(lifted, names, time)
+        if names and np.isnan(lifted.residual).all():
             most = (confidence > 0).sum(1).max()
             if most >= self._min_visible:
                 raise MessageError(
@@ -118,4 +140,4 @@ class Pipeline:
                 f"message has at most {most} visible keypoints of the "
                 f"model's {len(self.model.layout)} in an object; min_visible is {self._min_visible}"
             )
-        return lifted
+        return lifted, names

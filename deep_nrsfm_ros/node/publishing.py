@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Duration
+from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Transform, Vector3
 from numpy.typing import NDArray
@@ -61,6 +61,11 @@ class PointCloud:
         message.data = array("B", bytes(n * p * POINT_STEP))
         # A view of the message's own array: what is written to it needs no copying.
         self._values = np.frombuffer(message.data, "<f4").reshape(n, p, 4)
+
+
+def seconds(stamp: Time) -> float:
+    """Return a stamp in seconds, 0 if it was never set."""
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def camera_rotation(header: Header, rotation: NDArray[np.float32]) -> QuaternionStamped:

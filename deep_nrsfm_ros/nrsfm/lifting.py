@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.nrsfm.confidence import near
 from deep_nrsfm_ros.nrsfm.correction import correct
 from deep_nrsfm_ros.nrsfm.geometry import (
     centre,
@@ -88,7 +89,13 @@ class Lifted(NamedTuple):
     scale: Float32  # (n,) pixels per output unit
     translation: Float32  # (n, 2) where the shape's centre is in the image
     residual: Float32  # (n,) relative reprojection error of the network, before correction
-    confidence: Float32  # (n, p) 0..1
+    confidence: Float32  # (n, p) chance that the point is near its true place, see `confidence`
+
+    @property
+    def object_confidence(self) -> Float32:
+        """The share (n,) of each object's points to be expected near their true places."""
+        share: Float32 = self.confidence.mean(1)
+        return share
 
 
 class Lifter:
@@ -108,6 +115,7 @@ class Lifter:
         turn = np.kron(np.eye(p), model.object_frame)
         learned = self.options.correction == "learned"
         self._covariance = turn.T @ model.error_covariance @ turn if learned else np.eye(3 * p)
+        self._spread = np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1))
         self._length = self.options.reference_length or model.layout.reference_length or 1.0
         self._reference = pair and (model.layout.index(pair[0]), model.layout.index(pair[1]))
 
@@ -140,12 +148,26 @@ class Lifter:
                 fitted = self._fit(filled, whole, visible, perspective)
         S, R, residual, _, _ = fitted
         S = centre(S)
+        sure = self.sure(confidence, residual, S)
         S *= self._length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
-        lifted = Lifted(S, R, scale, translation, residual, self._sure(confidence, residual))
+        lifted = Lifted(S, R, scale, translation, residual, sure)
         lost = on_one_line(points, visible)
         lost |= visible.sum(1) < self.options.min_visible
         return blank(lifted, lost) if lost.any() else lifted
+
+    def sure(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
+        """Return the confidence (n, p) of shapes S (n, p, 3) in the network's unit, centred."""
+        return near(confidence, residual, self.spread(S))
+
+    def spread(self, S: Float32) -> Float32:
+        """Return the standard deviation (n, p) of the model's errors, relative to the RMS radius.
+
+        S: as in `sure`.
+        """
+        radius = np.sqrt((S * S).sum(2).mean(1))
+        spread: Float32 = self._spread / np.maximum(radius, 1e-9)[:, None]
+        return spread
 
     def _fit(
         self, points: Float32, mask: Float32, visible: NDArray[np.bool_], perspective: bool
@@ -210,18 +232,6 @@ class Lifter:
             size = np.linalg.norm(S[:, a] - S[:, b], axis=1)
         held: Float32 = np.maximum(size, np.float32(1e-9))
         return held[:, None, None]
-
-    @staticmethod
-    def _sure(confidence: Float32, residual: Float32) -> Float32:
-        """Return confidence (n, p): the detector's, less what the residual takes from it.
-
-        A missing point counts half of the mean of those seen: the model guesses it from them.
-        """
-        seen = confidence > 0
-        mean = confidence.sum(1) / np.maximum(seen.sum(1), 1).astype(np.float32)
-        sure = np.where(seen, confidence, np.float32(0.5) * mean[:, None])
-        trust: Float32 = np.minimum(sure, 1) * np.maximum(1 - residual, 0)[:, None]
-        return trust
 
 
 def lift_all(lifter: Lifter, points: Float32, confidence: Float32) -> Lifted:
