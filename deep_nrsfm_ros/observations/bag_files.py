@@ -39,14 +39,21 @@ class Topic(NamedTuple):
         return self.type.replace("/msg/", "/")
 
 
+class Record(NamedTuple):
+    """A message as it was recorded: when, in ns, and its serialised bytes."""
+
+    time: int
+    raw: bytes
+
+
 class _Storage(Protocol):
     """What reads one bag or one of its files."""
 
     def topics(self) -> list[Topic]:
         """Return what is there."""
 
-    def messages(self, name: str) -> Iterator[bytes]:
-        """Yield the serialised messages of a topic; raise anything where the file is damaged."""
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic; raise anything where the file is damaged."""
 
     def close(self) -> None:
         """Free the file."""
@@ -71,11 +78,15 @@ class BagFile:
 
     def messages(self, topic: Topic) -> Iterator[bytes]:
         """Yield the serialised messages of `topic`, by time within each file."""
+        return (record.raw for record in self.records(topic))
+
+    def records(self, topic: Topic) -> Iterator[Record]:
+        """Yield the messages of `topic` with their times, by time within each file."""
         for storage in self._storages:
             try:
-                for raw in storage.messages(topic.name):
+                for record in storage.records(topic.name):
                     self._given[topic.name] += 1
-                    yield raw
+                    yield record
             except GeneratorExit:
                 raise
             except Exception as error:  # damaged files fail in many ways; what was read counts
@@ -145,11 +156,11 @@ class _Sound:
         """Return what is there."""
         return [Topic(c.topic, c.msgtype, c.msgcount) for c in self._reader.connections]
 
-    def messages(self, name: str) -> Iterator[bytes]:
-        """Yield the serialised messages of a topic."""
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic."""
         connections = [c for c in self._reader.connections if c.topic == name]
-        for _, _, raw in self._reader.messages(connections) if connections else ():
-            yield raw
+        for _, time, raw in self._reader.messages(connections) if connections else ():
+            yield Record(time, raw)
 
 
 class _CutMcap:
@@ -172,11 +183,11 @@ class _CutMcap:
         """Return what is there; how many messages is unknown."""
         return [Topic(c.topic, c.msgtype, 0) for c in self._reader.connections]
 
-    def messages(self, name: str) -> Iterator[bytes]:
-        """Yield the serialised messages of a topic up to the cut."""
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic up to the cut."""
         connections = [c for c in self._reader.connections if c.topic == name]
-        for _, _, raw in self._reader.messages_scan(connections):
-            yield raw
+        for _, time, raw in self._reader.messages_scan(connections):
+            yield Record(time, raw)
 
 
 class _CutSqlite:
@@ -195,12 +206,13 @@ class _CutSqlite:
         """Return what is there; how many messages is unknown."""
         return [Topic(name, kind, 0) for _, name, kind in self._topics]
 
-    def messages(self, name: str) -> Iterator[bytes]:
-        """Yield the serialised messages of a topic up to the cut."""
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic up to the cut."""
         wanted = {number for number, topic, _ in self._topics if topic == name}
-        for number, raw in self._file.execute("SELECT topic_id, data FROM messages"):
+        rows = self._file.execute("SELECT topic_id, timestamp, data FROM messages")
+        for number, time, raw in rows:
             if number in wanted:
-                yield raw
+                yield Record(time, raw)
 
     def close(self) -> None:
         """Free the file."""

@@ -78,7 +78,7 @@ def read_bags(
         raise BagError("no bag to read; name at least one")
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
-            chosen = _choose(bag, topic)
+            chosen = choose_topic(bag, topic)
             done = messages
             for raw in bag.messages(chosen):
                 messages += 1
@@ -109,7 +109,7 @@ def most_keypoints(paths: Sequence[Path], topic: str) -> int:
     reason = ""
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
-            chosen = _choose(bag, topic)
+            chosen = choose_topic(bag, topic)
             for raw in islice(bag.messages(chosen), _SAMPLE):
                 try:
                     message = _STORE.deserialize_cdr(raw, chosen.type)
@@ -157,10 +157,15 @@ class _Frames:
         return Ensemble(points, visible, self._map.target, source)
 
 
-def _choose(bag: BagFile, name: str) -> Topic:
-    """Return the topic called `name`, or the only one of a supported type."""
+def choose_topic(bag: BagFile, name: str) -> Topic:
+    """Return the topic called `name`, or the only one of a supported type.
+
+    The answers of a lifter are of such a type too, but they are known by their neighbours.
+    """
     listing = ", ".join(f"{t.name} [{t.input_type}]" for t in bag.topics) or "no topics"
-    found = [t for t in bag.topics if t.name == name or not name and t.input_type in INPUT_TYPES]
+    answers = {points.name for points, _ in answer_topics(bag)}
+    fit = [t for t in bag.topics if t.input_type in INPUT_TYPES and t.name not in answers]
+    found = [t for t in bag.topics if t.name == name] if name else fit
     if len(found) != 1:
         wanted = f"{len(found)} topics called {name}" if name else f"{len(found)} keypoint topics"
         raise BagError(f"bag {bag.path} has {wanted}; name one of: {listing}")
@@ -170,6 +175,17 @@ def _choose(bag: BagFile, name: str) -> Topic:
             f"it must be one of {', '.join(INPUT_TYPES)}"
         )
     return found[0]
+
+
+def answer_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
+    """Return the topics `points` and `camera_rotation` of every lifter that was recorded."""
+    topics = {topic.name: topic for topic in bag.topics}
+    pairs = []
+    for name, points in topics.items():
+        rotation = topics.get(f"{name.removesuffix('points')}camera_rotation")
+        if name.endswith("/points") and rotation:
+            pairs.append((points, rotation))
+    return pairs
 
 
 def _text(error: Exception) -> str:
@@ -254,11 +270,15 @@ def _triples(frame: Frame) -> NDArray[np.float32]:
 def _point_cloud(frame: Frame) -> Any:
     """Return the frame as a PointCloud2."""
     values = _triples(frame)
-    n, q = frame.confidence.shape
+    return point_cloud(_header(frame), values[..., :2], values[..., 2])
+
+
+def point_cloud(header: Any, points: NDArray[np.floating], confidence: NDArray[np.floating]) -> Any:
+    """Return points (n, q, 2 or 3) with confidence (n, q) as a PointCloud2 for a bag."""
+    n, q = confidence.shape
     fields = [_make("sensor_msgs/msg/PointField", name, at, 7, 1) for name, at in POINT_FIELDS]
-    data = np.frombuffer(pack_points(values[..., :2], values[..., 2]), np.uint8)
+    data = np.frombuffer(pack_points(points, confidence), np.uint8)
     size = (POINT_STEP, POINT_STEP * q)
-    header = _header(frame)
     return _make("sensor_msgs/msg/PointCloud2", header, n, q, fields, False, *size, data, False)
 
 
