@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_quaternion
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.observations.bag_files import BagError, BagFile, Topic, open_bag
-from deep_nrsfm_ros.observations.bags import STORAGES, answer_topics, point_cloud
+from deep_nrsfm_ros.observations.bag_files import BagError, BagFile, Topic, answer_topics, open_bag
+from deep_nrsfm_ros.observations.bags import STORAGES, point_cloud
 from deep_nrsfm_ros.observations.detections import Detections
 from deep_nrsfm_ros.observations.keypoint_files import stamp_of
 from deep_nrsfm_ros.observations.messages import read_points

@@ -131,6 +131,17 @@ def open_bag(path: Path) -> BagFile:
     return bag
 
 
+def answer_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
+    """Return the topics `points` and `camera_rotation` of every lifter that was recorded."""
+    topics = {topic.name: topic for topic in bag.topics}
+    pairs = []
+    for name, points in topics.items():
+        rotation = topics.get(f"{name.removesuffix('points')}camera_rotation")
+        if name.endswith("/points") and rotation:
+            pairs.append((points, rotation))
+    return pairs
+
+
 def _recorded_counts(path: Path) -> dict[str, int]:
     """Return the messages per topic that metadata.yaml speaks of, if it is there and sound."""
     with suppress(Exception):

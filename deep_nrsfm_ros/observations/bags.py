@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
-from deep_nrsfm_ros.observations.bag_files import BagError, BagFile, Topic, open_bag
+from deep_nrsfm_ros.observations.bag_files import BagError, BagFile, Topic, answer_topics, open_bag
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 from deep_nrsfm_ros.observations.messages import (
     INPUT_TYPES,
@@ -175,17 +175,6 @@ def choose_topic(bag: BagFile, name: str) -> Topic:
             f"it must be one of {', '.join(INPUT_TYPES)}"
         )
     return found[0]
-
-
-def answer_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
-    """Return the topics `points` and `camera_rotation` of every lifter that was recorded."""
-    topics = {topic.name: topic for topic in bag.topics}
-    pairs = []
-    for name, points in topics.items():
-        rotation = topics.get(f"{name.removesuffix('points')}camera_rotation")
-        if name.endswith("/points") and rotation:
-            pairs.append((points, rotation))
-    return pairs
 
 
 def _text(error: Exception) -> str:

@@ -19,7 +19,7 @@ class Detections:
 
     points: (m, q, 2), x right and y down; confidence: (m, q), 0 where missing: as `Observation`.
     frame: (m,) int64, ascending: the place among `stamps` of the frame that shows the object.
-    ids: (m,) int64: who it is, by the source; where that does not say, its place in its frame.
+    ids: (m,) str: who it is, by the source; where that does not say, its place in its frame.
     stamps: (f,) int64, ns, of all frames, those that show nobody among them.
     frame_id: the camera, "" if it is not known.
     """
@@ -27,7 +27,7 @@ class Detections:
     points: NDArray[np.float32]
     confidence: NDArray[np.float32]
     frame: NDArray[np.int64]
-    ids: NDArray[np.int64]
+    ids: NDArray[np.str_]
     stamps: NDArray[np.int64]
     frame_id: str = ""
 
@@ -72,7 +72,7 @@ def gather(
     stamps: Sequence[int] | NDArray[np.int64],
     keypoints: int,
     frame_id: str = "",
-    ids: Sequence[int] | None = None,
+    ids: Sequence[str] | None = None,
 ) -> Detections:
     """Return what each frame shows, in order, as one; `stamps` (f,) in ns.
 
@@ -88,7 +88,7 @@ def gather(
         points,
         confidence,
         np.repeat(np.arange(len(seen)), counts),
-        places if ids is None else np.asarray(ids, np.int64),
+        places.astype(str) if ids is None else np.asarray(ids, str),
         np.asarray(stamps, np.int64),
         frame_id,
     )

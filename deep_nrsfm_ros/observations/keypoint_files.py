@@ -173,7 +173,7 @@ def _coco(content: Any, keypoints: int, rate: float, min_confidence: float) -> D
     for row in rows:
         by_frame[frames[row["image_id"]]].append(row)
     seen = [_people(people, keypoints, min_confidence) for people in by_frame]
-    ids = [int(p.get("track_id", i)) for people in by_frame for i, p in enumerate(people)]
+    ids = [str(p.get("track_id", i)) for people in by_frame for i, p in enumerate(people)]
     return gather(seen, stamps_at(rate, len(seen)), keypoints, ids=ids)
 
 
@@ -212,7 +212,7 @@ def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Dete
         stamps = _numbers(arrays, "stamps", np.int64, (count,))
     else:
         stamps = stamps_at(rate, count)
-    ids = _numbers(arrays, "ids", np.int64, (m,)) if "ids" in arrays else _places(frame)
+    ids = arrays.get("ids", _places(frame)).astype(str)
     seen = observation(points, min_confidence)
     order = np.argsort(frame, kind="stable")
     return Detections(seen.points[order], seen.confidence[order], frame[order], ids[order], stamps)

@@ -77,7 +77,7 @@ def _document(recording: Recording, model: str) -> dict[str, Any]:
     ]
     for i in np.flatnonzero(sound).tolist():
         one = {name: _plain(values[i]) for name, values in recording.lifted._asdict().items()}
-        frames[seen.frame[i]]["objects"].append({"id": int(seen.ids[i]), **one})
+        frames[seen.frame[i]]["objects"].append({"id": str(seen.ids[i]), **one})
     return {
         "model": model,
         "keypoints": list(target.keypoints),

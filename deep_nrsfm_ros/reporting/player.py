@@ -43,7 +43,7 @@ class Stage:
         stamp: int,
         seen: Observation,
         lifted: Lifted | None = None,
-        ids: Sequence[int] | None = None,
+        ids: Sequence[str] | None = None,
     ) -> Scene:
         """Return a frame as the page wants it, short enough for thousands.
 
@@ -54,9 +54,11 @@ class Stage:
         `residual`.
         """
         objects = []
-        for i, (points, confidence) in enumerate(zip(*seen, strict=True)):
-            both = np.concatenate([_rounded(points, 5), _rounded(confidence[:, None], 2)], 1)
-            one: Scene = {"id": i if ids is None else int(ids[i]), "seen": _flat(both)}
+        for i, points in enumerate(seen.points):
+            both = np.concatenate(
+                [_rounded(points, 5), _rounded(seen.confidence[i, :, None], 2)], 1
+            )
+            one: Scene = {"id": str(i) if ids is None else ids[i], "seen": _flat(both)}
             if lifted is not None and np.isfinite(lifted.shapes[i]).all():
                 one |= self._lifted(Lifted(*(part[i] for part in lifted)))
             objects.append(one)
@@ -82,7 +84,7 @@ class Stage:
             "sure": _flat(_rounded(one.confidence, 2)),
             "place": _flat(_rounded(place, 4)),
             "size": round(size, 4),
-            "rotation": _flat(np.round(one.rotations, 4)) if known else None,
+            "rotation": _flat(np.round(one.rotations.astype(np.float64), 4)) if known else None,
             "residual": round(float(one.residual), 4) if np.isfinite(one.residual) else None,
         }
 
@@ -113,17 +115,18 @@ def stage_of(recording: Recording) -> Stage:
     return Stage(np.median(translation[known], 0), float(np.median(scale[known])))
 
 
-def scenes(recording: Recording, every: int = 1) -> Iterator[Scene]:
-    """Yield the frames of a recording, each `every`-th one."""
-    seen, lifted, stage = recording.seen, recording.lifted, stage_of(recording)
-    first = int(seen.stamps[0]) if len(seen.stamps) else 0
+def scenes(recording: Recording, every: int = 1, stage: Stage | None = None) -> Iterator[Scene]:
+    """Yield the frames of a recording, each `every`-th one.
+
+    stage: where its camera and objects stand, if it goes on from another recording.
+    """
+    seen, lifted, stage = recording.seen, recording.lifted, stage or stage_of(recording)
     ends = np.searchsorted(seen.frame, np.arange(len(seen.stamps) + 1))
     for frame in range(0, len(seen.stamps), every):
         rows = slice(ends[frame], ends[frame + 1])
         observation = Observation(seen.points[rows], seen.confidence[rows])
         there = Lifted(*(part[rows] for part in lifted))
-        stamp = int(seen.stamps[frame]) - first
-        yield stage.scene(stamp, observation, there, seen.ids[rows].tolist())
+        yield stage.scene(int(seen.stamps[frame]), observation, there, seen.ids[rows].tolist())
 
 
 def stride(recording: Recording, most: int) -> int:

@@ -72,7 +72,10 @@ def test_the_largest_alone(
         ]
     )
     frames = json.loads((tmp_path / "out.json").read_text())["frames"]
-    assert [[one["id"] for one in frame["objects"]] for frame in frames] == [[0]] * 3 + [[1], [0]]
+    assert [[one["id"] for one in frame["objects"]] for frame in frames] == [["0"]] * 3 + [
+        ["1"],
+        ["0"],
+    ]
     assert "5 of 5 objects in 5 frames lifted" in capsys.readouterr().out
 
 
