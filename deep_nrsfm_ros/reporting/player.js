@@ -70,7 +70,8 @@ function drawSeen() {
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.lineCap = "round";
   const frame = frames[index];
-  if (!frame || box[0] > box[2]) return;
+  if (!frame) return;
+  if (box[0] > box[2]) { write(pen, 12, 20, "none so far", "#888888"); return; }
   const zoom = Math.min((width - 30) / (box[2] - box[0] || 1), (height - 30) / (box[3] - box[1] || 1));
   const place = ([x, y]) => [width / 2 + zoom * (x - (box[0] + box[2]) / 2),
                              height / 2 + zoom * (y - (box[1] + box[3]) / 2)];

@@ -141,7 +141,7 @@ def recording_page(
     every = stride(recording, most)
     shown = list(scenes(recording, every))
     if every > 1:
-        notes = [*notes, f"{len(shown)} of {len(recording.seen.stamps)} frames: every {every}th"]
+        notes = [*notes, f"{len(shown)} of {len(recording.seen.stamps)} frames: one in {every}"]
     return _page(recording.source, recording.target, title, notes, shown)
 
 

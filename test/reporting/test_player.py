@@ -104,7 +104,7 @@ def test_unknown_scale_and_rotation_are_bearable() -> None:
 def test_long_recordings_are_thinned_and_say_so() -> None:
     recording = recording_of(100)
     text = recording_page(recording, "mine", most=30)
-    assert len(head_of(text)["frames"]) == 25 and "25 of 100 frames: every 4th" in text
+    assert len(head_of(text)["frames"]) == 25 and "25 of 100 frames: one in 4" in text
     assert stride(recording, 100) == 1
 
 
