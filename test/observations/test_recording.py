@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -149,6 +149,7 @@ def test_outputs_that_cannot_be_are_refused_at_once(tmp_path: Path) -> None:
             check_output(tmp_path / name)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_quaternions_and_rotations_are_the_same(seed: int) -> None:
     R = Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
