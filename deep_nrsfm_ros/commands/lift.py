@@ -21,6 +21,7 @@ from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.observations.detections import Detections
 from deep_nrsfm_ros.observations.keypoint_files import KINDS, read_keypoints
 from deep_nrsfm_ros.observations.lifted_files import check_output, write_recording
+from deep_nrsfm_ros.observations.mapping_file import read_mapping
 from deep_nrsfm_ros.observations.recording import Recording, lift_recording
 
 
@@ -42,6 +43,11 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what says how keypoints are read and lifted."""
     parser.add_argument("--topic", default="", help="keypoints in a bag (default: the only ones)")
     parser.add_argument(
+        "--mapping",
+        default="",
+        help="field mapping (.yaml) for messages in a bag of a type not known here",
+    )
+    parser.add_argument(
         "--rate",
         type=_positive,
         default=30.0,
@@ -53,7 +59,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("all", "largest"),
         help="lift everyone in a frame, or who is largest in the image (default: %(default)s)",
     )
-    add_arguments(parser, InputOptions, without=("input_type",))
+    add_arguments(parser, InputOptions, without=("input_type", "topics"))
     add_arguments(parser, LiftingOptions)
 
 
@@ -79,6 +85,8 @@ def read_objects(given: argparse.Namespace, source: KeypointLayout) -> Detection
             min_confidence=inputs.min_confidence,
             on_progress=on_progress,
             warn=warn,
+            mapping=read_mapping(Path(given.mapping).expanduser()) if given.mapping else None,
+            size=inputs.image_size,
         )
     return seen.largest() if given.objects == "largest" else seen
 

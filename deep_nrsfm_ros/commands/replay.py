@@ -127,8 +127,8 @@ def watch(given: argparse.Namespace, model: Model, source: KeypointLayout) -> No
         rclpy.init()
         try:
             topic = given.topic or "/keypoints"
-            names = (given.lifter, topic, source, model.layout, inputs.min_confidence)
-            rclpy.spin(Watcher(*names, show))
+            names = (given.lifter, topic, source, model.layout)
+            rclpy.spin(Watcher(*names, inputs.min_confidence, inputs.image_size, show))
         except ExternalShutdownException:
             raise KeyboardInterrupt from None
         finally:

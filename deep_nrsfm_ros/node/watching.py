@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -14,12 +13,15 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
+from deep_nrsfm_ros.node.message_types import message_class
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.observations.answers import Answer
 from deep_nrsfm_ros.observations.detections import gather
+from deep_nrsfm_ros.observations.field_mapping import Size
 from deep_nrsfm_ros.observations.keypoint_files import stamp_of
-from deep_nrsfm_ros.observations.messages import INPUT_TYPES, Observation, read, read_points
+from deep_nrsfm_ros.observations.messages import INPUT_TYPES, read, read_points
+from deep_nrsfm_ros.observations.observation import Observation
 from deep_nrsfm_ros.observations.recording import Recording, lifted_before
 
 _KEPT = 100  # observations that wait for their answers
@@ -41,13 +43,14 @@ class Watcher(Node):
         source: KeypointLayout,
         target: KeypointLayout,
         min_confidence: float,
+        size: Size | None,
         show: Callable[[Recording], None],
         context: Context | None = None,
     ) -> None:
         """Listen to the node called `lifter` and to the topic `keypoints`, whatever its type."""
         super().__init__("lifter_watcher", context=context)
         self._source, self._target, self._show = source, target, show
-        self._min_confidence = min_confidence
+        self._min_confidence, self._size = min_confidence, size
         self._seen: OrderedDict[int, Observation] = OrderedDict()  # by stamp; 0: has no header
         self._waiting: Answer | None = None
         self._keypoints = self.resolve_topic_name(keypoints)
@@ -63,10 +66,7 @@ class Watcher(Node):
         for name, types in self.get_topic_names_and_types():
             for kind in (kind.replace("/msg/", "/") for kind in types):
                 if name == self._keypoints and kind in INPUT_TYPES:
-                    package, word = kind.split("/")
-                    message = getattr(import_module(f"{package}.msg"), word)
-                    take = self._taker(kind)
-                    self.create_subscription(message, name, take, _QOS)
+                    self.create_subscription(message_class(kind), name, self._taker(kind), _QOS)
                     self.get_logger().info(f"listening to {name} ({kind})")
                     self._search.cancel()
                     return
@@ -76,7 +76,7 @@ class Watcher(Node):
 
         def take(message: Any) -> None:
             try:
-                seen = read(message, kind, len(self._source), self._min_confidence)
+                seen = read(message, kind, len(self._source), self._min_confidence, self._size)
             except ValueError as problem:
                 self._complain(str(problem))
                 return

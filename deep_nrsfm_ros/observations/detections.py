@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.observations.messages import Observation
+from deep_nrsfm_ros.observations.observation import Observation
 from deep_nrsfm_ros.observations.openpose import largest
 
 
@@ -76,22 +76,28 @@ def gather(
 ) -> Detections:
     """Return what each frame shows, in order, as one; `stamps` (f,) in ns.
 
-    keypoints: q, for recordings that show nobody. ids: of all objects, their places if None.
+    keypoints: q, for recordings that show nobody. ids: of all objects; None: those of the
+    observations, and the places of whom they do not name.
     """
     seen = list(observations)
     counts = [len(observation.confidence) for observation in seen]
     nothing = np.empty((0, keypoints), np.float32)
     points = np.concatenate([np.empty((0, keypoints, 2), np.float32), *(o.points for o in seen)])
     confidence = np.concatenate([nothing, *(o.confidence for o in seen)])
-    places = np.concatenate([np.empty(0, np.int64), *map(np.arange, counts)])
     return Detections(
         points,
         confidence,
         np.repeat(np.arange(len(seen)), counts),
-        places.astype(str) if ids is None else np.asarray(ids, str),
+        np.asarray(_names(seen) if ids is None else ids, str),
         np.asarray(stamps, np.int64),
         frame_id,
     )
+
+
+def _names(seen: Sequence[Observation]) -> list[str]:
+    """Return who the objects of all observations are: by name, or by place in the frame."""
+    named = ((o.ids or (None,) * len(o.confidence)) for o in seen)
+    return [str(i) if name is None else name for ids in named for i, name in enumerate(ids)]
 
 
 def stamps_at(rate: float, frames: int) -> NDArray[np.int64]:

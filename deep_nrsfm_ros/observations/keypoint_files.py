@@ -12,19 +12,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.observations.bag_files import SUFFIXES, open_bag
-from deep_nrsfm_ros.observations.bags import Progress, choose_topic
+from deep_nrsfm_ros.observations.bag_topics import keypoint_topics
+from deep_nrsfm_ros.observations.bags import Progress
 from deep_nrsfm_ros.observations.detections import Detections, gather, stamps_at
-from deep_nrsfm_ros.observations.messages import Observation, observation, read
+from deep_nrsfm_ros.observations.field_mapping import FieldMapping, Size
+from deep_nrsfm_ros.observations.messages import read
+from deep_nrsfm_ros.observations.observation import Observation, observation
 from deep_nrsfm_ros.observations.openpose import read_people
 
 KINDS = (
     "a bag (folder, .db3 or .mcap), an .npz with `points`, COCO keypoints (.json), a folder of "
     "OpenPose .json files, or OpenPose frames as .jsonl (.jsonl.gz)"
 )
-_STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 class KeypointFileError(ValueError):
@@ -40,18 +41,22 @@ def read_keypoints(
     min_confidence: float = 0.0,
     on_progress: Progress = lambda done, total: None,
     warn: Callable[[str], None] = lambda message: None,
+    mapping: FieldMapping | None = None,
+    size: Size | None = None,
 ) -> Detections:
     """Return everyone in a file or folder of `KINDS`, whichever it turns out to be.
 
     keypoints: q of the detector's layout. topic: of a bag; "" takes the only one that fits.
     rate: frames a second of files that have no stamps. min_confidence: below, a keypoint is
-    missing. Raises KeypointFileError or BagError, which name the file and what is wrong with it.
+    missing. mapping, size: of a bag, see `read_bag`. Raises KeypointFileError or BagError, which
+    name the file and what is wrong with it.
     """
     name = path.name.lower()
     if not path.exists():
         raise KeypointFileError(f"{path} does not exist")
     if is_bag(path):
-        return read_bag(path, topic, keypoints, min_confidence, on_progress, warn)
+        words = (on_progress, warn, mapping, size)
+        return read_bag(path, topic, keypoints, min_confidence, *words)
     try:
         if path.is_dir():
             files = sorted(path.glob("*.json"), key=_natural)
@@ -91,27 +96,32 @@ def read_bag(
     min_confidence: float = 0.0,
     on_progress: Progress = lambda done, total: None,
     warn: Callable[[str], None] = lambda message: None,
+    mapping: FieldMapping | None = None,
+    size: Size | None = None,
 ) -> Detections:
     """Return everyone on a topic of a bag ("": the only one that fits); raise BagError if none.
 
+    The topic may have a `*`, mapping and size are as in `bags.read_bags`.
     Stamps are those of the headers, or the time of recording where there is no header. Messages
     that cannot be read are left out; `warn` gets how many, and the reason of the first.
     """
     seen, stamps, reason, camera, count = [], [], "", "", 0
     with closing(open_bag(path)) as bag:
-        chosen = choose_topic(bag, topic)
-        for count, record in enumerate(bag.records(chosen), 1):
-            try:
-                message = _STORE.deserialize_cdr(record.raw, chosen.type)
-                seen.append(read(message, chosen.input_type, keypoints, min_confidence))
-                stamps.append(stamp_of(message) or record.time)
-                camera = camera or str(getattr(getattr(message, "header", None), "frame_id", ""))
-            except Exception as error:  # whatever bytes a bag holds, the others still count
-                reason = reason or str(error) or repr(error)
-            if count % 256 == 0:
-                on_progress(count, max(count, chosen.total))
-        if warning := bag.warning(chosen):
-            warn(warning)
+        for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
+            for record in bag.records(chosen):
+                count += 1
+                try:
+                    message = decode(record.raw)
+                    seen.append(read(message, kind, keypoints, min_confidence, size))
+                    stamps.append(stamp_of(message) or record.time)
+                    header = getattr(message, "header", None)
+                    camera = camera or str(getattr(header, "frame_id", ""))
+                except Exception as error:  # whatever bytes a bag holds, the others still count
+                    reason = reason or str(error) or repr(error)
+                if count % 256 == 0:
+                    on_progress(count, max(count, chosen.total))
+            if warning := bag.warning(chosen):
+                warn(warning)
     if not seen:
         raise KeypointFileError(f"no readable message in {path} ({count} found); {reason}")
     if len(seen) < count:

@@ -13,7 +13,7 @@ from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.observations.answers import Answer
 from deep_nrsfm_ros.observations.detections import Detections, gather
-from deep_nrsfm_ros.observations.messages import Observation
+from deep_nrsfm_ros.observations.observation import Observation
 
 _TOGETHER = 50_000_000  # ns within which an answer and keypoints are of one frame
 

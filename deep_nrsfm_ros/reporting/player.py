@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.observations.messages import Observation
+from deep_nrsfm_ros.observations.observation import Observation
 from deep_nrsfm_ros.observations.recording import Recording
 from deep_nrsfm_ros.reporting.drawing import edge_colours
 from deep_nrsfm_ros.reporting.template import embedded, render

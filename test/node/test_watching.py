@@ -42,7 +42,9 @@ def test_keypoints_and_answers_are_joined(
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     executor = SingleThreadedExecutor(context=context)
-    watcher = Watcher("/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, shown.append, context=context)
+    watcher = Watcher(
+        "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
+    )
     executor.add_node(watcher)
     try:
         second = 0
@@ -76,7 +78,9 @@ def test_odd_points_are_complained_of(domain: int, wrong: str) -> None:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     shown: list[Recording] = []
-    watcher = Watcher("/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, shown.append, context=context)
+    watcher = Watcher(
+        "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
+    )
     complaints: list[str] = []
     watcher._complain = complaints.append  # type: ignore[method-assign]
     odd = message(1)

@@ -14,7 +14,8 @@ from deep_nrsfm_ros.nrsfm.keypoints import COCO17
 from deep_nrsfm_ros.observations.bags import Frame, write_bag
 from deep_nrsfm_ros.observations.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.observations.keypoint_files import KeypointFileError, read_keypoints
-from deep_nrsfm_ros.observations.messages import MULTI_ARRAY, observation
+from deep_nrsfm_ros.observations.messages import MULTI_ARRAY
+from deep_nrsfm_ros.observations.observation import observation
 
 Q = len(COCO17)
 COUNTS = (1, 0, 2, 3, 1)  # objects in each frame

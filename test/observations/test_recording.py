@@ -26,11 +26,11 @@ from deep_nrsfm_ros.observations.answers import (
     write_answers,
 )
 from deep_nrsfm_ros.observations.bag_files import BagError, answer_topics, open_bag
-from deep_nrsfm_ros.observations.bags import choose_topic
+from deep_nrsfm_ros.observations.bag_topics import keypoint_topics
 from deep_nrsfm_ros.observations.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.observations.keypoint_files import read_keypoints
 from deep_nrsfm_ros.observations.lifted_files import check_output, write_recording
-from deep_nrsfm_ros.observations.messages import Observation, observation
+from deep_nrsfm_ros.observations.observation import Observation, observation
 from deep_nrsfm_ros.observations.recording import Recording, lift_recording, lifted_before
 
 COUNTS = (2, 0, 1, 1)
@@ -108,8 +108,8 @@ def test_a_lifter_is_known_by_its_topics(tmp_path: Path, recording: Recording) -
     write_answers(tmp_path / "bag", recording.seen, recording.lifted)
     with closing(open_bag(tmp_path / "bag")) as bag:
         assert [points.name for points, _ in answer_topics(bag)] == [POINTS]
-        assert choose_topic(bag, "").name == KEYPOINTS
-        assert choose_topic(bag, POINTS).name == POINTS
+        for name, expected in (("", KEYPOINTS), (POINTS, POINTS)):
+            assert [found.topic.name for found in keypoint_topics(bag, name, None)] == [expected]
 
 
 def test_npz_holds_every_object(tmp_path: Path, recording: Recording) -> None:

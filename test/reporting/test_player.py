@@ -14,7 +14,7 @@ from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.observations.detections import gather, stamps_at
-from deep_nrsfm_ros.observations.messages import Observation
+from deep_nrsfm_ros.observations.observation import Observation
 from deep_nrsfm_ros.observations.recording import Recording
 from deep_nrsfm_ros.reporting.player import recording_page, scenes, stride
 
