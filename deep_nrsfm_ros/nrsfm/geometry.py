@@ -199,3 +199,17 @@ def quaternion(R: Floats) -> Floats:
         q[3] = R[k, j] - R[j, k]
     q /= np.linalg.norm(q) * (1 if q[3] >= 0 else -1)
     return q
+
+
+def rotation_from_quaternion(q: Floats) -> Floats:
+    """Return the rotation matrix (3, 3) of a quaternion (x, y, z, w) of any length but 0."""
+    x, y, z, w = q / np.linalg.norm(q)
+    half = np.array(
+        [
+            [-y * y - z * z, x * y - w * z, x * z + w * y],
+            [x * y + w * z, -x * x - z * z, y * z - w * x],
+            [x * z - w * y, y * z + w * x, -x * x - y * y],
+        ]
+    )
+    R: Floats = np.eye(3) + 2 * half
+    return R

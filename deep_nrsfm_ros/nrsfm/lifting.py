@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -234,10 +235,21 @@ class Lifter:
         return held[:, None, None]
 
 
-def lift_all(lifter: Lifter, points: Float32, confidence: Float32) -> Lifted:
-    """Lift any number of objects, a few at a time: many at once leave the processor's cache."""
-    starts = range(0, len(points), _BLOCK) or (0,)
-    parts = [lifter(points[i : i + _BLOCK], confidence[i : i + _BLOCK]) for i in starts]
+def lift_all(
+    lifter: Lifter,
+    points: Float32,
+    confidence: Float32,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Lifted:
+    """Lift any number of objects, a few at a time: many at once leave the processor's cache.
+
+    on_progress: called with how many are done and how many there are.
+    """
+    parts = []
+    for start in range(0, len(points), _BLOCK) or (0,):
+        end = min(start + _BLOCK, len(points))
+        parts.append(lifter(points[start:end], confidence[start:end]))
+        on_progress(end, len(points))
     return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
