@@ -4,11 +4,10 @@
     python mediapipe_detector.py --ros-args -p source:=0
     ros2 run deep_nrsfm_ros lifter --ros-args -p keypoint_layout:=mediapipe33
 
-The wheel carries the weights of the pose model and brings OpenCV. For every image `keypoints`
-(sensor_msgs/PointCloud2) holds the 33 landmarks of one person: x right and y down in pixels,
-confidence = MediaPipe's visibility; height 0 where nobody is seen. The stamp is the image's time:
-of a topic its own, of a camera when it came, of files their place in the video from the start on.
-It needs nothing of deep_nrsfm_ros: copy it, and put your own detector in the place of `Detector`.
+The wheel has the weights and brings OpenCV. For every image `keypoints` (sensor_msgs/PointCloud2)
+holds the 33 landmarks of one person, x and y in pixels and confidence = MediaPipe's visibility, or
+nothing (height 0). The stamp is the image's: a topic's own; when it came, of a camera; of a file,
+the start plus its place in the video. Copy this, and put your own detector in place of `Detector`.
 """
 
 from __future__ import annotations
@@ -36,7 +35,6 @@ from rclpy.time import Time
 from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
-Floats = NDArray[np.float32]
 RGB = NDArray[np.uint8]  # (height, width, 3)
 
 PARAMETERS: dict[str, tuple[Any, str]] = {
@@ -52,11 +50,11 @@ ENCODINGS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "mono8": (1, [0, 0,
 
 
 class Detection(NamedTuple):
-    """The landmarks of one person."""
+    """The landmarks of one person; x right, y down, z forward."""
 
-    points: Floats  # (33, 2) pixels
-    confidence: Floats  # (33,) visibility, 0 to 1
-    world: Floats  # (33, 3) MediaPipe's own 3D, metres about the hips: x right, y down, z forward
+    points: NDArray[np.float32]  # (33, 2) pixels
+    confidence: NDArray[np.float32]  # (33,) visibility, 0 to 1
+    world: NDArray[np.float32]  # (33, 3) MediaPipe's own 3D, metres about the hips
 
 
 class Detector:
@@ -99,8 +97,7 @@ def rgb(message: Image) -> RGB:
         raise ValueError(f"image is {kind!r}; expected one of {', '.join(ENCODINGS)}")
     depth, places = ENCODINGS[kind]
     if not height * width or step < width * depth or len(message.data) != height * step:
-        size = f"{len(message.data)} bytes, {step} a row"
-        raise ValueError(f"image of {width} x {height} pixels, {kind!r}, has {size}")
+        raise ValueError(f"image of {width} x {height} pixels ({kind}) has a wrong step or size")
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * depth]
     return np.ascontiguousarray(rows.reshape(height, width, depth)[..., places])
 
@@ -109,16 +106,11 @@ def cloud(found: Detection | None, header: Header) -> PointCloud2:
     """Return the message: a row of points for a person, no row for nobody."""
     rows = [] if found is None else [np.column_stack([found.points, found.confidence])]
     names = enumerate(("x", "y", "confidence"))
-    return PointCloud2(
-        header=header,
-        height=len(rows),
-        width=LANDMARKS,
-        fields=[PointField(name=n, offset=4 * i, datatype=7, count=1) for i, n in names],
-        point_step=12,
-        row_step=12 * LANDMARKS,
-        data=array("B", np.array(rows, "<f4").tobytes()),
-        is_dense=True,
-    )
+    fields = [PointField(name=n, offset=4 * i, datatype=7, count=1) for i, n in names]
+    message = PointCloud2(header=header, height=len(rows), width=LANDMARKS, fields=fields)
+    message.point_step, message.row_step, message.is_dense = 12, 12 * LANDMARKS, True
+    message.data = array("B", np.array(rows, "<f4").tobytes())
+    return message
 
 
 class DetectorNode(Node):
@@ -157,11 +149,10 @@ class DetectorNode(Node):
         if image is None:
             self.finished.set_result(None)
             return
-        stamp = now = self.get_clock().now().nanoseconds
-        if not self._live:
-            self._start = self._start or now
-            stamp = self._start + round(seconds * 1e9)
-            time.sleep(max(0, stamp - now) / 1e9)
+        now = self.get_clock().now().nanoseconds
+        self._start = self._start or now
+        stamp = now if self._live else self._start + round(seconds * 1e9)
+        time.sleep(max(0, stamp - now) / 1e9)
         header = Header(stamp=Time(nanoseconds=stamp).to_msg(), frame_id=self._given["frame_id"])
         self._publish(image, header)
 
