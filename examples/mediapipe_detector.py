@@ -119,10 +119,11 @@ class DetectorNode(Node):
     def __init__(self) -> None:
         """Declare the parameters and open the source; raise ValueError if there is none."""
         super().__init__("detector")
+        self._given = {}
         for name, (default, text) in PARAMETERS.items():
-            described = ParameterDescriptor(description=text, read_only=True)
-            self.declare_parameter(name, default, described)
-        self._given = {name: self.get_parameter(name).value for name in PARAMETERS}
+            # Of dynamic type, as `source:=0` and `rate:=30` are integers to ROS.
+            kind = ParameterDescriptor(description=text, read_only=True, dynamic_typing=True)
+            self._given[name] = type(default)(self.declare_parameter(name, default, kind).value)
         self.finished = Future()
         self._detect = Detector(self._given["smooth"])
         self._begun, self._start, self._persons = False, 0, 0

@@ -224,11 +224,12 @@ def test_a_topic_keeps_its_header_and_outlives_bad_images(start: Any, ears: Ears
     assert "image is 'yuv'; expected one of rgb8, bgr8, mono8" in said
 
 
-def test_a_bad_source_is_a_message(start: Any) -> None:
-    process = start(source="nowhere.mp4")
+@pytest.mark.parametrize("source", ["nowhere.mp4", 99])
+def test_a_bad_source_is_a_message(start: Any, source: Any) -> None:
+    process = start(source=source, rate=30)
     said = process.communicate(timeout=DEADLINE)[0]
     assert process.returncode == 1 and "Traceback" not in said
-    assert "detector: source 'nowhere.mp4' is no video" in said
+    assert f"detector: source '{source}' is no video" in said
 
 
 def test_the_real_one_sees_the_person(tmp_path: Path) -> None:
