@@ -1,4 +1,5 @@
 # make demo        from a fresh clone to the picture
+# make demo-live   from videos to 3D, with MediaPipe Pose as the detector
 # make test        environment, lint, types and all tests
 # make lint        lint and types only
 # make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
@@ -18,11 +19,16 @@ BENCHMARKS := nrsfm_on_cmu mirror ablation unseen noise missing structure_from_c
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
+# Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
+EXAMPLES_READY := .venv/.ready-examples
 
-.PHONY: demo test lint benchmark lock clean
+.PHONY: demo demo-live test lint benchmark lock clean
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
+
+demo-live: $(EXAMPLES_READY)
+	$(PYTHON) -m examples.demo_live
 
 test: lint
 	$(PYTHON) -m pytest
@@ -47,6 +53,13 @@ $(READY): requirements.lock setup.py
 	$(PYTHON) -m pip install --no-deps --no-build-isolation --editable .
 	touch $@
 
+$(EXAMPLES_READY): $(READY)
+	@$(PYTHON) -c 'import sys; sys.version_info < (3, 13) or sys.exit( \
+	    "MediaPipe 0.10.14 is made for Python 3.10 to 3.12 and .venv has %d.%d; choose one: " \
+	    "rm -rf .venv; make PYTHON3=python3.12 demo-live" % sys.version_info[:2])'
+	$(PYTHON) -m pip install --constraint requirements.lock --no-build-isolation --editable '.[examples]'
+	touch $@
+
 # Left out: the CUDA wheels, which torch itself pins, on the machines that want them.
 lock:
 	rm -rf build/lock && $(LOCK_PYTHON) -m venv build/lock
@@ -64,4 +77,4 @@ lock:
 clean:
 	rm -rf build install log dist demo_output .hypothesis .pytest_cache .ruff_cache .mypy_cache
 	rm -rf *.egg-info
-	find deep_nrsfm_ros benchmarks test launch -name __pycache__ -type d -prune -exec rm -rf {} +
+	find deep_nrsfm_ros benchmarks examples test launch -name __pycache__ -type d -prune -exec rm -rf {} +

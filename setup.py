@@ -57,5 +57,8 @@ setup(
             "matplotlib",  # the demo's picture and the benchmarks' plots
             "scipy",  # the demo's ground truth: triangulation from four calibrated cameras
         ],
+        "examples": [
+            "mediapipe==0.10.14",  # the detector; this wheel carries the weights of its pose model
+        ],
     },
 )

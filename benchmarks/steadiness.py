@@ -17,7 +17,7 @@ from deep_nrsfm_ros.node.model_folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.keypoints import BODY25, BODY25B, HUMAN17, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, lift_all
-from deep_nrsfm_ros.nrsfm.metrics import procrustes_distances
+from deep_nrsfm_ros.nrsfm.metrics import degrees, procrustes_distances
 from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.steadying import Steadying, SteadyingOptions
 from deep_nrsfm_ros.observations.mocap import human17, read_amc, read_asf, trials
@@ -150,10 +150,9 @@ def figures(lifted: Lifted, steady: Lifted, clip: Clip) -> dict[str, float]:
     """Return the `FIGURES` of the answers `steady` of a filter to what was lifted."""
     S, R = steady.shapes.astype(float), steady.rotations
     S = S / np.sqrt((S * S).sum(2).mean(1))[:, None, None]
-    traces = (R[1:] * R[:-1]).sum((1, 2))
-    turns = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+    turns = degrees(R[1:] @ R[:-1].swapaxes(1, 2))
     shown: dict[str, float] = {
-        "rotation deg": np.nanmedian(turns),
+        "rotation deg": float(np.nanmedian(turns)),
         "points %": 100 * _middle(np.diff(S, axis=0)),
         "shake %": 100 * _middle(np.diff(S, 2, axis=0)),
     }

@@ -73,14 +73,19 @@ def camera_errors(shapes: Floats, truth: Floats) -> CameraErrors:
     S, T = centre(shapes[known].astype(float)), centre(truth[known])
     scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
     apart = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
-    turn = align(S, T).rotation
-    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
     return CameraErrors(
         float(procrustes_distances(S, T).mean()),
         float(apart.mean()),
-        float(np.degrees(np.median(angle))),
+        float(np.median(degrees(align(S, T).rotation))),
         float(align(S, T, allow_reflection=True).mirrored.mean()),
     )
+
+
+def degrees(turns: Floats) -> Floats:
+    """Return the angles (...) of rotations (..., 3, 3)."""
+    cosine = (np.trace(turns, axis1=-2, axis2=-1) - 1) / 2
+    angles: Floats = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    return angles
 
 
 def signed_volumes(S: Floats, layout: KeypointLayout) -> Floats:

@@ -31,6 +31,7 @@ _CALIBRATION = re.compile(r".*S00_Demo_Session/S00_Calibration/Calib\.qca\.txt")
 _DETECTION = re.compile(
     r".*S00_Demo_Session/.*BalancingTrial/pose/(cam\d+)_json/cam\d+\.(\d+)\.json"
 )
+_VIDEO = re.compile(r".*S00_Demo_Session/.*_(\w+)Trial/videos/(cam\d+)\.mp4")
 _SUBPIXELS = 64  # Qualisys counts 64 to a pixel
 # How far refinement may easily go from the calibration, which also holds the free scale.
 _PRIOR = np.array([0.02, 0.02, 0.02, 100, 100, 100, 2])  # rad, mm, frames
@@ -96,6 +97,26 @@ def read_session(wheel: Path) -> Session:
         truth[known == 0] = np.nan
         views.append(View(camera, seen.points, seen.confidence, delay, camera.to_camera(truth)))
     return Session(tuple(views), world, _summary(errors), _summary(given))
+
+
+def extract_videos(wheel: Path, trial: str, folder: Path) -> dict[str, Path]:
+    """Write the videos of the "Balancing" or the "Static" trial to a folder; return camera -> file.
+
+    Raises ValueError when the file is no wheel with such videos in it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    videos = {}
+    try:
+        with zipfile.ZipFile(wheel) as archive:
+            for match in filter(None, map(_VIDEO.fullmatch, sorted(archive.namelist()))):
+                if match[1] == trial:
+                    videos[match[2]] = folder / f"{match[2]}.mp4"
+                    videos[match[2]].write_bytes(archive.read(match[0]))
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"{wheel} is damaged: {error}; download it again") from None
+    if not videos:
+        raise ValueError(f"{wheel} is not pose2sim 0.6.0: no videos of the trial {trial!r}")
+    return videos
 
 
 def _cameras(archive: zipfile.ZipFile) -> list[Camera]:

@@ -13,7 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -106,9 +106,17 @@ def run(given: argparse.Namespace) -> None:
 
 
 def evaluate(
-    session: Session, played: list[Played], layout: KeypointLayout, bag: Path, picture: Path
+    session: Session,
+    played: list[Played],
+    layout: KeypointLayout,
+    bag: Path,
+    picture: Path,
+    detector: KeypointLayout = BODY25B,
 ) -> None:
-    """Print the table and draw the picture, from what the bag holds of the lifter's answers."""
+    """Print the table and draw the picture, from what the bag holds of the lifter's answers.
+
+    detector: layout of the points of the session's views.
+    """
     points = read_points(bag)
     limbs = [layout.index(joint) for joint in JOINTS]
     print(table(session, played, points, limbs), flush=True)
@@ -126,7 +134,7 @@ def evaluate(
                 view.truth[frame],
             )
         )
-    draw(panels, BODY25B, layout, JOINTS, picture)
+    draw(panels, detector, layout, JOINTS, picture)
     say(f"answers in {bag}, picture in {picture}")
 
 
@@ -165,7 +173,11 @@ def say(text: str) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the demo; exit code 1 says that something went wrong, 130 that it was stopped."""
-    given = arguments().parse_args(argv)
+    launch(run, arguments().parse_args(argv))
+
+
+def launch(run: Callable[[argparse.Namespace], None], given: argparse.Namespace) -> None:
+    """Run a demo on a DDS domain of its own, with the exit codes of `main`."""
     # A shell that starts a job in the background has it ignore SIGINT, unless it says otherwise.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
@@ -177,7 +189,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except DemoError as error:
-        sys.exit(f"demo: {error}; the lifter's log is {given.output / LOG}")
+        sys.exit(f"demo: {error}; the logs are in {given.output}")
     except (OSError, ValueError) as error:
         sys.exit(f"demo: {error}")
 

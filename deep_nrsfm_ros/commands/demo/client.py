@@ -9,7 +9,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -37,15 +37,24 @@ class DemoError(RuntimeError):
     """The demo cannot go on; says why."""
 
 
+def lifter(
+    parameters: Mapping[str, Any], log: Path
+) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    """Run the lifter as `node` does."""
+    return node("deep_nrsfm_ros.node.lifter", parameters, log)
+
+
 @contextmanager
-def lifter(parameters: Mapping[str, Any], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the lifter as a process of its own, its output in the file `log`; end it at the end."""
-    command = [sys.executable, "-m", "deep_nrsfm_ros.node.lifter", "--ros-args"]
+def node(
+    module: str, parameters: Mapping[str, Any], log: Path
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a node as a process of its own, its output in the file `log`; end it at the end."""
+    command = [sys.executable, "-m", module, "--ros-args"]
     for name, value in parameters.items():
         command += ["-p", f"{name}:={value}"]
     with log.open("wb") as output:
         process = subprocess.Popen(
-            # A session of its own: Ctrl-C reaches the demo alone, which then ends the lifter.
+            # A session of its own: Ctrl-C reaches the demo alone, which then ends the node.
             command,
             stdout=output,
             stderr=subprocess.STDOUT,
@@ -85,13 +94,13 @@ class Client:
     health, training: values of the newest diagnostics and training status.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes], source: Path, bag: Path) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], source: Path | None, bag: Path) -> None:
         """Connect to the lifter that runs as `process`.
 
         source: bag to play, PointCloud2 messages on one topic. bag: must not exist yet.
         """
         self._process = process
-        self._messages = _by_camera(source)
+        self._messages = _by_camera(source) if source else {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("demo", context=self._context)
@@ -136,13 +145,21 @@ class Client:
         Raises DemoError if none of them is answered.
         """
         messages, sent = self._messages[camera], {}
-        self._received.clear()
-        self._errors.clear()
+        self._forget()
         begin = time.perf_counter() - messages[0][0] / 1e9
         for stamp, raw in messages:
             self._spin_until(begin + stamp / 1e9)
             sent[stamp] = time.perf_counter()
             self._publisher.publish(raw)
+        return self._played(sent)
+
+    def _forget(self) -> None:
+        """Forget what was answered so far."""
+        self._received.clear()
+        self._errors.clear()
+
+    def _played(self, sent: Mapping[int, float]) -> Played:
+        """Hear the next diagnostics and return how messages, time by stamp, were answered."""
         reports = len(self._errors)
         self.wait(lambda: len(self._errors) > reports, "diagnostics")
         received = {stamp: at for stamp, at in self._received.items() if stamp in sent}

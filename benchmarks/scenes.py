@@ -1,0 +1,105 @@
+"""Pose2Sim's demo session for a benchmark: what four cameras, MediaPipe and the truth say of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from deep_nrsfm_ros.commands.demo.__main__ import fetch_wheel
+from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
+from deep_nrsfm_ros.nrsfm.keypoints import MEDIAPIPE33
+from deep_nrsfm_ros.observations.cameras import triangulate
+from deep_nrsfm_ros.observations.pose2sim import JOINTS, View, extract_videos, read_session
+
+Floats = NDArray[Any]
+
+CACHE = Path(".cache")
+"""Where the demo keeps what it has fetched."""
+LIMBS = [MEDIAPIPE33.index(joint) for joint in JOINTS]
+
+
+class Seen(NamedTuple):
+    """What MediaPipe made of the f images of a video; NaN and confidence 0 where nobody was."""
+
+    points: Floats  # (f, 33, 2) pixels
+    confidence: Floats  # (f, 33)
+    world: Floats  # (f, 33, 3) metres, camera axes
+    seconds: Floats  # (f,) that it took
+
+
+class Scene(NamedTuple):
+    """What one camera saw of one trial.
+
+    truth: (f, 12, 3) mm, `JOINTS` in the camera's axes. given: the detections that come with it.
+    """
+
+    camera: str
+    intrinsics: Intrinsics
+    truth: Floats
+    seen: Seen
+    given: View | None
+
+
+def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]:
+    """Return the two trials, and the mean pixels by which their truths miss the detections."""
+    wheel = fetch_wheel(CACHE)
+    session = read_session(wheel)
+    cameras = [view.camera for view in session.views]
+    moving = watch_trial(wheel, "Balancing", output)
+    balancing = [
+        Scene(view.camera.name, view.camera.intrinsics, view.truth, moving[view.camera.name], view)
+        for view in session.views
+    ]
+    still = watch_trial(wheel, "Static", output)
+    standing = [still[camera.name] for camera in cameras]
+    plain = zip(cameras, standing, strict=True)
+    points = np.stack([camera.undistort(seen.points[:, LIMBS]) for camera, seen in plain])
+    weights = np.stack([seen.confidence[:, LIMBS] for seen in standing]).astype(float)
+    world, missed = triangulate([c.without_lens() for c in cameras], points, weights)
+    truths = [
+        Scene(camera.name, camera.intrinsics, camera.to_camera(world), seen, None)
+        for camera, seen in zip(cameras, standing, strict=True)
+    ]
+    pixels = float(np.nanmean(np.linalg.norm(missed, axis=-1)))
+    return balancing, truths, (session.pixels[0], pixels)
+
+
+def watch_trial(wheel: Path, trial: str, output: Path) -> dict[str, Seen]:
+    """Return what MediaPipe sees in the videos of a trial; what is in the output is not run again.
+
+    Raises ValueError where MediaPipe is wanted and is not installed.
+    """
+    folder = output / "mediapipe-0.10.14" / trial
+    found = {}
+    for camera, video in extract_videos(wheel, trial, folder).items():
+        kept, partial = folder / f"{camera}.npz", folder / f"{camera}_partial.npz"
+        if not kept.exists():
+            np.savez(partial, **watch(video)._asdict())
+            partial.replace(kept)
+        with np.load(kept) as arrays:
+            found[camera] = Seen(*(arrays[name] for name in Seen._fields))
+    return found
+
+
+def watch(video: Path) -> Seen:
+    """Run MediaPipe on a video."""
+    try:
+        from examples.mediapipe_detector import LANDMARKS, Detector, images
+    except ImportError as error:
+        raise ValueError(f"{error}; `make demo-live` installs MediaPipe") from None
+    detect = Detector()
+    nobody = (np.full((LANDMARKS, 2), np.nan), np.zeros(LANDMARKS), np.full((LANDMARKS, 3), np.nan))
+
+    def frames() -> Iterator[tuple[Floats, Floats, Floats, float]]:
+        for _, image in tqdm(images(str(video)), desc=f"MediaPipe on {video.name}"):
+            begin = time.perf_counter()
+            found = detect(image) or nobody
+            yield *found, time.perf_counter() - begin
+
+    return Seen(*(np.array(part) for part in zip(*frames(), strict=True)))

@@ -1,0 +1,1 @@
+"""Examples: what to put before the lifter."""
