@@ -115,6 +115,7 @@ def _spread(S: Floats, visible: NDArray[np.bool_]) -> float:
     a, b = np.array(HUMAN17.edge_indices()).T
     lengths = np.linalg.norm(S[:, a] - S[:, b], axis=2)
     shares = lengths / lengths.sum(1, keepdims=True)
-    shares[~(visible[:, a] & visible[:, b])] = np.nan
-    low, middle, high = np.nanpercentile(shares, (16, 50, 84), axis=0)
+    seen = visible[:, a] & visible[:, b]
+    shares[~seen] = np.nan
+    low, middle, high = np.nanpercentile(shares[:, seen.any(0)], (16, 50, 84), axis=0)
     return float(np.mean((high - low) / 2 / middle))

@@ -43,11 +43,11 @@ from deep_nrsfm_ros.observations.openpose import read_people
 
 TOPIC = "/keypoints"
 VIDEO = "detections/long_video_body25.jsonl.gz"
-VIDEO_RATE = 30.0
+VIDEO_RATE, CMU_RATE = 30.0, 120.0
 EXCAVATOR = Path(__file__).parents[1] / "config/objects/excavator.yaml"
 WORK, WORK_LATER = 6000, 1500
 """Frames of the machine to learn from, and of other work to lift."""
-STEPS = {"video": 30_000, "tuned": 5000, "machine": 10_000, "mocap": 6000}
+STEPS = {"video": 30_000, "tuned": 1000, "machine": 8000, "mocap": 3000}
 QUALITY = {
     "reprojection": "label-free, from the training's report: error of the network alone",
     "cycle": "label-free: error of reconstructing its own shapes seen from elsewhere",
@@ -69,6 +69,7 @@ class Session(NamedTuple):
     data: Path
     output: Path
     steps: int | None  # instead of STEPS
+    stride: int  # every n-th frame of the motion capture
 
     @property
     def models(self) -> Path:
@@ -87,7 +88,8 @@ class Session(NamedTuple):
     def named(self, title: str, kind: str) -> tuple[str, int]:
         """Return name and steps of a training."""
         steps = self.steps or STEPS[kind]
-        return f"{title}_{steps}", steps
+        every = f"_every_{self.stride}" if kind == "mocap" and self.stride > 1 else ""
+        return f"{title}_{steps}{every}", steps
 
     def trained(self, title: str, kind: str, *words: str) -> Model:
         """Return the model that the program `train` makes, told by `words` what else to do."""
@@ -131,7 +133,7 @@ def video(session: Session) -> Table:
     table = Table(
         "from_video",
         f"A real video of {len(seen)} people in {bag.name}",
-        ("lifted by",),
+        ("lifted by", "steps"),
         (*anatomy.FIGURES, "residual %", "unlike human %", "mirrored to human %", *QUALITY),
         anatomy.FIGURES | legend | QUALITY,
         lambda _, figure: anatomy.draw(figure, kept, shapes, chosen),
@@ -144,10 +146,10 @@ def video(session: Session) -> Table:
             "unlike human %": 100 * unlike.proper,
             "mirrored to human %": 100 * unlike.mirrored,
         }
-        table.add((name,), row | _quality(model))
+        table.add((name, str(model.provenance["step"])), row | _quality(model))
     flat = np.concatenate((kept.points, np.zeros_like(kept.points[..., :1])), -1)
     unturned = anatomy.figures(flat, kept.visible)
-    table.add(("no depth",), {name: unturned[name] for name in ("bones %", "depth %")})
+    table.add(("no depth", ""), {name: unturned[name] for name in ("bones %", "depth %")})
     return table
 
 
@@ -169,7 +171,7 @@ def machine(session: Session) -> Table:
     table = Table(
         "from_excavator",
         "A synthetic excavator",
-        ("bag", "frames", "lifted by"),
+        ("bag", "frames", "lifted by", "steps"),
         (*_SHOWN, "metres", *QUALITY),
         _SHOWN | legend | QUALITY,
         bars("shape %", "proper %"),
@@ -181,17 +183,19 @@ def machine(session: Session) -> Table:
         distances = np.linalg.norm(align(lifted.shapes, truth).aligned - truth, axis=2)
         row = _errors(lifted.shapes, truth) | {"metres": float(distances.mean())}
         labels = (name, str(len(seen)))
-        table.add((*labels, model.name), row | _quality(model))
-        table.add((*labels, "rigid"), _errors(rigid(seen.points), truth))
+        steps = str(model.provenance["step"])
+        table.add((*labels, "this machine's model", steps), row | _quality(model))
+        table.add((*labels, "rigid", ""), _errors(rigid(seen.points), truth))
     return table
 
 
 def mocap(session: Session) -> Table:
     """Train on CMU 01 from a bag through ~/train, and from the motion capture directly."""
     folder = session.data / "cmu"
-    truth = read_split(folder, ["01"], "train", CMU31)
-    bag = session.bag("cmu01_bag", lambda: _frames(truth, 120.0))
-    words = ("--cmu", str(folder), "--subjects", "01", "--object", CMU31.name)
+    truth = read_split(folder, ["01"], "train", CMU31, stride=session.stride)
+    bag = session.bag(f"cmu01_{session.stride}_bag", lambda: _frames(truth, CMU_RATE))
+    every = ("--stride", str(session.stride))
+    words = ("--cmu", str(folder), "--subjects", "01", "--object", CMU31.name, *every)
     models = {
         "train --cmu": session.trained("direct", "mocap", *words),
         "~/train, as the motion capture is": _served(session, "served", bag, UNTOUCHED),
@@ -199,8 +203,8 @@ def mocap(session: Session) -> Table:
     }
     table = Table(
         "from_mocap",
-        f"CMU 01, the paper's {len(truth)} frames",
-        ("trained by", "frames", "lifted"),
+        f"CMU 01, {len(truth)} frames of the paper's trials",
+        ("trained by", "frames", "steps", "lifted"),
         (*_SHOWN, *QUALITY),
         _SHOWN | QUALITY,
         bars("shape %", "proper %"),
@@ -208,8 +212,8 @@ def mocap(session: Session) -> Table:
     for name, model in models.items():
         for way in ("network alone", "as shipped"):
             found = errors_in_words(evaluate(model, truth, LIFTING[way]))
-            labels = (name, str(model.provenance["frames"]), way)
-            table.add(labels, {key: found[key] for key in _SHOWN} | _quality(model))
+            trained = (str(model.provenance[key]) for key in ("frames", "step"))
+            table.add((name, *trained, way), {key: found[key] for key in _SHOWN} | _quality(model))
     return table
 
 
@@ -289,8 +293,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of detections/ and cmu/")
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks/from_bags"))
     parser.add_argument("--steps", type=int, help="for all trainings: a quick look")
+    parser.add_argument("--stride", type=int, default=1, help="take every n-th CMU frame only")
     given = parser.parse_args(argv)
-    session = Session(given.data, given.output, given.steps)
+    session = Session(given.data, given.output, given.steps, given.stride)
     # A domain of its own, and never beyond this machine.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(random.randrange(1, 102))

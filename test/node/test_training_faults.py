@@ -31,6 +31,7 @@ P = 17
 KILLS, MANY_KILLS = 5, int(os.environ.get("KILLS", "50"))
 RELIABLE = {"reliability": "reliable", "history": "keep_last", "depth": 1000}
 EVERY_MESSAGE = {"/keypoints": {"subscription": RELIABLE}}
+PATIENCE = 1200.0
 SAVING_OFTEN = (str(Path(__file__).with_name("saving_often.py")),)
 
 
@@ -75,8 +76,8 @@ class Stream:
             self.publisher.publish(cloud(self.sent))
             self.sent, self.last = self.sent + 1, time.monotonic()
 
-    def until(self, condition: Any, what: str) -> None:
-        self.client.wait(lambda: (self.go_on(), condition())[1], what)
+    def until(self, condition: Any, what: str, seconds: float = 60) -> None:
+        self.client.wait(lambda: (self.go_on(), condition())[1], what, seconds)
 
     def assert_all_answered(self) -> None:
         heard = self.client.heard["/lifter/points"]
@@ -184,23 +185,18 @@ def test_many_kills_each_gone_on_with_end_in_the_model_of_a_training_left_alone(
         answer = client.call("/lifter/train")
         assert answer.success, answer.message
 
-    def finish() -> None:
-        while not ended():
-            before = len(status)
-            stream.until(lambda: len(status) > before or ended(), "progress")  # noqa: B023
-
     begin("alone")
-    finish()
+    stream.until(ended, "the end", PATIENCE)
     alone = load_file(models / "alone.safetensors")
     while counts["killed"] < MANY_KILLS or look(models, "killed"):
         begin("killed")
         if counts["killed"] == MANY_KILLS:
-            finish()
+            stream.until(ended, "the end", PATIENCE)
         elif moments.random() < 0.5:
             wait_until(time.monotonic() + moments.uniform(0, 8))
         else:
             before = saved()
-            stream.until(lambda: ended() or saved() != before, "a checkpoint")  # noqa: B023
+            stream.until(lambda: ended() or saved() != before, "a checkpoint", PATIENCE)  # noqa: B023
             wait_until(time.monotonic() + moments.uniform(0, 1))
         if not ended():
             for pid in children_of(lifter.process.pid):
@@ -219,11 +215,11 @@ def test_many_kills_each_gone_on_with_end_in_the_model_of_a_training_left_alone(
             assert killed.keys() == alone.keys()
             for name, weight in alone.items():
                 np.testing.assert_array_equal(killed[name], weight, name)
+        with capsys.disabled():
+            print(f"{dict(counts)}, messages sent: {stream.sent}", flush=True)
     stream.assert_all_answered()
-    hidden = sorted(path.name for path in models.iterdir() if path.name.startswith("."))
-    with capsys.disabled():
-        print(f"\n{dict(counts)}, messages lifted: {stream.sent}, left behind: {hidden}")
     assert counts["finished"]
+    assert not [path.name for path in models.iterdir() if path.name.startswith(".killed.")]
 
 
 def test_a_new_lifter_finds_what_was_cut_off(start_lifter, connect, models, tmp_path):
