@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter
+from deep_nrsfm_ros.node.training_job import ENDED
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
 from deep_nrsfm_ros.observations.bags import frames, write_bag
@@ -54,11 +55,10 @@ def measure(folder: Path, rounds: int) -> dict[str, list[Played]]:
         client.play(CAMERA)  # the first answers are slow
         idle = [client.play(CAMERA) for _ in range(rounds)]
         client.train()
-        for _ in range(1000):  # a busy machine takes long to start it
-            if client.training["state"] == "training":
-                break
-            before = client.training
-            client.wait(lambda then=before: client.training is not then, "training")  # type: ignore[misc]
+        while client.training["state"] != "training":
+            if client.training["state"] in ENDED:
+                raise DemoError(client.training["message"])
+            client.wait_a_second()
         return {"idle": idle, "training": [client.play(CAMERA) for _ in range(rounds)]}
 
 
