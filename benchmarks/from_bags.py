@@ -47,7 +47,7 @@ VIDEO_RATE, CMU_RATE = 30.0, 120.0
 EXCAVATOR = Path(__file__).parents[1] / "config/objects/excavator.yaml"
 WORK, WORK_LATER = 6000, 1500
 """Frames of the machine to learn from, and of other work to lift."""
-STEPS = {"video": 30_000, "tuned": 1000, "machine": 8000, "mocap": 3000}
+STEPS = {"video": 30_000, "tuned": 100, "machine": 8000, "mocap": 3000}
 QUALITY = {
     "reprojection": "label-free, from the training's report: error of the network alone",
     "cycle": "label-free: error of reconstructing its own shapes seen from elsewhere",
