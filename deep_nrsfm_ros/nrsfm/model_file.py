@@ -76,6 +76,8 @@ def save_model(path: Path, model: Model) -> None:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         save_file(weights, partial, {"format": _FORMAT, "model": json.dumps(header)})
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())  # or a power cut may leave the new name on an empty file
         partial.chmod(0o644)  # safetensors writes for its owner alone; models are for everybody
         os.replace(partial, path)
     finally:

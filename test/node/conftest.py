@@ -173,9 +173,9 @@ class Client:
         self.wait(publisher.get_subscription_count, "the lifter to find the publisher")
         return publisher
 
-    def wait(self, condition: Callable[[], Any], what: str) -> Any:
-        """Spin until the condition holds and return its value; fail at the deadline."""
-        deadline = time.monotonic() + DEADLINE
+    def wait(self, condition: Callable[[], Any], what: str, seconds: float = DEADLINE) -> Any:
+        """Spin until the condition holds and return its value; fail after so many seconds."""
+        deadline = time.monotonic() + seconds
         while not (value := condition()):
             assert time.monotonic() < deadline, f"waited in vain for {what}"
             self._executor.spin_once(timeout_sec=0.05)

@@ -6,6 +6,8 @@ import os
 import random
 import signal
 import time
+from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +15,24 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import QoSProfile
+from safetensors.numpy import load_file
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from deep_nrsfm_ros.node.publishing import PointCloud
-from deep_nrsfm_ros.node.unfinished import record_file
+from deep_nrsfm_ros.node.unfinished import checkpoint_file, look, record_file
+from deep_nrsfm_ros.nrsfm.checkpoint import read_checkpoint
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.nrsfm.model_file import load_model
 from deep_nrsfm_ros.observations.bags import frames, write_bag
 
 P = 17
-KILLS = int(os.environ.get("KILLS", "5"))
+KILLS, MANY_KILLS = 5, int(os.environ.get("KILLS", "50"))
 RELIABLE = {"reliability": "reliable", "history": "keep_last", "depth": 1000}
+EVERY_MESSAGE = {"/keypoints": {"subscription": RELIABLE}}
+PATIENCE = 1200.0
+SAVING_OFTEN = (str(Path(__file__).with_name("saving_often.py")),)
 
 
 def views(f: int = 60, flat: bool = False) -> np.ndarray:
@@ -69,8 +76,8 @@ class Stream:
             self.publisher.publish(cloud(self.sent))
             self.sent, self.last = self.sent + 1, time.monotonic()
 
-    def until(self, condition: Any, what: str) -> None:
-        self.client.wait(lambda: (self.go_on(), condition())[1], what)
+    def until(self, condition: Any, what: str, seconds: float = 60) -> None:
+        self.client.wait(lambda: (self.go_on(), condition())[1], what, seconds)
 
     def assert_all_answered(self) -> None:
         heard = self.client.heard["/lifter/points"]
@@ -95,10 +102,9 @@ def recorded(models: Path) -> bool:
 def test_kills_at_random_moments_cost_no_message_and_no_model(
     start_lifter, connect, models, tmp_path
 ):
-    overrides = {"keypoints": {"subscription": RELIABLE}}
     (models / "broken.safetensors").unlink()
     lifter = start_lifter(
-        qos_overrides={f"/{topic}": value for topic, value in overrides.items()},
+        qos_overrides=EVERY_MESSAGE,
         train={"bags": [write(tmp_path / "bag")], "name": "fresh", "steps": 300, "seeds": 1,
                "batch": 8},
     )  # fmt: skip
@@ -142,6 +148,78 @@ def test_kills_at_random_moments_cost_no_message_and_no_model(
     refused = client.call("/lifter/train")
     assert not refused.success and "set train.resume to false to begin one" in refused.message
     stream.assert_all_answered()
+
+
+@pytest.mark.long
+@pytest.mark.timeout(7200)
+def test_many_kills_each_gone_on_with_end_in_the_model_of_a_training_left_alone(
+    start_lifter, connect, models, tmp_path, capsys
+):
+    """Half of the kills come anywhere, half of them within a second of a checkpoint."""
+    (models / "broken.safetensors").unlink()
+    lifter = start_lifter(
+        SAVING_OFTEN,
+        qos_overrides=EVERY_MESSAGE,
+        train={"bags": [write(tmp_path / "bag")], "name": "alone", "steps": 2000, "seeds": 2,
+               "screening": 100, "batch": 8, "activate": False},
+    )  # fmt: skip
+    client, moments, counts = connect(), random.Random(0), Counter()
+    stream, status = Stream(client), client.heard["/lifter/training_status"]
+
+    def ended() -> bool:
+        return bool(status) and values(status[-1])["state"] in ("failed", "finished")
+
+    def saved() -> int:
+        with suppress(FileNotFoundError):
+            return checkpoint_file(models, "killed").stat().st_mtime_ns
+        return 0
+
+    def wait_until(moment: float) -> None:
+        stream.until(lambda: ended() or time.monotonic() > moment, "the moment")
+
+    def begin(name: str) -> None:
+        found = look(models, name)
+        counts["gone on with"] += bool(found)
+        client.set_parameters(train__name=name, train__resume=found is not None)
+        status.clear()
+        answer = client.call("/lifter/train")
+        assert answer.success, answer.message
+
+    begin("alone")
+    stream.until(ended, "the end", PATIENCE)
+    alone = load_file(models / "alone.safetensors")
+    while counts["killed"] < MANY_KILLS or look(models, "killed"):
+        begin("killed")
+        if counts["killed"] == MANY_KILLS:
+            stream.until(ended, "the end", PATIENCE)
+        elif moments.random() < 0.5:
+            wait_until(time.monotonic() + moments.uniform(0, 8))
+        else:
+            before = saved()
+            stream.until(lambda: ended() or saved() != before, "a checkpoint", PATIENCE)  # noqa: B023
+            wait_until(time.monotonic() + moments.uniform(0, 1))
+        if not ended():
+            for pid in children_of(lifter.process.pid):
+                os.kill(pid, signal.SIGKILL)
+            stream.until(ended, "the end")
+        state = values(status[-1])["state"]
+        counts["killed" if state == "failed" else state] += 1
+        assert state == "finished" or "SIGKILL" in status[-1].message
+        for path in models.glob("*.safetensors"):
+            load_model(path)
+        if checkpoint_file(models, "killed").exists():
+            read_checkpoint(checkpoint_file(models, "killed"))
+            counts["checkpoints after a kill"] += 1
+        if state == "finished":
+            killed = load_file(models / "killed.safetensors")
+            assert killed.keys() == alone.keys()
+            for name, weight in alone.items():
+                np.testing.assert_array_equal(killed[name], weight, name)
+        with capsys.disabled():
+            print(f"{dict(counts)}, messages sent: {stream.sent}", flush=True)
+    stream.assert_all_answered()
+    assert counts["finished"]
+    assert not [path.name for path in models.iterdir() if path.name.startswith(".killed.")]
 
 
 def test_a_new_lifter_finds_what_was_cut_off(start_lifter, connect, models, tmp_path):

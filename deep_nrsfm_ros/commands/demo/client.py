@@ -184,6 +184,11 @@ class Client:
             raise DemoError(f"the lifter refused to train: {answer.message}")
         return str(answer.message)
 
+    def wait_a_second(self) -> None:
+        """Spin until the lifter's next diagnostics, which come once a second."""
+        before = self.health
+        self.wait(lambda: self.health is not before, "diagnostics")
+
     def wait(self, condition: Callable[[], Any], what: str) -> None:
         """Spin until the condition holds; raise DemoError at the deadline or with the lifter."""
         deadline = time.perf_counter() + _DEADLINE
