@@ -10,6 +10,8 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 Value = str | int | float | None
@@ -19,6 +21,7 @@ ENDED = ("finished", "failed", "cancelled")
 TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
 
 _LAST_WORDS = 10
+_LOWEST = 19
 _LINE_LIMIT = 65536
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -40,7 +43,7 @@ class TrainingJob:
     """One run of the training command, from its start to its end.
 
     The process runs at the lowest priority in a session of its own, so that neither Ctrl-C nor
-    its appetite reach the lifter. It prints one JSON object a line, {"state": ..., ...}; any
+    its appetite reaches the lifter. It prints one JSON object a line, {"state": ..., ...}; any
     other line is kept as its last words. Its standard input is a pipe: end of file means that
     the lifter is gone, and the process shall end.
     """
@@ -74,7 +77,7 @@ class TrainingJob:
             start_new_session=True,
             env=os.environ | dict.fromkeys(_THREAD_VARIABLES, str(threads)),
         )
-        os.setpriority(os.PRIO_PROCESS, self._process.pid, 19)
+        _yield_to_others(self._process.pid)
         self._watcher = threading.Thread(target=self._watch, name="training", daemon=True)
         self._watcher.start()
 
@@ -149,6 +152,17 @@ class TrainingJob:
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
         words = "\n".join(self._last_words) or "it said nothing"
         return Progress("failed", f"the training process ended {how}; its last words:\n{words}", {})
+
+
+def _yield_to_others(pid: int) -> None:
+    """Give a process that leads a session the lowest priority.
+
+    Where Linux groups processes by session, as on a desktop, priorities count within a session
+    only, and the session has one of its own.
+    """
+    with suppress(OSError):  # it ended already, or there are no such groups
+        os.setpriority(os.PRIO_PROCESS, pid, _LOWEST)
+        Path(f"/proc/{pid}/autogroup").write_text(str(_LOWEST))
 
 
 def parse_progress(line: str) -> Progress | None:

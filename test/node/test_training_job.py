@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from deep_nrsfm_ros.node.training_job import ENDED, Progress, TrainingJob, parse_progress
 
 STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in_training.py")))
+AUTOGROUP = Path("/proc/self/autogroup")
 DEADLINE = 60
 
 
@@ -69,6 +70,13 @@ def test_the_process_is_in_its_own_session_and_yields_to_others():
     job.close(DEADLINE)
     # The priority is set right after the start; the process may have asked before.
     assert values["niceness"] in (0, 19)
+
+
+@pytest.mark.skipif(not AUTOGROUP.exists(), reason="this kernel does not group by session")
+def test_its_session_yields_to_others_too():
+    job, _ = start("wait")
+    assert Path(f"/proc/{job.pid}/autogroup").read_text().endswith("nice 19\n")
+    job.close(DEADLINE)
 
 
 def test_cancel_keeps_what_there_is():
