@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.node.model_folders import default_models_dir
+from deep_nrsfm_ros.node.model_folders import default_bags_dir, default_models_dir
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model
@@ -25,6 +25,11 @@ class InputOptions:
     models_dir: str = option(
         str(default_models_dir()),
         "folder for trained models, looked through before those that come with the package",
+        read_only=True,
+    )
+    bags_dir: str = option(
+        str(default_bags_dir()),
+        "folder of the bags that train.bags may name, set by the owner; relative names begin here",
         read_only=True,
     )
     input_type: str = option(

@@ -169,6 +169,19 @@ def unwritable(folder: Path, error: Exception) -> str:
     )
 
 
+def check_room(folder: Path, megabytes: float) -> None:
+    """Raise ValueError unless the disk of a folder, which need not exist yet, has room."""
+    place = folder.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    free = shutil.disk_usage(place).free / 1e6
+    if free < megabytes:
+        raise ValueError(
+            f"{folder} is on a disk with {free:.0f} MB free; a training needs {megabytes:.0f} MB "
+            "(free_disk); make room, or choose another folder for models"
+        )
+
+
 def lasting(asked: Mapping[str, Any]) -> dict[str, Any]:
     """Return options as JSON has them, with whole paths: who resumes may be in another folder."""
     return {name: _lasting(value) for name, value in asked.items()}
