@@ -40,6 +40,12 @@ class InputOptions:
         "order of the detector's keypoints: a preset, the path of an object file, or 'model' for "
         "the order of the model's own",
     )
+    max_objects: int = option(
+        100,
+        "most objects in a message; one with more is dropped, not lifted for seconds",
+        low=1,
+        high=100_000,
+    )
     min_confidence: float = option(
         0.1, "a keypoint with less confidence counts as missing", low=0, high=1
     )
@@ -65,7 +71,7 @@ class Pipeline:
         self._map = KeypointMap(self.source, model.layout)
         self._lifter = Lifter(model, lifting)
         self._input_type, self._min_confidence = inputs.input_type, inputs.min_confidence
-        self._min_visible = lifting.min_visible
+        self._min_visible, self._max_objects = lifting.min_visible, inputs.max_objects
 
     def __call__(self, message: Any) -> Lifted:
         """Return the shapes of the objects in `message`; raise ValueError if there is none.
@@ -73,8 +79,11 @@ class Pipeline:
         Objects that cannot be lifted are NaN, unless all are: that is an error too.
         """
         seen = read(message, self._input_type, len(self.source), self._min_confidence)
-        if not len(seen.confidence):
-            raise MessageError("message has no object; expected at least one")
+        if not 0 < len(seen.confidence) <= self._max_objects:
+            raise MessageError(
+                f"message has {len(seen.confidence)} objects; expected at least one and at most "
+                f"{self._max_objects} (max_objects)"
+            )
         points, confidence = self._map(*seen)
         lifted = self._lifter(points, confidence)
         if np.isnan(lifted.residual).all():

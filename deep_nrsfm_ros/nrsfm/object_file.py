@@ -24,6 +24,7 @@ NUMBERED = "numbered"
 """Stands for an object that nobody has described, where its points tell how many they are."""
 
 _MAX_BYTES = 64 * 2**10
+_DEEPEST = 8
 _FEWEST = 4  # W = S M has a unique shape from four points on
 
 
@@ -72,9 +73,12 @@ def _parse(path: Path) -> dict[Any, Any]:
     if len(text) > _MAX_BYTES:
         raise ObjectFileError(f"is larger than {_MAX_BYTES >> 10} KiB: not a description")
     try:
+        _check_nesting(text)
         root = yaml.compose(text, yaml.SafeLoader)
         fields = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except ObjectFileError:
+        raise
+    except Exception as error:  # PyYAML raises many kinds for what explicit tags say
         raise ObjectFileError(f"is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(root, yaml.MappingNode) or not isinstance(fields, dict):
         raise ObjectFileError(f"is {_words(fields)}; it must hold fields like 'name: hand'")
@@ -82,6 +86,18 @@ def _parse(path: Path) -> dict[Any, Any]:
     if times > 1:  # YAML itself would keep the last and forget the others
         raise ObjectFileError(f"has the field {_words(name)} {times} times")
     return fields
+
+
+def _check_nesting(text: bytes) -> None:
+    """Refuse what makes much out of little before it is made: aliases, deep nesting."""
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ObjectFileError(f"has the alias *{event.anchor}; write out what it stands for")
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise ObjectFileError(f"is nested deeper than {_DEEPEST}: not a description")
 
 
 class _Description:
