@@ -1,6 +1,7 @@
 # make demo        from a fresh clone to the picture
 # make test        environment, lint, types and all tests
 # make lint        lint and types only
+# make fuzz        100000 spoilt inputs of every kind; takes hours
 # make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
 # make lock        resolve requirements.lock anew
 # make clean       remove what building and testing left; .venv and downloads stay
@@ -19,7 +20,7 @@ BENCHMARKS := nrsfm_on_cmu ablation unseen noise missing structure_from_category
 PYTHON := .venv/bin/python
 READY := .venv/.ready
 
-.PHONY: demo test lint benchmark lock clean
+.PHONY: demo test lint fuzz benchmark lock clean
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
@@ -31,6 +32,9 @@ lint: $(READY)
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
+
+fuzz: $(READY)
+	FUZZ=100000 $(PYTHON) -m pytest test/fuzz
 
 benchmark: $(READY)
 	@test -n "$(DATA)" || { echo "make benchmark DATA=DIR: DIR holds cmu/ and nrsfm/"; exit 2; }

@@ -10,6 +10,8 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 Value = str | int | float | None
@@ -75,6 +77,8 @@ class TrainingJob:
             env=os.environ | dict.fromkeys(_THREAD_VARIABLES, str(threads)),
         )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, 19)
+        with suppress(OSError):  # when memory runs out, the training goes, not the lifter
+            Path(f"/proc/{self._process.pid}/oom_score_adj").write_text("1000")
         self._watcher = threading.Thread(target=self._watch, name="training", daemon=True)
         self._watcher.start()
 

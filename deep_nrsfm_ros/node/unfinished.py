@@ -95,7 +95,7 @@ def look(folder: Path, name: str) -> Unfinished | None:
     try:
         with suppress(FileNotFoundError), record.open(encoding="utf-8") as file:
             running = not _lock(file, fcntl.LOCK_SH)
-            with suppress(ValueError):  # damaged: the checkpoint still counts
+            with suppress(ValueError, RecursionError):  # damaged: the checkpoint still counts
                 read = json.load(file)
                 asked = read if isinstance(read, dict) else {}
         saved = checkpoint.is_file()

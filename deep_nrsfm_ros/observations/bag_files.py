@@ -189,7 +189,8 @@ class _CutSqlite:
         self._file = sqlite3.connect(f"{uri}?immutable=1", uri=True)
         # Otherwise sqlite refuses a file shorter than its header says.
         self._file.execute("PRAGMA writable_schema = ON")
-        self._topics = self._file.execute("SELECT id, name, type FROM topics").fetchall()
+        rows = self._file.execute("SELECT id, name, type FROM topics").fetchall()
+        self._topics = [row for row in rows if isinstance(row[1], str) and isinstance(row[2], str)]
 
     def topics(self) -> list[Topic]:
         """Return what is there; how many messages is unknown."""

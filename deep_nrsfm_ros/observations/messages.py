@@ -56,7 +56,7 @@ def read(message: Any, input_type: str, keypoints: int, min_confidence: float = 
         raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
     try:
         values = reader(message, keypoints)
-    except (AttributeError, TypeError) as error:
+    except (AttributeError, TypeError, IndexError, OverflowError) as error:
         raise MessageError(f"expected a message of type {input_type}: {error}") from None
     return observation(values, min_confidence)
 
