@@ -26,6 +26,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PolygonStamped, QuaternionStamped
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -104,7 +105,10 @@ class LifterNode(Node):
         self._training = TrainingService(
             *(self, self._training_request, self._activate, self._fence.models_dir)
         )
-        self.create_timer(_REPORT_PERIOD, self._report)
+        # Not in ROS time: a simulation that pauses, or jumps back, would silence it.
+        self.create_timer(
+            _REPORT_PERIOD, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         keypoints = self.create_subscription(
             MESSAGES[self._inputs.input_type],
             "keypoints",
