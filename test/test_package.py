@@ -132,6 +132,7 @@ def test_share_has_what_the_source_has(prefix):
         "launch": ["*.launch.py"],
         "config": ["*.yaml"],
         "config/objects": ["*.yaml"],
+        "config/security": ["*.xml"],
         "models": ["*.safetensors", "*.md"],
     }.items():
         expected = sorted(p.name for pattern in patterns for p in (ROOT / folder).glob(pattern))
