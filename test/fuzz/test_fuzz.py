@@ -158,20 +158,22 @@ def spoil(rng: random.Random, value: Any) -> None:
 def live(kind: str) -> Input:
     """Spoil a message and lift it: only ValueError may come of it, and no trace may stay."""
     pipeline = Pipeline(model(), None, InputOptions(input_type=kind), LiftingOptions())
+    plain = LiftingOptions(correction="none", refill=0, turns=1)
+    quick = Pipeline(model(), None, InputOptions(input_type=kind), plain)
     valid, expected = message(kind), pipeline(message(kind))
 
     def one(rng: random.Random) -> Outcome:
         spoilt = loose(valid)
         spoil(rng, spoilt)
         try:
-            lifted = pipeline(spoilt)
+            lifted = (pipeline if rng.random() < 0.1 else quick)(spoilt)
         except ValueError as refusal:
             assert str(refusal)
             outcome = "refused"
         else:
             assert len(lifted.shapes) <= 100
             outcome = "lifted"
-        if rng.random() < 0.05:
+        if rng.random() < 0.02:
             for old, new in zip(expected, pipeline(valid), strict=True):
                 np.testing.assert_array_equal(old, new)
         return outcome
