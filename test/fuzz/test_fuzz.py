@@ -20,19 +20,29 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 from rosbags.typesys import Stores, get_typestore
 
+from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.node import parameters as ros_parameters
+from deep_nrsfm_ros.node.fence import Fence
+from deep_nrsfm_ros.node.lifter import LifterNode
+from deep_nrsfm_ros.node.parameters import name_of
 from deep_nrsfm_ros.node.pipeline import InputOptions, Pipeline
 from deep_nrsfm_ros.node.training_job import parse_progress
+from deep_nrsfm_ros.node.training_request import TrainingOptions, fenced
 from deep_nrsfm_ros.node.unfinished import look, record_file
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, ModelFileError, load_model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.object_file import ObjectFileError, read_object
+from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.observations import bags
 from deep_nrsfm_ros.observations.bags import BagError, frames, read_bags, write_bag
+from deep_nrsfm_ros.observations.curation import Curation
 from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, read
 
 INPUTS = int(os.environ.get("FUZZ", "200"))
@@ -310,6 +320,57 @@ def training(folder: Path) -> Input:
     return one
 
 
+def parameters(folder: Path) -> Input:
+    """Set parameters to anything of their type, as the lifter considers it; ask for a training."""
+    save_model(folder / "thing.safetensors", model())
+    (folder / "link.safetensors").symlink_to("/etc/passwd")
+    inputs = InputOptions(model="thing", models_dir=str(folder), bags_dir=str(folder))
+    stub = SimpleNamespace(get_parameter_or=lambda name, default: default)
+    stub._fence = Fence(folder, folder, ["thing"])
+    stub._pipeline = Pipeline(model(), None, inputs, LiftingOptions())
+    stub._prepare = lambda changes: LifterNode._prepare(stub, changes)
+    valid, expected = message(POINT_CLOUD), stub._pipeline(message(POINT_CLOUD))
+    known = [(c, "") for c in (InputOptions, LiftingOptions)]
+    known += [(c, "train.") for c in (TrainingOptions, Recipe, Limits, Curation)]
+    defaults = [(name_of(f, prefix), f.default) for c, prefix in known for f, _, _ in options(c)]
+    bits = (*WORDS, "thing", "link", "link.safetensors", "/etc/passwd", "~", "~x/y.yaml", "coco17",
+            "model", "thing.safetensors", "../" * 9, "numbered", "a.yaml", "x" * 5000)  # fmt: skip
+
+    def value(rng: random.Random, default: Any) -> Any:
+        if isinstance(default, bool):
+            return rng.random() < 0.5
+        if isinstance(default, int):
+            return max(-(2**63), min(rng.choice(SIZES), 2**63 - 1))
+        if isinstance(default, float):  # of dynamic type
+            return rng.choice((*NUMBERS, 0.5, 3, -1, True, "x", ["x"]))
+        words = [rng.choice(("", "/")).join(rng.choices(bits, k=rng.choice((1, 1, 2, 3))))
+                 for _ in range(rng.randrange(1, 4))]  # fmt: skip
+        return words if isinstance(default, tuple) else words[0]
+
+    def one(rng: random.Random) -> Outcome:
+        chosen = rng.choices(defaults, k=rng.choice((1, 1, 2, 5)))
+        changes = [Parameter(name, value=value(rng, default)) for name, default in chosen]
+        result = LifterNode._consider(stub, changes)
+        assert result.successful != bool(result.reason)
+        assert "internal error" not in result.reason, result.reason
+        given = {change.name: change.value for change in changes}
+        stub.get_parameter_or = lambda name, default: (
+            Parameter(name, value=given[name]) if name in given else default
+        )
+        try:
+            fenced(ros_parameters.read(stub, TrainingOptions, "train."), stub._fence)
+        except (ValueError, OSError) as refusal:
+            assert str(refusal)
+        finally:
+            stub.get_parameter_or = lambda name, default: default
+        if rng.random() < 0.02:
+            for old, new in zip(expected, stub._pipeline(valid), strict=True):
+                np.testing.assert_array_equal(old, new)
+        return "accepted" if result.successful else "refused"
+
+    return one
+
+
 def classes(folder: Path) -> dict[str, Callable[[], Input]]:
     cases: dict[str, Callable[[], Input]] = {k: lambda k=k: live(k) for k in INPUT_TYPES}  # type: ignore[misc]
     return cases | {
@@ -318,6 +379,7 @@ def classes(folder: Path) -> dict[str, Callable[[], Input]]:
         "object file": lambda: object_file(folder),
         "model file": lambda: model_file(folder),
         "training": lambda: training(folder),
+        "parameters": lambda: parameters(folder),
     }
 
 
