@@ -3,6 +3,7 @@
 # make lint        lint and types only
 # make fuzz        100000 spoilt inputs of every kind; takes hours
 # make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
+# make audit       known vulnerabilities of the pins in requirements.lock
 # make lock        resolve requirements.lock anew
 # make clean       remove what building and testing left; .venv and downloads stay
 #
@@ -20,7 +21,7 @@ BENCHMARKS := nrsfm_on_cmu ablation unseen noise missing structure_from_category
 PYTHON := .venv/bin/python
 READY := .venv/.ready
 
-.PHONY: demo test lint fuzz benchmark lock clean
+.PHONY: demo test lint fuzz benchmark audit lock clean
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
@@ -50,6 +51,12 @@ $(READY): requirements.lock setup.py
 	$(PYTHON) -m pip install --requirement requirements.lock
 	$(PYTHON) -m pip install --no-deps --no-build-isolation --editable .
 	touch $@
+
+# In an environment of its own: what it needs is nothing that we need.
+audit:
+	$(PYTHON3) -m venv build/audit
+	build/audit/bin/pip install --quiet pip-audit
+	build/audit/bin/pip-audit --requirement requirements.lock --no-deps --disable-pip
 
 # Left out: the CUDA wheels, which torch itself pins, on the machines that want them.
 lock:
