@@ -12,7 +12,6 @@ from benchmarks.harness import LIFTING_LEGEND, Session, across, command, in_pair
 from benchmarks.table import Table, lines
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
-from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 SUBJECTS = ("01",)
@@ -22,12 +21,15 @@ LIFTING: dict[str, Callable[[float], LiftingOptions]] = {
     "as shipped": lambda ratio: LiftingOptions(),
     "noise known": lambda ratio: LiftingOptions(noise=max(ratio, LiftingOptions().noise)),
 }
+TRAINED: dict[str, dict[str, float]] = {
+    "default": {},
+    "augmented by noise": {"noise": max(RATIOS.values())},
+}
 LEGEND = {
     "noise": "||noise||_F / ||W||_F of each frame, Gaussian; the truth is without",
-    "clean": "default recipe, trained on the frames without noise",
-    "augmented": "the same frames, noise up to the highest ratio added to the input at each step",
-    "retrained": "default recipe, trained on the disturbed frames and tested on them: the paper's "
-    "protocol, a model for each ratio",
+    "default": "default recipe, trained on the frames without noise",
+    "augmented by noise": "the same frames, noise up to the highest ratio added to the input at "
+    "each step",
     "network alone": LIFTING_LEGEND["network alone"],
     "as shipped": f"corrected for keypoints of {LiftingOptions().noise:.0%} noise",
     "noise known": "corrected for keypoints as noisy as they are (option `noise`)",
@@ -60,12 +62,14 @@ def benchmark(session: Session) -> Table:
     for subject in session.subjects:
         clean = session.mocap([subject], "train")
         tests = {name: disturbed(clean, ratio) for name, ratio in RATIOS.items()}
-        for seed in session.seeds:
-            for trained, models in _models(session, subject, tests, seed).items():
+        for trained, recipe in TRAINED.items():
+            for seed in session.seeds:
+                title = f"{subject} {trained} seed {seed}"
+                model = session.trained(title, clean, session.preset("default", seed, **recipe))
                 for lifting, options in LIFTING.items():
                     row: dict[str, float] = {}
                     for name, ratio in RATIOS.items():
-                        row |= across({name: (models[name], tests[name])}, options(ratio))
+                        row |= across({name: (model, tests[name])}, options(ratio))
                     table.add((subject, trained, lifting), row, seed)
         solved = {name: solve(session, name, clean).errors for name in BASELINES}
         name = min(solved, key=lambda name: solved[name].shape)
@@ -73,25 +77,6 @@ def benchmark(session: Session) -> Table:
         row = dict(zip(in_pairs(["0 %"]), found, strict=True))
         table.add((subject, f"best baseline: {name}", ""), row)
     return table
-
-
-def _models(
-    session: Session, subject: str, tests: dict[str, Ensemble], seed: int
-) -> dict[str, dict[str, Model]]:
-    """Return way of training -> noise -> model."""
-
-    def trained(title: str, of: str, **recipe: float) -> Model:
-        preset = session.preset("default", seed, **recipe)
-        return session.trained(f"{subject} {title} seed {seed}", tests[of], preset)
-
-    plain = trained("default", "0 %")
-    augmented = trained("augmented by noise", "0 %", noise=max(RATIOS.values()))
-    noisy = {name: trained(f"with noise {name[:-2]}", name) for name in tests if name != "0 %"}
-    return {
-        "clean": dict.fromkeys(tests, plain),
-        "augmented": dict.fromkeys(tests, augmented),
-        "retrained": {"0 %": plain} | noisy,
-    }
 
 
 def main(argv: Sequence[str] | None = None) -> None:

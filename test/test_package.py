@@ -133,6 +133,7 @@ def test_share_has_what_the_source_has(prefix):
         "config": ["*.yaml"],
         "config/objects": ["*.yaml"],
         "config/security": ["*.xml"],
+        "config/mappings": ["*.yaml"],
         "models": ["*.safetensors", "*.md"],
     }.items():
         expected = sorted(p.name for pattern in patterns for p in (ROOT / folder).glob(pattern))

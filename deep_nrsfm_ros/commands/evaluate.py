@@ -33,8 +33,10 @@ LIFTING = {
     "network alone": ALONE,
     "back-projected": LiftingOptions(correction="back_projection", turns=1),
     "as shipped": LiftingOptions(),
+    "as shipped, noise 0": LiftingOptions(noise=0.0),
 }
-"""How a model's shapes come about: one pass, one pass moved onto the input, the default."""
+"""How a model's shapes come about: one pass, one pass moved onto the input, the default, and the
+default for keypoints without noise."""
 
 
 def arguments() -> argparse.ArgumentParser:

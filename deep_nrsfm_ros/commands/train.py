@@ -45,6 +45,8 @@ from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.observations.bags import most_keypoints, read_bags
 from deep_nrsfm_ros.observations.curation import Curated, Curation
 from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.field_mapping import FieldMapping
+from deep_nrsfm_ros.observations.mapping_file import read_mapping
 from deep_nrsfm_ros.observations.variation import Variation
 from deep_nrsfm_ros.reporting.page import Training, write_report
 
@@ -66,6 +68,12 @@ def arguments() -> argparse.ArgumentParser:
     data.add_argument(
         "--min-confidence", type=float, default=0.1, help="keypoints below it count as missing"
     )
+    data.add_argument(
+        "--mapping", default="", help="field mapping (.yaml) for messages of a type not known here"
+    )
+    for side in ("width", "height"):
+        text = f"{side} of the image in pixels, for normalised keypoints"
+        data.add_argument(f"--image-{side}", type=int, default=0, help=text)
     data.add_argument("--cmu", type=Path, help="folder of the CMU database (NN/NN.asf, *.amc)")
     data.add_argument("--subjects", nargs="*", default=["01"], help="CMU subjects")
     data.add_argument(
@@ -112,9 +120,12 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
         raise ValueError("name what to train on: --bag (repeatable), or --cmu with --subjects")
     source, target = read_layouts(given)
     if given.bag:
+        size = (given.image_width, given.image_height)
         reading = read_bags(
             *(given.bag, given.topic, source, target, given.min_confidence, report.reading),
             max_frames=override(Limits(), given).max_frames,
+            mapping=_mapping(given),
+            size=size if all(size) else None,
         )
         for warning in reading.warnings:
             report.warn(warning)
@@ -138,11 +149,16 @@ def read_layouts(given: argparse.Namespace) -> tuple[KeypointLayout, KeypointLay
                 f"--object {NUMBERED} takes the points of bags as they come; "
                 "leave out --keypoint-layout and --cmu, or name an object"
             )
-        points = KeypointLayout.numbered(most_keypoints(given.bag, given.topic))
+        points = KeypointLayout.numbered(most_keypoints(given.bag, given.topic, _mapping(given)))
         return points, points
     target = find_layout("--object", given.object or HUMAN17.name)
     named = given.keypoint_layout
     return find_layout("--keypoint-layout", named) if named else target, target
+
+
+def _mapping(given: argparse.Namespace) -> FieldMapping | None:
+    """Return the field mapping that the arguments name, if they name one."""
+    return read_mapping(Path(given.mapping).expanduser()) if given.mapping else None
 
 
 def read_start(given: argparse.Namespace) -> Model | None:

@@ -39,16 +39,17 @@ class Health:
         self._last_input = self._last_report = clock()
         self._seconds: list[float] = []
         self._errors: list[NDArray[np.float32]] = []
-        self._rejected = 0
+        self._rejected = self._empty = 0
         self._unheard = ""
         self.total_lifted = 0
+        self.total_empty = 0
         self.total_rejected = 0
         self.last_problem = ""
 
     @property
     def idle(self) -> bool:
         """Tell whether no message has come since the last report."""
-        return not self._seconds and not self._rejected
+        return not self._seconds and not self._rejected and not self._empty
 
     def lifted(self, seconds: float, reprojection_error: NDArray[np.float32]) -> None:
         """Count a message that took `seconds`.
@@ -60,6 +61,13 @@ class Health:
         self._errors.append(reprojection_error[~np.isnan(reprojection_error)])
         self._unheard = ""
         self.total_lifted += 1
+
+    def saw_nothing(self) -> None:
+        """Count a message without any object: the detector works and sees none."""
+        self._last_input = self._clock()
+        self._empty += 1
+        self._unheard = ""
+        self.total_empty += 1
 
     def rejected(self, reason: str) -> None:
         """Count a message that could not be lifted, and remember why."""
@@ -86,10 +94,11 @@ class Health:
             "processing time max [ms]": f"{seconds.max() * 1e3:.3f}",
             "reprojection error": f"{error:.4f}",
             "messages lifted": str(self.total_lifted),
+            "messages without objects": str(self.total_empty),
             "messages rejected": str(self.total_rejected),
             "last problem": self.last_problem or "none",
         }
-        self._last_report, self._rejected = now, 0
+        self._last_report, self._rejected, self._empty = now, 0, 0
         self._seconds.clear()
         self._errors.clear()
         return Report(level, message, values)
@@ -106,4 +115,6 @@ class Health:
             return WARN, f"no keypoints for {silence:.0f} s"
         if error > _POOR_FIT:
             return WARN, f"poor fit: half of the reprojection errors are above {error:.2f}"
+        if self._empty and not self._seconds:
+            return OK, "the detector sees no object"
         return OK, "lifting" if self._seconds else "waiting for keypoints"

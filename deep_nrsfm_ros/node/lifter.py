@@ -7,6 +7,7 @@ Every message on `keypoints` is answered, with its own header, on
   keypoints are visible,
 - ~/camera_rotation: from the axes of the first object (x front, y left, z up, where its layout
   says which is which) to those of the camera; left out when the first object is NaN,
+- ~/objects: who is in which row, and the rotation of each; made only when someone listens,
 - ~/markers: the same for RViz, made only when someone listens.
 
 It never imports torch: lifting is NumPy, and training is a process of its own.
@@ -24,23 +25,21 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PolygonStamped, QuaternionStamped
+from geometry_msgs.msg import QuaternionStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
-from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Float32MultiArray, Header
+from sensor_msgs.msg import MultiDOFJointState, PointCloud2
+from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.node import parameters, publishing
 from deep_nrsfm_ros.node.fence import Fence
 from deep_nrsfm_ros.node.health import Health
+from deep_nrsfm_ros.node.listening import Listener, Source
 from deep_nrsfm_ros.node.pipeline import MODEL_ORDER, InputOptions, Pipeline
 from deep_nrsfm_ros.node.training_request import (
     TrainingOptions,
@@ -58,14 +57,6 @@ from deep_nrsfm_ros.nrsfm.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.observations.curation import Curation
-from deep_nrsfm_ros.observations.messages import MULTI_ARRAY, POINT_CLOUD, POLYGON
-
-MESSAGES: dict[str, Any] = {
-    POINT_CLOUD: PointCloud2,
-    MULTI_ARRAY: Float32MultiArray,
-    POLYGON: PolygonStamped,
-}
-SENSOR_INPUT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 _TRAIN = "train."
 _LOG_PERIOD = 2.0
@@ -100,6 +91,7 @@ class LifterNode(Node):
         self._cloud = publishing.PointCloud()
         self._points = self.create_publisher(PointCloud2, "~/points", 10)
         self._rotation = self.create_publisher(QuaternionStamped, "~/camera_rotation", 10)
+        self._objects = self.create_publisher(MultiDOFJointState, "~/objects", 10)
         self._markers = self.create_publisher(MarkerArray, "~/markers", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._training = TrainingService(
@@ -109,49 +101,47 @@ class LifterNode(Node):
         self.create_timer(
             _REPORT_PERIOD, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
-        keypoints = self.create_subscription(
-            MESSAGES[self._inputs.input_type],
-            "keypoints",
-            self._lift,
-            SENSOR_INPUT,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._mend_qos),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
-        self._topic = keypoints.topic_name
         self.add_on_set_parameters_callback(self._consider)
         self.add_post_set_parameters_callback(self._adopt)
         self.get_logger().info(
-            f"listening to {self._topic} ({self._inputs.input_type}, "
-            f"{len(self._pipeline.source)} keypoints in the order of "
-            f"{self._pipeline.source.name!r}), lifting with model {self._pipeline.model.name!r}"
+            f"lifting with model {self._pipeline.model.name!r} {len(self._pipeline.source)} "
+            f"keypoints in the order of {self._pipeline.source.name!r}"
         )
+        self._listener = Listener(self, self._inputs, self._lift, self._health.unheard)
 
     def close(self) -> None:
         """End a training that runs."""
         self._training.close(_END_OF_TRAINING)
 
-    def _lift(self, message: Any) -> None:
+    def _lift(self, source: Source, message: Any) -> None:
         """Lift one message and publish the result: the hot path."""
         started = time.perf_counter()
         try:
-            lifted = self._pipeline(message)
+            seen = self._pipeline.observe(message, source.input_type)
+            if not len(seen.confidence):
+                self._health.saw_nothing()
+                return
+            lifted = self._pipeline.lift(seen)
         except Exception as problem:  # whatever it is, the next message may be fine
-            self._reject(problem)
+            self._reject(source, problem)
             return
         header = getattr(message, "header", None) or self._header()
         self._points.publish(self._cloud.fill(header, lifted))
         if not np.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
+        if self._objects.get_subscription_count():
+            names = source.tracker(seen, started)
+            self._objects.publish(publishing.objects(header, lifted, names))
         if self._markers.get_subscription_count():
             self._markers.publish(publishing.markers(header, lifted, self._pipeline.edges))
         self._health.lifted(time.perf_counter() - started, lifted.residual)
 
-    def _reject(self, problem: Exception) -> None:
+    def _reject(self, source: Source, problem: Exception) -> None:
         """Count a message that could not be lifted; say why, but not too often."""
         reason = _words(problem)
         self._health.rejected(reason)
         self.get_logger().warning(
-            f"message on {self._topic} dropped: {reason}", throttle_duration_sec=_LOG_PERIOD
+            f"message on {source.topic} dropped: {reason}", throttle_duration_sec=_LOG_PERIOD
         )
 
     def _header(self) -> Header:
@@ -160,42 +150,15 @@ class LifterNode(Node):
 
     def _report(self) -> None:
         """Publish diagnostics."""
-        if self._health.idle:
-            self._look_for_other_types()
+        self._listener.look(idle=self._health.idle)
         level, message, values = self._health.report()
         model = self._pipeline.model
-        values |= {"model": model.name, "topic": self._topic}
+        values |= {"model": model.name, "topic": ", ".join(self._listener.topics)}
+        values["heard"] = self._listener.heard
         lifting = publishing.status(f"{self.get_name()}: lifting", level, message, values)
         self._diagnostics.publish(
             DiagnosticArray(header=self._header(), status=[lifting, self._training.status])
         )
-
-    def _mend_qos(self, event: Any) -> None:
-        """Say how to hear a publisher whose quality of service does not fit."""
-        policy = qos_policy_name_from_kind(event.last_policy_kind)
-        parameter = f"qos_overrides.{self._topic}.subscription.{policy.split('_')[0].lower()}"
-        reason = (
-            f"a publisher on {self._topic} offers a {policy} that does not fit: nothing comes from "
-            f"it; start the lifter without -p {parameter}, or change the publisher"
-        )
-        self._health.unheard(reason)
-        self.get_logger().error(reason)
-
-    def _look_for_other_types(self) -> None:
-        """Say so if messages of another type are published where the lifter listens.
-
-        DDS keeps such publishers apart and reports nothing.
-        """
-        expected = self._inputs.input_type
-        publishers = self.get_publishers_info_by_topic(self._topic)
-        types = {info.topic_type.replace("/msg/", "/") for info in publishers} - {expected}
-        if types:
-            reason = (
-                f"{self._topic} carries {', '.join(sorted(types))}; expected {expected}: change "
-                "the publisher, or start the lifter with another input_type"
-            )
-            self._health.unheard(reason)
-            self.get_logger().error(reason, throttle_duration_sec=_LOG_PERIOD)
 
     def _prepare(self, changes: Sequence[Parameter]) -> Pipeline:
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
@@ -239,12 +202,15 @@ class LifterNode(Node):
         inputs = parameters.read(self, InputOptions)
         wanted = fenced(parameters.read(self, TrainingOptions, _TRAIN), self._fence)
         heard = self._fence.layout("keypoint_layout", inputs.keypoint_layout)
-        model = self._fence.model("model", inputs.model)
+        topics, model = self._listener.topics, self._fence.model("model", inputs.model)
         source, target = layouts(wanted, heard, model, wanted.from_)
         return TrainingRequest(
             wanted,
             parameters.read(self, Recipe, _TRAIN),
-            topic=wanted.topic or self._topic,
+            topic=wanted.topic or (topics[0] if len(topics) == 1 else ""),
+            input_type=inputs.input_type,
+            image_width=inputs.image_width,
+            image_height=inputs.image_height,
             source_layout=source,
             target_layout=target,
             start=wanted.from_,

@@ -12,9 +12,12 @@ from deep_nrsfm_ros.node.model_folders import default_bags_dir, default_models_d
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, MessageError, read
+from deep_nrsfm_ros.observations.field_mapping import Size
+from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, InputType, read
+from deep_nrsfm_ros.observations.observation import MessageError, Observation
 
 MODEL_ORDER = "model"
+AUTO = "auto"
 
 
 @dataclass(frozen=True)
@@ -33,8 +36,21 @@ class InputOptions:
         read_only=True,
     )
     input_type: str = option(
-        POINT_CLOUD, "type of the keypoint messages", choices=tuple(INPUT_TYPES), read_only=True
+        POINT_CLOUD,
+        f"type of the keypoint messages: one of {', '.join(INPUT_TYPES)}; the path of a field "
+        "mapping for any other; or 'auto': that of the first publisher",
+        read_only=True,
     )
+    topics: tuple[str, ...] = option(
+        (),
+        "topics with keypoints, '*' for any one part of a name, which is then the identity of "
+        "what comes from there: /humans/bodies/*/skeleton2d; none: keypoints",
+        read_only=True,
+    )
+    image_width: int = option(
+        0, "width of the image in pixels, for normalised keypoints; 0: unknown", low=0, high=1000000
+    )
+    image_height: int = option(0, "height of the image in pixels, likewise", low=0, high=1000000)
     keypoint_layout: str = option(
         MODEL_ORDER,
         "order of the detector's keypoints: a preset, the path of an object file, or 'model' for "
@@ -49,6 +65,12 @@ class InputOptions:
     min_confidence: float = option(
         0.1, "a keypoint with less confidence counts as missing", low=0, high=1
     )
+
+    @property
+    def image_size(self) -> Size | None:
+        """Return width and height of the image, None if they are unknown."""
+        known = self.image_width and self.image_height
+        return (self.image_width, self.image_height) if known else None
 
 
 class Pipeline:
@@ -70,22 +92,31 @@ class Pipeline:
         self.edges = model.layout.edge_indices()
         self._map = KeypointMap(self.source, model.layout)
         self._lifter = Lifter(model, lifting)
-        self._input_type, self._min_confidence = inputs.input_type, inputs.min_confidence
+        self._min_confidence = inputs.min_confidence
+        self._size = inputs.image_size
         self._min_visible, self._max_objects = lifting.min_visible, inputs.max_objects
 
-    def __call__(self, message: Any) -> Lifted:
-        """Return the shapes of the objects in `message`; raise ValueError if there is none.
+    def observe(self, message: Any, input_type: InputType, size: Size | None = None) -> Observation:
+        """Return the objects in `message`, their keypoints as the model orders them.
 
-        Objects that cannot be lifted are NaN, unless all are: that is an error too.
+        size: that of the image, instead of the one that the options tell. Raises MessageError.
         """
-        seen = read(message, self._input_type, len(self.source), self._min_confidence)
-        if not 0 < len(seen.confidence) <= self._max_objects:
+        q = len(self.source)
+        seen = read(message, input_type, q, self._min_confidence, size or self._size)
+        if len(seen.confidence) > self._max_objects:
             raise MessageError(
-                f"message has {len(seen.confidence)} objects; expected at least one and at most "
+                f"message has {len(seen.confidence)} objects; expected at most "
                 f"{self._max_objects} (max_objects)"
             )
-        points, confidence = self._map(*seen)
-        lifted = self._lifter(points, confidence)
+        return Observation(*self._map(seen.points, seen.confidence), seen.ids)
+
+    def lift(self, seen: Observation) -> Lifted:
+        """Return the shapes of the objects, of which there is at least one, all in one pass.
+
+        Objects that cannot be lifted are NaN, unless all are: then MessageError is raised.
+        """
+        confidence = seen.confidence
+        lifted = self._lifter(seen.points, confidence)
         if np.isnan(lifted.residual).all():
             most = (confidence > 0).sum(1).max()
             if most >= self._min_visible:

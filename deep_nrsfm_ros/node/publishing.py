@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Vector3
+from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Transform, Vector3
 from numpy.typing import NDArray
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -65,8 +65,24 @@ class PointCloud:
 
 def camera_rotation(header: Header, rotation: NDArray[np.float32]) -> QuaternionStamped:
     """Return the rotation (3, 3) of an object as a quaternion."""
-    x, y, z, w = quaternion(rotation).tolist()
-    return QuaternionStamped(header=header, quaternion=Quaternion(x=x, y=y, z=z, w=w))
+    return QuaternionStamped(header=header, quaternion=_quaternion(rotation))
+
+
+def objects(header: Header, lifted: Lifted, names: Sequence[str]) -> MultiDOFJointState:
+    """Return who is in which row of the point cloud, and how each is turned.
+
+    Of the standard messages this one alone holds a header, a list of names and a transform for
+    each: an object before a camera is a floating joint. (TFMessage is in a package that this one
+    does not need; an id as a field of the cloud would have to be a number.)
+
+    names: n, "" for an object without one. A transform leads from the axes of the object, its
+    origin the mean of its keypoints, to those of the cloud: its rotation is that of
+    ~/camera_rotation, its translation zero, as each object of the cloud is centred. NaN where the
+    object could not be lifted.
+    """
+    message = MultiDOFJointState(header=header, joint_names=list(names))
+    message.transforms = [Transform(rotation=_quaternion(R)) for R in lifted.rotations]
+    return message
 
 
 def markers(header: Header, lifted: Lifted, edges: Sequence[tuple[int, int]]) -> MarkerArray:
@@ -106,3 +122,9 @@ def status(
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
     )
+
+
+def _quaternion(rotation: NDArray[np.float32]) -> Quaternion:
+    """Return a rotation (3, 3) as a message, NaN if it is."""
+    x, y, z, w = quaternion(rotation).tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)

@@ -26,6 +26,7 @@ from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, check_name, load_model
 from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.observations.curation import Curation
+from deep_nrsfm_ros.observations.mapping_file import MAPPING_SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,8 @@ class TrainingRequest:
     source_layout, target_layout: those of the bags and of the new model, each as `find_layout`
         takes it; the target may be "numbered", the source is then empty.
     start: the file of the model to start from, or "".
+    input_type, image_width, image_height: those of the lifter. Bags tell the types of their
+        messages; a field mapping says how to read those of a type that is not known.
     """
 
     options: TrainingOptions
@@ -130,6 +133,9 @@ class TrainingRequest:
     output: Path
     curation: Curation = Curation()
     limits: Limits = Limits()
+    input_type: str = ""
+    image_width: int = 0
+    image_height: int = 0
 
     def check(self) -> str:
         """Return what should be known before, or ""; raise ValueError that says what is wrong."""
@@ -172,6 +178,9 @@ class TrainingRequest:
             "--object": self.target_layout,
             "--from": self.start,
             "--min-confidence": str(self.min_confidence),
+            "--mapping": self._mapping,
+            "--image-width": str(self.image_width),
+            "--image-height": str(self.image_height),
         }
         words += [f"{name}={value}" for name, value in named.items()]  # even one that begins with -
         for bag in self.options.bags:
@@ -179,6 +188,11 @@ class TrainingRequest:
         for config in (self.recipe, self.limits, self.curation):
             words += to_arguments(config)
         return words
+
+    @property
+    def _mapping(self) -> str:
+        """Return the file of the field mapping, or ""."""
+        return self.input_type if self.input_type.endswith(MAPPING_SUFFIXES) else ""
 
     def _unfinished(self) -> Unfinished:
         """Return the training to go on with; raise ValueError if there is none."""
@@ -203,6 +217,9 @@ class TrainingRequest:
             "object": self.target_layout,
             "start": self.start,
             "min_confidence": self.min_confidence,
+            "mapping": self._mapping,
+            "image_width": self.image_width,
+            "image_height": self.image_height,
             **dataclasses.asdict(self.recipe),
             **dataclasses.asdict(self.limits),
             **dataclasses.asdict(self.curation),

@@ -252,6 +252,15 @@ OPENPOSE18 = KeypointLayout(
     (*_OPENPOSE_ARMS, *_OPENPOSE_LEGS, *_OPENPOSE_FACE),
     edges=(*_OPENPOSE_EDGES, *(("neck", f"{side}_hip") for side in ("left", "right"))),
 )
+REP155 = KeypointLayout(
+    "rep155",
+    (
+        *_OPENPOSE_ARMS,
+        *_OPENPOSE_LEGS,
+        *_sides("eye", "ear"),
+    ),  # as hri_msgs/Skeleton2D numbers them
+    edges=OPENPOSE18.edges,
+)
 BODY25 = KeypointLayout(
     "body25",
     (
@@ -284,5 +293,5 @@ MEDIAPIPE33 = KeypointLayout(
 
 LAYOUTS: dict[str, KeypointLayout] = {
     preset.name: preset
-    for preset in (HUMAN17, CMU31, COCO17, BODY25, BODY25B, OPENPOSE18, MEDIAPIPE33)
+    for preset in (HUMAN17, CMU31, COCO17, BODY25, BODY25B, OPENPOSE18, REP155, MEDIAPIPE33)
 }

@@ -191,7 +191,7 @@ class Lifter:
         seen = confidence > 0
         mean = confidence.sum(1) / np.maximum(seen.sum(1), 1).astype(np.float32)
         sure = np.where(seen, confidence, np.float32(0.5) * mean[:, None])
-        trust: Float32 = np.clip(sure, 0, 1) * np.clip(1 - residual, 0, 1)[:, None]
+        trust: Float32 = np.minimum(sure, 1) * np.maximum(1 - residual, 0)[:, None]
         return trust
 
 

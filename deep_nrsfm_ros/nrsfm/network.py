@@ -206,8 +206,13 @@ def _solve(A: Array, B: Array) -> Array:
 
 
 def _symmetric_product(A: Array, X: Array) -> Array:
-    """Return A X for a symmetric A (p, p): X^T A is one matrix product for the whole batch."""
-    return (X.swapaxes(-1, -2) @ A).swapaxes(-1, -2)
+    """Return A X for a symmetric A (p, p), as X^T A: one matrix product for the whole batch."""
+    return _product(X.swapaxes(-1, -2), A).swapaxes(-1, -2)
+
+
+def _product(X: Array, A: Array) -> Array:
+    """Return X A for X (..., k): one product of all rows, where NumPy would make one a matrix."""
+    return (X.reshape(-1, X.shape[-1]) @ A).reshape(*X.shape[:-1], A.shape[-1])
 
 
 def forward(net: Network, W: Array) -> tuple[Array, Array]:
@@ -233,16 +238,16 @@ def encode(net: Network, W: Array) -> list[Array]:
     threshold = _THRESHOLDS[net.architecture.threshold]
     p, _, k = net.D[0].shape
     W = whiten(net, W)
-    V = (W.swapaxes(-1, -2) @ net.D[0].reshape(p, 3 * k)).reshape(*W.shape[:-2], 2, 3, k)
+    V = _product(W.swapaxes(-1, -2), net.D[0].reshape(p, 3 * k)).reshape(*W.shape[:-2], 2, 3, k)
     Psi = [threshold(V, net.b[0])]
     for D, b in zip(net.D[1:], net.b[1:], strict=True):
-        Psi.append(threshold(Psi[-1] @ D, b))
+        Psi.append(threshold(_product(Psi[-1], D), b))
     return Psi
 
 
 def _relu(X: Array) -> Array:
-    """Return max(X, 0); torch's own relu, since the gradient of clip costs three times as much."""
-    return X.clip(min=0) if isinstance(X, np.ndarray) else X.relu()
+    """Return max(X, 0), each library by its fastest way."""
+    return np.maximum(X, 0) if isinstance(X, np.ndarray) else X.relu()
 
 
 def _relu_threshold(V: Array, b: Array) -> Array:
@@ -265,7 +270,7 @@ def recover(net: Network, Psi: Array) -> tuple[Array, Array]:
         psi, rows = _leading_factors(Psi)
     else:
         psi = Psi.reshape(*Psi.shape[:-3], 6 * Psi.shape[-1]) @ net.code_head
-        rows = (Psi @ net.camera_head)[..., 0]
+        rows = _product(Psi, net.camera_head)[..., 0]
     if net.architecture.camera == "orthonormal":
         rows = polar(rows)
     return psi, rows.swapaxes(-1, -2)

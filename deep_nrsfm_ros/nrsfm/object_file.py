@@ -5,14 +5,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, Edge, KeypointLayout
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, load_model
+from deep_nrsfm_ros.nrsfm.yaml_file import read_fields, words
 
 OBJECT_SUFFIXES = (".yaml", ".yml")
 FIELDS = (
@@ -23,8 +21,6 @@ HANDEDNESS = ("left", "right", "up", "front")
 NUMBERED = "numbered"
 """Stands for an object that nobody has described, where its points tell how many they are."""
 
-_MAX_BYTES = 64 * 2**10
-_DEEPEST = 8
 _FEWEST = 4  # W = S M has a unique shape from four points on
 
 
@@ -54,50 +50,11 @@ def find_layout(option: str, word: str) -> KeypointLayout:
 def read_object(path: Path) -> KeypointLayout:
     """Return the layout that an object file describes; raise ObjectFileError if it is none."""
     try:
-        return _Description(_parse(path)).layout()
+        return _Description(read_fields(path, "name: hand")).layout()
     except ObjectFileError as error:
         raise ObjectFileError(f"object file {path}: {error}") from None
     except ValueError as error:
         raise ObjectFileError(f"object file {path}: {error}") from error
-
-
-def _parse(path: Path) -> dict[Any, Any]:
-    """Return the fields of a file, its size and its form checked."""
-    try:
-        if path.exists() and not path.is_file():  # reading a pipe would wait for ever
-            raise ObjectFileError("is not a regular file")
-        with path.open("rb") as file:
-            text = file.read(_MAX_BYTES + 1)
-    except OSError as error:
-        raise ObjectFileError(f"cannot be read: {error.strerror or error}") from error
-    if len(text) > _MAX_BYTES:
-        raise ObjectFileError(f"is larger than {_MAX_BYTES >> 10} KiB: not a description")
-    try:
-        _check_nesting(text)
-        root = yaml.compose(text, yaml.SafeLoader)
-        fields = yaml.safe_load(text)
-    except ObjectFileError:
-        raise
-    except Exception as error:  # PyYAML raises many kinds for what explicit tags say
-        raise ObjectFileError(f"is not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(root, yaml.MappingNode) or not isinstance(fields, dict):
-        raise ObjectFileError(f"is {_words(fields)}; it must hold fields like 'name: hand'")
-    ((name, times),) = Counter(str(key.value) for key, _ in root.value).most_common(1) or [("", 0)]
-    if times > 1:  # YAML itself would keep the last and forget the others
-        raise ObjectFileError(f"has the field {_words(name)} {times} times")
-    return fields
-
-
-def _check_nesting(text: bytes) -> None:
-    """Refuse what makes much out of little before it is made: aliases, deep nesting."""
-    depth = 0
-    for event in yaml.parse(text, yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):
-            raise ObjectFileError(f"has the alias *{event.anchor}; write out what it stands for")
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > _DEEPEST:
-            raise ObjectFileError(f"is nested deeper than {_DEEPEST}: not a description")
 
 
 class _Description:
@@ -111,7 +68,7 @@ class _Description:
         unknown = [name for name in fields if name not in FIELDS]
         if unknown:
             raise ObjectFileError(
-                f"has no field {_words(unknown[0])}; the fields are {', '.join(FIELDS)}"
+                f"has no field {words(unknown[0])}; the fields are {', '.join(FIELDS)}"
             )
         # A field without a value, as a template leaves it, is as good as none.
         self._fields = {name: value for name, value in fields.items() if value is not None}
@@ -148,7 +105,7 @@ class _Description:
         given = self._mapping("handedness")
         if set(given) != set(HANDEDNESS):
             raise ObjectFileError(
-                f"handedness names {', '.join(map(_words, given)) or 'nothing'}; "
+                f"handedness names {', '.join(map(words, given)) or 'nothing'}; "
                 f"it must name {', '.join(HANDEDNESS)}"
             )
         left, right, up, front = (self._text(f"handedness.{s}", given[s]) for s in HANDEDNESS)
@@ -166,7 +123,7 @@ class _Description:
         if length is None:
             return None
         if isinstance(length, bool) or not isinstance(length, (int, float)):
-            raise ObjectFileError(f"reference_length is {_words(length)}; it must be in metres")
+            raise ObjectFileError(f"reference_length is {words(length)}; it must be in metres")
         return float(length)
 
     def _pair(self, where: str, value: Any) -> Edge:
@@ -181,27 +138,17 @@ class _Description:
 
     def _list(self, where: str, value: Any) -> list[Any]:
         if not isinstance(value, list):
-            raise ObjectFileError(f"{where} is {_words(value)}; it must be a list")
+            raise ObjectFileError(f"{where} is {words(value)}; it must be a list")
         return value
 
     def _mapping(self, where: str) -> dict[Any, Any]:
         value = self._fields[where]
         if not isinstance(value, dict):
-            raise ObjectFileError(f"{where} is {_words(value)}; it must be a mapping")
+            raise ObjectFileError(f"{where} is {words(value)}; it must be a mapping")
         return value
 
     def _text(self, where: str, value: Any) -> str:
         if isinstance(value, str) and value.strip():
             return value
         # YAML reads `on`, `no` and 1 as something else than text.
-        raise ObjectFileError(
-            f"{where} is {_words(value)}; it must be a name, in quotes if need be"
-        )
-
-
-def _words(value: Any) -> str:
-    """Return a value as a complaint shows it: short, whatever a file holds."""
-    if isinstance(value, (list, dict)):
-        return "a list" if isinstance(value, list) else "a mapping"
-    text = "empty" if value is None else repr(value)
-    return text if len(text) <= 60 else f"{text[:60]}..."
+        raise ObjectFileError(f"{where} is {words(value)}; it must be a name, in quotes if need be")

@@ -27,15 +27,19 @@ class BagError(ValueError):
 
 
 class Topic(NamedTuple):
-    """A topic of a bag: its name, type ("sensor_msgs/msg/PointCloud2") and number of messages."""
+    """A topic of a bag: its name, type ("sensor_msgs/msg/PointCloud2") and number of messages.
+
+    definition: of the type, in the words of a .msg or .idl file; "" if the bag has none.
+    """
 
     name: str
     type: str
     total: int
+    definition: str = ""
 
     @property
     def input_type(self) -> str:
-        """Return the type as `messages.INPUT_TYPES` writes it."""
+        """Return the type as `messages.INPUT_TYPES` write it."""
         return self.type.replace("/msg/", "/")
 
 
@@ -59,12 +63,14 @@ class BagFile:
         """Take over open storages; `problem` says what was wrong when they were opened."""
         self.path, self._storages, self._problem = path, storages, problem
         counts: Counter[tuple[str, str]] = Counter()
+        definitions: dict[str, str] = {}
         for storage in storages:
             for topic in storage.topics():
                 counts[topic.name, topic.type] += topic.total
+                definitions[topic.type] = definitions.get(topic.type) or topic.definition
         recorded = _recorded_counts(path)
         self.topics = [
-            Topic(name, kind, max(count, recorded.get(name, 0)))
+            Topic(name, kind, max(count, recorded.get(name, 0)), definitions[kind])
             for (name, kind), count in counts.items()
         ]
         self._given: Counter[str] = Counter()
@@ -132,6 +138,11 @@ def _recorded_counts(path: Path) -> dict[str, int]:
     return {}
 
 
+def _topic(connection: Any, total: int) -> Topic:
+    """Return a connection of rosbags as a topic."""
+    return Topic(connection.topic, connection.msgtype, total, connection.msgdef.data)
+
+
 class _Sound:
     """A bag, or a file of one, that rosbags can read."""
 
@@ -143,7 +154,7 @@ class _Sound:
 
     def topics(self) -> list[Topic]:
         """Return what is there."""
-        return [Topic(c.topic, c.msgtype, c.msgcount) for c in self._reader.connections]
+        return [_topic(c, c.msgcount) for c in self._reader.connections]
 
     def messages(self, name: str) -> Iterator[bytes]:
         """Yield the serialised messages of a topic."""
@@ -170,7 +181,7 @@ class _CutMcap:
 
     def topics(self) -> list[Topic]:
         """Return what is there; how many messages is unknown."""
-        return [Topic(c.topic, c.msgtype, 0) for c in self._reader.connections]
+        return [_topic(c, 0) for c in self._reader.connections]
 
     def messages(self, name: str) -> Iterator[bytes]:
         """Yield the serialised messages of a topic up to the cut."""
@@ -191,10 +202,16 @@ class _CutSqlite:
         self._file.execute("PRAGMA writable_schema = ON")
         rows = self._file.execute("SELECT id, name, type FROM topics").fetchall()
         self._topics = [row for row in rows if isinstance(row[1], str) and isinstance(row[2], str)]
+        self._definitions: dict[str, str] = {}
+        with suppress(sqlite3.Error):  # older bags have none
+            found = "SELECT topic_type, encoded_message_definition FROM message_definitions"
+            self._definitions = dict(self._file.execute(found).fetchall())
 
     def topics(self) -> list[Topic]:
         """Return what is there; how many messages is unknown."""
-        return [Topic(name, kind, 0) for _, name, kind in self._topics]
+        return [
+            Topic(name, kind, 0, self._definitions.get(kind, "")) for _, name, kind in self._topics
+        ]
 
     def messages(self, name: str) -> Iterator[bytes]:
         """Yield the serialised messages of a topic up to the cut."""

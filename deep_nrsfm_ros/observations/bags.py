@@ -15,21 +15,22 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
-from deep_nrsfm_ros.observations.bag_files import BagError, BagFile, Topic, open_bag
+from deep_nrsfm_ros.observations.bag_files import BagError, open_bag
+from deep_nrsfm_ros.observations.bag_topics import keypoint_topics
 from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.field_mapping import FieldMapping, Size
 from deep_nrsfm_ros.observations.messages import (
-    INPUT_TYPES,
     MULTI_ARRAY,
     POINT_CLOUD,
     POINT_FIELDS,
     POINT_STEP,
     POLYGON,
-    MessageError,
-    Observation,
     count_keypoints,
+    may_leave_out,
     pack_points,
     read,
 )
+from deep_nrsfm_ros.observations.observation import MessageError, Observation
 
 STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
 Progress = Callable[[int, int], None]
@@ -64,13 +65,17 @@ def read_bags(
     min_confidence: float = 0.0,
     on_progress: Progress | None = None,
     max_frames: int | None = None,
+    mapping: FieldMapping | None = None,
+    size: Size | None = None,
 ) -> BagReading:
     """Read the keypoints of all bags into one ensemble in the layout `target`.
 
     paths: bag folders or single .db3 or .mcap files.
-    topic: name of the topic; "" takes the only one of a type in `messages.INPUT_TYPES`.
+    topic: name of the topic, or of several by a `*` (see `topics.match`); "" takes the only one of
+        the mapping's type, or of a type in `messages.INPUT_TYPES`.
     source: the layout in which the detector wrote the messages.
     max_frames: more than these raise BagError.
+    mapping: how messages of its type are read. size: of the image, for normalised keypoints.
     Memory stays within about twice the ensemble. Raises BagError naming the bag when one is
     missing, damaged beyond reading or without such a topic, or when no message is readable.
     """
@@ -80,25 +85,24 @@ def read_bags(
         raise BagError("no bag to read; name at least one")
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
-            chosen = _choose(bag, topic)
-            done = messages
-            for raw in bag.messages(chosen):
-                messages += 1
-                try:
-                    message = _STORE.deserialize_cdr(raw, chosen.type)
-                    frames.add(read(message, chosen.input_type, len(source), min_confidence))
-                except Exception as error:  # whatever bytes a bag holds, the others still count
-                    unreadable += 1
-                    reason = reason or _text(error)
-                if max_frames is not None and frames.count > max_frames:
-                    raise BagError(
-                        f"bag {path} brings the frames above {max_frames}, the most that are read "
-                        "(max_frames); name fewer bags, or allow more"
-                    )
-                if on_progress and messages % 256 == 0:
-                    on_progress(messages, max(messages, done + chosen.total))
-            if warning := bag.warning(chosen):
-                warnings.append(warning)
+            for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
+                done = messages
+                for raw in bag.messages(chosen):
+                    messages += 1
+                    try:
+                        frames.add(read(decode(raw), kind, len(source), min_confidence, size))
+                    except Exception as error:  # whatever bytes a bag holds, others still count
+                        unreadable += 1
+                        reason = reason or _text(error)
+                    if max_frames is not None and frames.count > max_frames:
+                        raise BagError(
+                            f"bag {path} brings the frames above {max_frames}, the most that are "
+                            "read (max_frames); name fewer bags, or allow more"
+                        )
+                    if on_progress and messages % 256 == 0:
+                        on_progress(messages, max(messages, done + chosen.total))
+                if warning := bag.warning(chosen):
+                    warnings.append(warning)
     names = ", ".join(path.name for path in map(Path, paths))
     if messages == unreadable:
         raise BagError(f"no readable message in {names} ({messages} found); {reason or 'empty'}")
@@ -106,30 +110,32 @@ def read_bags(
     return BagReading(ensemble, messages, unreadable, reason, tuple(warnings))
 
 
-def most_keypoints(paths: Sequence[Path], topic: str) -> int:
+def most_keypoints(paths: Sequence[Path], topic: str, mapping: FieldMapping | None = None) -> int:
     """Return how many keypoints the objects in the bags have, for an object nobody has described.
 
     Looks at the first messages of each bag and takes the number that most of them have, since a
-    detector may send others while it sees nothing. Raises BagError if no message tells.
+    detector may send others while it sees nothing; or the highest, of a detector that leaves out
+    what it does not see. Raises BagError if no message tells.
     """
     counts: Counter[int] = Counter()
-    reason = ""
+    reason, partial = "", False
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
-            chosen = _choose(bag, topic)
-            for raw in islice(bag.messages(chosen), _SAMPLE):
-                try:
-                    message = _STORE.deserialize_cdr(raw, chosen.type)
-                    count = count_keypoints(message, chosen.input_type)
-                    if count:
-                        read(message, chosen.input_type, count)  # a damaged one may say anything
-                        counts[count] += 1
-                except Exception as error:  # as in read_bags
-                    reason = reason or _text(error)
+            for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
+                partial |= may_leave_out(kind)
+                for raw in islice(bag.messages(chosen), _SAMPLE):
+                    try:
+                        message = decode(raw)
+                        count = count_keypoints(message, kind)
+                        if count:
+                            read(message, kind, count, size=(1, 1))  # a damaged one says anything
+                            counts[count] += 1
+                    except Exception as error:  # as in read_bags
+                        reason = reason or _text(error)
     if not counts:
         names = ", ".join(path.name for path in map(Path, paths))
         raise BagError(f"no message in {names} tells how many keypoints there are; {reason}")
-    return counts.most_common(1)[0][0]
+    return max(counts) if partial else counts.most_common(1)[0][0]
 
 
 class _Frames:
@@ -153,7 +159,8 @@ class _Frames:
     def _store(self) -> None:
         """Map what is waiting to the target layout."""
         if self._waiting:
-            points, confidence = map(np.concatenate, zip(*self._waiting, strict=True))
+            points = np.concatenate([seen.points for seen in self._waiting])
+            confidence = np.concatenate([seen.confidence for seen in self._waiting])
             points, confidence = self._map(points, confidence)
             self._points.append(points)
             self._visible.append(confidence > 0)
@@ -164,21 +171,6 @@ class _Frames:
         self._store()
         points, visible = np.concatenate(self._points), np.concatenate(self._visible)
         return Ensemble(points, visible, self._map.target, source)
-
-
-def _choose(bag: BagFile, name: str) -> Topic:
-    """Return the topic called `name`, or the only one of a supported type."""
-    listing = ", ".join(f"{t.name} [{t.input_type}]" for t in bag.topics) or "no topics"
-    found = [t for t in bag.topics if t.name == name or not name and t.input_type in INPUT_TYPES]
-    if len(found) != 1:
-        wanted = f"{len(found)} topics called {name}" if name else f"{len(found)} keypoint topics"
-        raise BagError(f"bag {bag.path} has {wanted}; name one of: {listing}")
-    if found[0].input_type not in INPUT_TYPES:
-        raise BagError(
-            f"topic {name} of bag {bag.path} has type {found[0].input_type}; "
-            f"it must be one of {', '.join(INPUT_TYPES)}"
-        )
-    return found[0]
 
 
 def _text(error: Exception) -> str:

@@ -9,18 +9,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from deep_nrsfm_ros.observations.field_mapping import MAPPINGS, FieldMapping, Size
+from deep_nrsfm_ros.observations.mapping_file import MAPPING_SUFFIXES, read_mapping
+from deep_nrsfm_ros.observations.observation import (
+    MessageError,
+    Observation,
+    check_keypoints,
+    observation,
+)
 
 POINT_CLOUD = "sensor_msgs/PointCloud2"
 MULTI_ARRAY = "std_msgs/Float32MultiArray"
 POLYGON = "geometry_msgs/PolygonStamped"
 
-# No image is this large, and sums of squares stay far below the largest float32.
-_FARTHEST = 1e9
-_LEAST = np.nextafter(np.float32(0), np.float32(1))
 _FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField datatypes FLOAT32 and FLOAT64
 
 # The layout that `pack_points` writes, as (name, offset) of float32 fields.
@@ -28,44 +35,70 @@ POINT_FIELDS = (("x", 0), ("y", 4), ("z", 8), ("confidence", 12))
 POINT_STEP = 16
 
 
-class Observation(NamedTuple):
-    """What one message shows: n objects of q keypoints each, in the detector's order.
+InputType = str | FieldMapping
+"""One of `INPUT_TYPES`, or the mapping of any other."""
 
-    points: (n, q, 2) float32, x right and y down; (0, 0) where missing.
-    confidence: (n, q) float32, above 0 and at most 1; 0 where missing.
+
+def find_input(option: str, word: str) -> InputType:
+    """Return the input type that `word`, given by `option`, stands for.
+
+    word: one of `INPUT_TYPES`, or the path of a field mapping. Raises ValueError for anything else,
+    or for a damaged file.
     """
+    name = word.replace("/msg/", "/")
+    if name in INPUT_TYPES:
+        return name
+    if word.endswith(MAPPING_SUFFIXES):
+        return read_mapping(Path(word).expanduser())
+    raise ValueError(
+        f"{option} is {word!r}; name one of {', '.join(INPUT_TYPES)}, or for any other type the "
+        f"path of a field mapping ({MAPPING_SUFFIXES[0]})"
+    )
 
-    points: NDArray[np.float32]
-    confidence: NDArray[np.float32]
+
+def name_of(input_type: InputType) -> str:
+    """Return the type of the messages, "package/Type"."""
+    return input_type if isinstance(input_type, str) else input_type.type
 
 
-class MessageError(ValueError):
-    """A message that cannot be read: says what was expected and what came."""
-
-
-def read(message: Any, input_type: str, keypoints: int, min_confidence: float = 0.0) -> Observation:
-    """Return the observation in `message`, which is of type `input_type` (see `INPUT_TYPES`).
+def read(
+    message: Any,
+    input_type: InputType,
+    keypoints: int,
+    min_confidence: float = 0.0,
+    size: Size | None = None,
+) -> Observation:
+    """Return the observation in `message`, which is of type `input_type`.
 
     keypoints: q, the number that the detector's layout has; another number is an error.
     min_confidence: a keypoint below it is missing. So is one with confidence 0, at (0, 0), or
         with NaN or infinity in a coordinate or its confidence.
+    size: width and height of the image, where the keypoints are normalised by them.
     Raises MessageError for a malformed message, ValueError for an unknown `input_type`.
     """
-    reader = INPUT_TYPES.get(input_type)
-    if reader is None:
-        raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
+    mapping = _mapping(input_type)
     try:
-        values = reader(message, keypoints)
-    except (AttributeError, TypeError, IndexError, OverflowError) as error:
-        raise MessageError(f"expected a message of type {input_type}: {error}") from None
-    return observation(values, min_confidence)
+        if mapping:
+            values, ids = mapping(message, keypoints, size)
+            return observation(values, min_confidence, ids)
+        if isinstance(input_type, str) and (reader := _READERS.get(input_type)):
+            return observation(reader(message, keypoints), min_confidence)
+    except MessageError:
+        raise
+    except (AttributeError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise MessageError(f"expected a message of type {name_of(input_type)}: {error}") from None
+    raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
 
 
-def count_keypoints(message: Any, input_type: str) -> int:
+def count_keypoints(message: Any, input_type: InputType) -> int:
     """Return how many keypoints each object in `message` has; 0 if there is no object in it.
 
-    Raises MessageError for an array of plain numbers that may be pairs or triples.
+    Where the detector leaves some out it is the least that there can be. Raises MessageError for
+    an array of plain numbers that may be pairs or triples.
     """
+    mapping = _mapping(input_type)
+    if mapping:
+        return mapping.count(message)
     if input_type == POINT_CLOUD:
         return int(message.width) if int(message.height) else 0
     if input_type == POLYGON:
@@ -83,24 +116,15 @@ def count_keypoints(message: Any, input_type: str) -> int:
     )
 
 
-def observation(values: NDArray[np.floating], min_confidence: float = 0.0) -> Observation:
-    """Return values (n, q, 2: x, y or 3: x, y, confidence) with missing keypoints marked.
+def may_leave_out(input_type: InputType) -> bool:
+    """Tell whether messages leave out keypoints, so that none need tell how many there are."""
+    mapping = _mapping(input_type)
+    return bool(mapping and mapping.keypoint_id and not mapping.names)
 
-    Values without a confidence are certain; a confidence above 1 counts as 1.
-    """
-    with np.errstate(over="ignore"):
-        values = values.astype(np.float32)
-    x, y = values[..., 0], values[..., 1]
-    # NaN compares false, so the first test drops it together with infinity.
-    seen = (np.abs(values).max(-1) < _FARTHEST) & ((x != 0) | (y != 0))
-    if values.shape[-1] == 3:
-        confidence = np.minimum(values[..., 2], np.float32(1))
-        seen &= confidence >= max(np.float32(min_confidence), _LEAST)
-    else:
-        confidence = np.ones_like(x)
-    points = values[..., :2]
-    points[~seen] = confidence[~seen] = 0
-    return Observation(points, confidence)
+
+def _mapping(input_type: InputType) -> FieldMapping | None:
+    """Return the mapping of an input type, if it is read by one."""
+    return MAPPINGS.get(input_type) if isinstance(input_type, str) else input_type
 
 
 def pack_points(points: NDArray[np.floating], confidence: NDArray[np.floating]) -> bytes:
@@ -118,7 +142,7 @@ def pack_points(points: NDArray[np.floating], confidence: NDArray[np.floating]) 
 def _point_cloud(message: Any, keypoints: int) -> NDArray[np.floating]:
     """Return (n, q, 2 or 3) of a PointCloud2: fields x, y and, where there is one, confidence."""
     height, width, step = int(message.height), int(message.width), int(message.point_step)
-    _check_keypoints(width, keypoints, "width")
+    check_keypoints(width, keypoints, "width")
     names = ["x", "y"] + ["confidence"] * any(f.name == "confidence" for f in message.fields)
     formats, offsets = zip(*(_field(message.fields, name, step) for name in names), strict=True)
     if not height:
@@ -181,7 +205,7 @@ def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:
     *objects, count, size = shape
     if size not in (2, 3):
         raise MessageError(f"last dimension is {size}; expected 2 (x, y) or 3 (x, y, confidence)")
-    _check_keypoints(count, keypoints, "next to last dimension")
+    check_keypoints(count, keypoints, "next to last dimension")
     return data.reshape(*(objects or [1]), count, size)
 
 
@@ -191,22 +215,15 @@ def _polygon(message: Any, keypoints: int) -> NDArray[np.floating]:
     A z of exactly 0 everywhere is a sender that gives no confidence: all points are certain.
     """
     points = message.polygon.points
-    _check_keypoints(len(points), keypoints, "number of points")
+    check_keypoints(len(points), keypoints, "number of points")
     values = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(1, keypoints, 3)
     return values if values[..., 2].any() else values[..., :2]
 
 
-def _check_keypoints(count: int, keypoints: int, where: str) -> None:
-    """Raise MessageError naming both numbers when they differ."""
-    if count != keypoints:
-        raise MessageError(
-            f"message has {count} keypoints ({where}); the keypoint layout has {keypoints}: "
-            "name the layout in which the detector gives them"
-        )
-
-
-INPUT_TYPES: dict[str, Callable[[Any, int], NDArray[np.floating]]] = {
+_READERS: dict[str, Callable[[Any, int], NDArray[np.floating]]] = {
     POINT_CLOUD: _point_cloud,
     MULTI_ARRAY: _multi_array,
     POLYGON: _polygon,
 }
+
+INPUT_TYPES = (*_READERS, *MAPPINGS)

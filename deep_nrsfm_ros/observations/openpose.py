@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.observations.messages import Observation, observation
+from deep_nrsfm_ros.observations.observation import Observation, observation
 
 
 def read_people(text: str | bytes, keypoints: int, min_confidence: float = 0.0) -> Observation:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from deep_nrsfm_ros.nrsfm.keypoints import BODY25B, HUMAN17
 from deep_nrsfm_ros.observations.cameras import Array, Camera, triangulate
-from deep_nrsfm_ros.observations.messages import Observation
+from deep_nrsfm_ros.observations.observation import Observation
 from deep_nrsfm_ros.observations.openpose import largest, read_people
 
 RATE = 60.0
@@ -146,7 +146,8 @@ def _detections(archive: zipfile.ZipFile, camera: str) -> Observation:
         people = read_people(archive.read(name), len(BODY25B))
         subject = largest(people)
         if subject is not None:
-            points[frame], confidence[frame] = (part[subject] for part in people)
+            points[frame] = people.points[subject]
+            confidence[frame] = people.confidence[subject]
     return Observation(points, confidence)
 
 

@@ -53,6 +53,16 @@ def test_each_report_begins_anew_but_totals_stay(health, clock):
     assert values["last problem"] == "too short"
 
 
+def test_a_detector_that_sees_nothing_is_heard(health, clock):
+    health.unheard("a publisher that is gone by now")
+    clock.now += 10
+    health.saw_nothing()
+    assert not health.idle
+    level, message, values = health.report()
+    assert (level, message) == (OK, "the detector sees no object")
+    assert values["messages without objects"] == "1" and health.idle
+
+
 def test_nothing_but_rejected_messages_is_an_error_that_says_why(health):
     health.rejected("5 keypoints, not 17")
     level, message, _ = health.report()

@@ -118,7 +118,6 @@ def bad_clouds() -> dict[str, PointCloud2]:
         "too long": cloud(pixels(1, P + 1)),
         "too short": cloud(pixels(1, P - 1)),
         "nothing": PointCloud2(),
-        "no object": cloud(pixels(0)),
         "field missing": wrong_field,
         "data missing": short,
         "wrong datatype": strange_type,
@@ -145,6 +144,18 @@ def test_bad_input_is_counted_and_the_next_message_lifted(start_lifter, connect)
     last = {pair.key: pair.value for pair in status.values}["last problem"]
     assert "3 visible keypoints" in last
     assert "dropped" in lifter.log
+
+
+def test_a_detector_that_sees_nobody_is_no_trouble(start_lifter, connect):
+    start_lifter()
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    sender = client.node.create_timer(0.1, lambda: publisher.publish(cloud(pixels(0))))
+    status = client.wait_for_health(lambda _, v: int(v["messages without objects"]) > 0)
+    assert status.level == b"\x00" and "sees no object" in status.message
+    client.node.destroy_timer(sender)
+    assert not client.heard["/lifter/points"]
+    assert unpack(client.exchange(publisher, cloud(pixels(1)))).shape == (1, P, 4)
 
 
 def test_nothing_but_bad_input_is_an_error_and_silence_a_warning(start_lifter, connect):

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from std_msgs.msg import Header
 
 from deep_nrsfm_ros.node import lifter, publishing
+from deep_nrsfm_ros.node.listening import Source
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.observations.messages import POINT_CLOUD, read
+from deep_nrsfm_ros.observations.tracker import Tracker
 
 
 def lifted(n: int, p: int = 5, seed: int = 0) -> Lifted:
@@ -40,7 +42,7 @@ def test_one_cloud_serves_messages_of_any_size():
         values = np.frombuffer(message.data, "<f4").reshape(n, p, 4)
         np.testing.assert_array_equal(values[..., :3], wanted.shapes)
         np.testing.assert_array_equal(values[..., 3], wanted.confidence)
-        points, confidence = read(message, POINT_CLOUD, p)
+        points, confidence, _ = read(message, POINT_CLOUD, p)
         np.testing.assert_array_equal(points, wanted.shapes[..., :2])
         np.testing.assert_array_equal(confidence, wanted.confidence)
 
@@ -49,6 +51,19 @@ def test_a_cloud_with_nan_is_not_dense():
     part = lifted(2)
     part.residual[1] = np.nan
     assert not publishing.PointCloud().fill(Header(), part).is_dense
+
+
+def test_objects_are_named_and_turned_row_by_row():
+    both = lifted(2)
+    both.rotations[0] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    both.rotations[1] = np.nan
+    sent = publishing.objects(Header(frame_id="camera"), both, ("anna", ""))
+    message = deserialize_message(serialize_message(sent), MultiDOFJointState)
+    assert message.header.frame_id == "camera" and message.joint_names == ["anna", ""]
+    first, second = (transform.rotation for transform in message.transforms)
+    assert first == publishing.camera_rotation(Header(), both.rotations[0]).quaternion
+    assert np.isnan([second.x, second.y, second.z, second.w]).all()
+    assert message.transforms[0].translation.x == 0
 
 
 def test_the_rotation_turns_the_object_into_the_camera():
@@ -82,7 +97,10 @@ def test_markers_are_not_made_when_nobody_listens(
         node = lifter.LifterNode()
         heard: list[PointCloud2] = []
         monkeypatch.setattr(node._points, "publish", heard.append)
-        node._lift(publishing.PointCloud().fill(Header(), lifted(1, len(HUMAN17))))
+        node._lift(
+            Source("/keypoints", POINT_CLOUD, Tracker()),
+            publishing.PointCloud().fill(Header(), lifted(1, len(HUMAN17))),
+        )
         assert heard and not made
         node.destroy_node()
     finally:

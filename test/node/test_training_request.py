@@ -56,10 +56,19 @@ def test_the_training_command_understands_every_word(tmp_path):
     assert given.start == ""
     assert (given.object, given.name, given.threads) == ("human17", "mine", 3)
     assert (given.output, given.min_confidence) == (Path("folder"), 0.25)
+    assert given.mapping == "" and (given.image_width, given.image_height) == (0, 0)
     assert given.json_progress
     assert override(Recipe(), given) == recipe
     assert override(Curation(), given) == curation
     assert override(Limits(), given) == limits
+
+
+def test_what_the_lifter_knows_of_the_messages_goes_along():
+    wanted = dataclasses.replace(
+        request(), input_type="cats.yaml", image_width=640, image_height=480
+    )
+    given = arguments().parse_args(wanted.arguments())
+    assert (given.mapping, given.image_width, given.image_height) == ("cats.yaml", 640, 480)
 
 
 @pytest.mark.parametrize("name", ["", ".", "../up", "a/b", "-x", "a b", "x" * 101])

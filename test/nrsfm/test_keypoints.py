@@ -18,6 +18,8 @@ PLACES = {
     "18 left_ear 19 left_big_toe 20 left_small_toe 21 left_heel 22 right_big_toe 24 right_heel",
     "openpose18": "0 nose 1 neck 2 right_shoulder 4 right_wrist 5 left_shoulder 8 right_hip "
     "10 right_ankle 11 left_hip 13 left_ankle 14 right_eye 15 left_eye 16 right_ear 17 left_ear",
+    "rep155": "0 nose 1 neck 2 right_shoulder 4 right_wrist 5 left_shoulder 8 right_hip "
+    "10 right_ankle 11 left_hip 13 left_ankle 14 left_eye 15 right_eye 16 left_ear 17 right_ear",
     "body25b": "0 nose 1 left_eye 4 right_ear 5 left_shoulder 6 right_shoulder 7 left_elbow "
     "9 left_wrist 10 right_wrist 11 left_hip 12 right_hip 13 left_knee 16 right_ankle "
     "17 upper_neck 18 head_top 19 left_big_toe 21 left_heel 22 right_big_toe 24 right_heel",
@@ -30,7 +32,7 @@ PLACES = {
     "human17": "0 left_shoulder 1 right_shoulder 12 neck 13 mid_hip 14 nose 15 left_big_toe",
 }
 COUNTS = {"human17": 17, "cmu31": 31, "coco17": 17, "body25": 25, "body25b": 25}
-COUNTS |= {"openpose18": 18, "mediapipe33": 33}
+COUNTS |= {"openpose18": 18, "rep155": 18, "mediapipe33": 33}
 
 
 @every_preset

@@ -21,12 +21,12 @@ from deep_nrsfm_ros.observations.messages import (
     POINT_FIELDS,
     POINT_STEP,
     POLYGON,
-    MessageError,
     count_keypoints,
-    observation,
+    find_input,
     pack_points,
     read,
 )
+from deep_nrsfm_ros.observations.observation import MessageError, observation
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 FORMATS = {PointField.FLOAT32: "f4", PointField.FLOAT64: "f8"}
@@ -109,7 +109,7 @@ def polygon(values: np.ndarray) -> PolygonStamped:
 def test_point_cloud_of_any_make(origin: str, n: int, q: int, names: Any, **make: Any) -> None:
     values = keypoints(n, q)
     message = received(cloud(values, names=tuple(names), **make), POINT_CLOUD, origin)
-    points, confidence = read(message, POINT_CLOUD, q)
+    points, confidence, _ = read(message, POINT_CLOUD, q)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2])
     assert points.dtype == confidence.dtype == np.float32
@@ -126,7 +126,7 @@ def test_packed_points_read_back() -> None:
     message = PointCloud2(height=2, width=6, point_step=POINT_STEP, row_step=6 * POINT_STEP)
     message.fields = [PointField(name=n, offset=o, datatype=7, count=1) for n, o in POINT_FIELDS]
     message.data = array("B", pack_points(values[..., :2], values[..., 2]))
-    points, confidence = read(message, POINT_CLOUD, 6)
+    points, confidence, _ = read(message, POINT_CLOUD, 6)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2])
 
@@ -139,7 +139,7 @@ def test_multi_array_by_its_layout(origin: str, shape: str, size: int) -> None:
     values = keypoints(n, q)
     sizes = {"p": (q, size), "n p": (n, q, size), "flat": (q * size,), "none": ()}[shape]
     message = multi_array(values[..., :size], sizes, offset=2)
-    points, confidence = read(received(message, MULTI_ARRAY, origin), MULTI_ARRAY, q)
+    points, confidence, _ = read(received(message, MULTI_ARRAY, origin), MULTI_ARRAY, q)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2] if size == 3 else np.ones((n, q)))
 
@@ -147,7 +147,7 @@ def test_multi_array_by_its_layout(origin: str, shape: str, size: int) -> None:
 @BOTH
 def test_polygon_takes_z_for_confidence(origin: str) -> None:
     values = keypoints(1, 7)
-    points, confidence = read(received(polygon(values[0]), POLYGON, origin), POLYGON, 7)
+    points, confidence, _ = read(received(polygon(values[0]), POLYGON, origin), POLYGON, 7)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2])
     values[..., 2] = 0
@@ -178,7 +178,7 @@ def test_missing_keypoints(missing: tuple[float, float, float]) -> None:
     values[0, 3] = missing
     with np.errstate(all="raise", over="ignore"):
         message = cloud(values, datatypes=(PointField.FLOAT64,) * 3)
-        points, confidence = read(message, POINT_CLOUD, 5, min_confidence=0.3)
+        points, confidence, _ = read(message, POINT_CLOUD, 5, min_confidence=0.3)
     np.testing.assert_array_equal(confidence, [[0.5, 0.5, 0.5, 0, 0.5]])
     np.testing.assert_array_equal(points[0, 3], [0, 0])
     np.testing.assert_array_equal(points[0, :3], values[0, :3, :2].astype(np.float32))
@@ -201,7 +201,7 @@ def test_confidence_is_at_most_one() -> None:
         (MULTI_ARRAY, multi_array(keypoints(1, 17), (17, 3))),
         (POLYGON, polygon(keypoints(1, 17)[0])),
     ],
-    ids=INPUT_TYPES,
+    ids=[POINT_CLOUD, MULTI_ARRAY, POLYGON],
 )
 def test_wrong_number_of_keypoints_names_both(input_type: str, message: Any) -> None:
     with pytest.raises(MessageError, match="17 keypoints.*has 25"):
@@ -281,7 +281,7 @@ def test_malformed_multi_array(sizes: tuple[int, ...], expected: str) -> None:
 )
 def test_arbitrary_point_cloud_is_read_or_refused(**message: Any) -> None:
     try:
-        points, confidence = read(SimpleNamespace(**message), POINT_CLOUD, 5)
+        points, confidence, _ = read(SimpleNamespace(**message), POINT_CLOUD, 5)
     except MessageError:
         return
     assert points.shape == (message["height"], 5, 2)
@@ -298,7 +298,7 @@ def test_arbitrary_multi_array_is_read_or_refused(
 ) -> None:
     layout = SimpleNamespace(data_offset=offset, dim=[SimpleNamespace(size=s) for s in sizes])
     try:
-        points, confidence = read(SimpleNamespace(layout=layout, data=data), MULTI_ARRAY, 5)
+        points, confidence, _ = read(SimpleNamespace(layout=layout, data=data), MULTI_ARRAY, 5)
     except MessageError:
         return
     assert points.shape[1:] == (5, 2) and len(points) * 10 <= len(data)
@@ -314,6 +314,14 @@ def test_message_of_another_type_is_refused(input_type: str) -> None:
 def test_unknown_input_type_lists_the_known() -> None:
     with pytest.raises(ValueError, match="no input type 'a/B'; choose one of sensor_msgs/Point"):
         read(None, "a/B", 5)
+
+
+def test_a_type_is_found_by_name_and_else_the_choice_is_told() -> None:
+    assert find_input("input_type", "sensor_msgs/msg/PointCloud2") == POINT_CLOUD
+    with pytest.raises(ValueError, match=r"input_type is 'a/B'; name one of .*field mapping"):
+        find_input("input_type", "a/B")
+    with pytest.raises(ValueError, match="field mapping nowhere.yaml: cannot be read"):
+        find_input("input_type", "nowhere.yaml")
 
 
 @pytest.mark.parametrize(
