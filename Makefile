@@ -16,7 +16,7 @@ LOCK_TORCH ?= torch==2.13.0
 
 # In order: what an earlier one has trained, the later ones find in the output folder.
 BENCHMARKS := nrsfm_on_cmu mirror ablation unseen noise missing structure_from_category classic_sequences \
-    coherence spoiled
+    coherence perspective reliability steadiness spoiled
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready

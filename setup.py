@@ -21,7 +21,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),
         (f"{SHARE}/launch", glob("launch/*.launch.py")),
-        (f"{SHARE}/config", glob("config/*.yaml")),
+        (f"{SHARE}/config", glob("config/*.yaml") + glob("config/*.rviz")),
         (f"{SHARE}/config/objects", glob("config/objects/*.yaml")),
         (f"{SHARE}/config/security", glob("config/security/*.xml")),
         (f"{SHARE}/config/mappings", glob("config/mappings/*.yaml")),
@@ -36,8 +36,8 @@ setup(
         "torch>=2.2",  # training only; the node lifts without it
         "rosbags",  # reads and writes rosbag2 without a ROS installation
         "pyyaml",  # object files, parameter files and bag metadata
-        "jinja2",  # the training's report: a template that escapes whatever comes from data
-        "tqdm",  # progress of training and evaluation
+        "jinja2",  # reports and recordings as pages: templates that escape whatever comes from data
+        "tqdm",  # progress of training, evaluation and lifting
         "ros-jazzy-rclpy",  # the node
         "ros-jazzy-common-interfaces",  # the messages it hears and speaks
         "ros-jazzy-rmw-fastrtps-cpp",  # the DDS under it

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, TypeVar, get_type_hints
 
 Config = TypeVar("Config")
@@ -74,13 +75,16 @@ def check(config: Any) -> None:
         opt.check(field.name, getattr(config, field.name))
 
 
-def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
+def add_arguments(parser: argparse.ArgumentParser, cls: type, without: Sequence[str] = ()) -> None:
     """Add `--name-of-field` to `parser` for every option of the dataclass `cls`.
 
-    What is not given leaves no trace in the parsed arguments: see `override`.
+    without: fields that mean nothing to this program. What is not given leaves no trace in the
+    parsed arguments: see `override`.
     """
     group = parser.add_argument_group((cls.__doc__ or cls.__name__).splitlines()[0].rstrip("."))
     for field, kind, opt in options(cls):
+        if field.name in without:
+            continue
         settings: dict[str, Any] = {"default": argparse.SUPPRESS}
         if kind is bool:
             settings["action"] = argparse.BooleanOptionalAction

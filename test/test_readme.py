@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.node.camera import CameraOptions
 from deep_nrsfm_ros.node.parameters import name_of
 from deep_nrsfm_ros.node.pipeline import InputOptions
 from deep_nrsfm_ros.node.training_request import TrainingOptions
@@ -15,6 +16,7 @@ from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations.curation import Curation
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
@@ -38,6 +40,8 @@ def parameter_rows(cls: type, prefix: str) -> list[str]:
     [
         (InputOptions, ""),
         (LiftingOptions, ""),
+        (CameraOptions, ""),
+        (SteadyingOptions, "steady."),
         (TrainingOptions, "train."),
         (Recipe, "train."),
         (Limits, "train."),

@@ -28,10 +28,10 @@ CONVENTIONS = {
     "unscaled %": "as proper, without rescaling",
 }
 """What each figure of `figures` means."""
-ALONE = LiftingOptions(correction="none", turns=1)
+ALONE = LiftingOptions(correction="none", turns=1, mirror=False)
 LIFTING = {
     "network alone": ALONE,
-    "back-projected": LiftingOptions(correction="back_projection", turns=1),
+    "back-projected": LiftingOptions(correction="back_projection", turns=1, mirror=False),
     "as shipped": LiftingOptions(),
     "as shipped, noise 0": LiftingOptions(noise=0.0),
 }
@@ -46,7 +46,14 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument(
         "--models-dir", type=Path, default=Path("models"), help="searched before the package's own"
     )
-    parser.add_argument("--cmu", type=Path, required=True, help="folder of the CMU database")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--cmu", type=Path, help="folder of the CMU database")
+    source.add_argument(
+        "--pose2sim",
+        type=Path,
+        help="wheel of pose2sim 0.6.0, with real detections of a person by four cameras: tells "
+        "what intrinsics are worth, and how far off the place is",
+    )
     parser.add_argument("--subjects", nargs="+", default=["01"])
     parser.add_argument(
         "--split",
@@ -104,10 +111,32 @@ def figures(errors: ShapeErrors) -> dict[str, float]:
     return {name: 100 * value for name, value in zip(CONVENTIONS, shown, strict=True)}
 
 
+def compare_cameras(given: argparse.Namespace) -> None:
+    """Print what a real person's detections come to, with and without intrinsics."""
+    try:
+        # Here, because motion capture needs no SciPy.
+        from deep_nrsfm_ros.commands.four_cameras import CAMERA_CONVENTIONS, camera_table
+        from deep_nrsfm_ros.observations.pose2sim import read_session
+    except ModuleNotFoundError as error:
+        print(f"failed: {error}; install deep_nrsfm_ros[benchmarks]", file=sys.stderr)
+        sys.exit(2)
+    try:
+        models = [load_model(find_model(m, model_folders(given.models_dir))) for m in given.models]
+        session = read_session(given.pose2sim)
+        print(camera_table(models, session), flush=True)
+    except (ValueError, OSError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        sys.exit(2)
+    print("", *(f"{name}: {meaning}" for name, meaning in CAMERA_CONVENTIONS.items()), sep="\n")
+
+
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per model and way of lifting; exit code 2 says the input was at fault."""
     given = arguments().parse_args(argv)
+    if given.pose2sim:
+        compare_cameras(given)
+        return
     columns = ("model", "lifted", *CONVENTIONS)
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
     try:

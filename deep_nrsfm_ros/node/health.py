@@ -13,6 +13,7 @@ OK, WARN, ERROR = range(3)
 
 _SILENCE = 3.0
 _POOR_FIT = 0.3
+_UNSURE = 0.3
 
 
 class Report(NamedTuple):
@@ -28,8 +29,9 @@ class Health:
 
     ERROR: messages came since the last report and none could be lifted, or there is a publisher
     that cannot be heard and nothing else to lift.
-    WARN: some messages could not be lifted; none has come for 3 s; or half of the objects seen
-    since the last report fit the model worse than a reprojection error of 0.3.
+    WARN: some messages could not be lifted; none has come for 3 s; half of the objects seen
+    since the last report fit the model worse than a reprojection error of 0.3; or half of them
+    have a confidence below 0.3.
     OK: otherwise.
     """
 
@@ -39,6 +41,7 @@ class Health:
         self._last_input = self._last_report = clock()
         self._seconds: list[float] = []
         self._errors: list[NDArray[np.float32]] = []
+        self._confidences: list[NDArray[np.float32]] = []
         self._rejected = self._empty = 0
         self._unheard = ""
         self.total_lifted = 0
@@ -51,14 +54,22 @@ class Health:
         """Tell whether no message has come since the last report."""
         return not self._seconds and not self._rejected and not self._empty
 
-    def lifted(self, seconds: float, reprojection_error: NDArray[np.float32]) -> None:
+    def lifted(
+        self,
+        seconds: float,
+        reprojection_error: NDArray[np.float32],
+        confidence: NDArray[np.float32],
+    ) -> None:
         """Count a message that took `seconds`.
 
         reprojection_error: (n) of its objects, NaN of those that could not be lifted.
+        confidence: (n) of its objects.
         """
         self._last_input = self._clock()
         self._seconds.append(seconds)
-        self._errors.append(reprojection_error[~np.isnan(reprojection_error)])
+        known = ~np.isnan(reprojection_error)
+        self._errors.append(reprojection_error[known])
+        self._confidences.append(confidence[known])
         self._unheard = ""
         self.total_lifted += 1
 
@@ -84,15 +95,15 @@ class Health:
         """Return how the time since the last report went, and begin anew."""
         now = self._clock()
         seconds = np.array(self._seconds or [np.nan])
-        errors = np.concatenate([np.empty(0), *self._errors])
-        error = float(np.median(errors)) if len(errors) else np.nan
+        error, confidence = _median(self._errors), _median(self._confidences)
         rate = len(self._seconds) / max(now - self._last_report, 1e-9)
-        level, message = self._judge(now - self._last_input, error)
+        level, message = self._judge(now - self._last_input, error, confidence)
         values = {
             "rate [Hz]": f"{rate:.1f}",
             "processing time p50 [ms]": f"{np.median(seconds) * 1e3:.3f}",
             "processing time max [ms]": f"{seconds.max() * 1e3:.3f}",
             "reprojection error": f"{error:.4f}",
+            "confidence": f"{confidence:.2f}",
             "messages lifted": str(self.total_lifted),
             "messages without objects": str(self.total_empty),
             "messages rejected": str(self.total_rejected),
@@ -101,9 +112,10 @@ class Health:
         self._last_report, self._rejected, self._empty = now, 0, 0
         self._seconds.clear()
         self._errors.clear()
+        self._confidences.clear()
         return Report(level, message, values)
 
-    def _judge(self, silence: float, error: float) -> tuple[int, str]:
+    def _judge(self, silence: float, error: float, confidence: float) -> tuple[int, str]:
         """Return level and message by the rules of the class."""
         if self._rejected:
             came = self._rejected + len(self._seconds)
@@ -115,6 +127,14 @@ class Health:
             return WARN, f"no keypoints for {silence:.0f} s"
         if error > _POOR_FIT:
             return WARN, f"poor fit: half of the reprojection errors are above {error:.2f}"
+        if confidence < _UNSURE:
+            return WARN, f"low confidence: that of half of the objects is below {confidence:.2f}"
         if self._empty and not self._seconds:
             return OK, "the detector sees no object"
         return OK, "lifting" if self._seconds else "waiting for keypoints"
+
+
+def _median(values: list[NDArray[np.float32]]) -> float:
+    """Return the median of all that is in the arrays, NaN if nothing is."""
+    together = np.concatenate([np.empty(0), *values])
+    return float(np.median(together)) if len(together) else np.nan

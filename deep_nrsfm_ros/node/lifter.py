@@ -2,13 +2,14 @@
 
 Every message on `keypoints` is answered, with its own header, on
 
-- ~/points: n objects (rows) of p keypoints: x right, y down, z forward, and confidence; centred
-  on each object's keypoints, in units of the parameter reference_length; NaN where too few
-  keypoints are visible,
+- ~/points: n objects (rows) of p keypoints: x right, y down, z forward, and confidence; at their
+  place before the camera if its CameraInfo is known, else centred on each object's keypoints; in
+  units of the parameter reference_length; NaN where too few keypoints are visible,
 - ~/camera_rotation: from the axes of the first object (x front, y left, z up, where its layout
   says which is which) to those of the camera; left out when the first object is NaN,
 - ~/objects: who is in which row, and the rotation of each; made only when someone listens,
-- ~/markers: the same for RViz, made only when someone listens.
+- ~/markers: the same for RViz, made only when someone listens,
+- /tf: a frame for each object, if the parameter tf_prefix asks for it.
 
 It never imports torch: lifting is NumPy, and training is a process of its own.
 """
@@ -37,6 +38,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.node import parameters, publishing
+from deep_nrsfm_ros.node.camera import CameraListener, CameraOptions
 from deep_nrsfm_ros.node.fence import Fence
 from deep_nrsfm_ros.node.health import Health
 from deep_nrsfm_ros.node.listening import Listener, Source
@@ -50,14 +52,17 @@ from deep_nrsfm_ros.node.training_request import (
     paths_of,
 )
 from deep_nrsfm_ros.node.training_service import TrainingService
+from deep_nrsfm_ros.node.transforms import Broadcaster
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations.curation import Curation
 
+_STEADY = "steady."
 _TRAIN = "train."
 _LOG_PERIOD = 2.0
 _REPORT_PERIOD = 1.0
@@ -76,6 +81,8 @@ class LifterNode(Node):
         super().__init__("lifter")
         self._inputs = parameters.declare(self, InputOptions)
         parameters.declare(self, LiftingOptions)
+        camera = parameters.declare(self, CameraOptions)
+        parameters.declare(self, SteadyingOptions, _STEADY)
         training = parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
         parameters.declare(self, Limits, _TRAIN)
@@ -87,6 +94,8 @@ class LifterNode(Node):
         )
         self._pipeline = self._proposed = self._prepare(())
 
+        self._camera = CameraListener(self, camera)
+        self._tf = Broadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._health = Health()
         self._cloud = publishing.PointCloud()
         self._points = self.create_publisher(PointCloud2, "~/points", 10)
@@ -117,24 +126,34 @@ class LifterNode(Node):
         """Lift one message and publish the result: the hot path."""
         started = time.perf_counter()
         try:
-            seen = self._pipeline.observe(message, source.input_type)
-            if not len(seen.confidence):
-                self._health.saw_nothing()
-                return
-            lifted = self._pipeline.lift(seen)
+            intrinsics = self._camera.known()
+            seen = self._pipeline.observe(message, source.input_type, self._camera.size)
+            told = self._objects.get_subscription_count()
+            wanted = told or self._tf or self._pipeline.steadies
+            names = source.tracker(seen, started) if wanted else ("",) * len(seen.confidence)
+            header = getattr(message, "header", None) or self._header()
+            header.frame_id = header.frame_id or self._camera.frame
+            stamp = publishing.seconds(header.stamp) or publishing.seconds(self._header().stamp)
+            lifted, names = self._pipeline.lift(seen, intrinsics, names, source.topic, stamp)
         except Exception as problem:  # whatever it is, the next message may be fine
             self._reject(source, problem)
             return
-        header = getattr(message, "header", None) or self._header()
+        if not names:
+            self._health.saw_nothing()
+            return
+        placed = self._camera.wanted
         self._points.publish(self._cloud.fill(header, lifted))
         if not np.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
-        if self._objects.get_subscription_count():
-            names = source.tracker(seen, started)
-            self._objects.publish(publishing.objects(header, lifted, names))
+        if told:
+            self._objects.publish(publishing.objects(header, lifted, names, placed=placed))
+        if self._tf:
+            self._tf.send(header, lifted, names)
         if self._markers.get_subscription_count():
-            self._markers.publish(publishing.markers(header, lifted, self._pipeline.edges))
-        self._health.lifted(time.perf_counter() - started, lifted.residual)
+            edges = self._pipeline.edges
+            self._markers.publish(publishing.markers(header, lifted, edges, placed=placed))
+        fit = lifted.residual, lifted.object_confidence
+        self._health.lifted(time.perf_counter() - started, *fit)
 
     def _reject(self, source: Source, problem: Exception) -> None:
         """Count a message that could not be lifted; say why, but not too often."""
@@ -154,7 +173,7 @@ class LifterNode(Node):
         level, message, values = self._health.report()
         model = self._pipeline.model
         values |= {"model": model.name, "topic": ", ".join(self._listener.topics)}
-        values["heard"] = self._listener.heard
+        values |= {"heard": self._listener.heard, "camera": self._camera.status}
         lifting = publishing.status(f"{self.get_name()}: lifting", level, message, values)
         self._diagnostics.publish(
             DiagnosticArray(header=self._header(), status=[lifting, self._training.status])
@@ -164,6 +183,7 @@ class LifterNode(Node):
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
+        steadying = parameters.read(self, SteadyingOptions, _STEADY, changes)
         for checked in (TrainingOptions, Recipe, Limits, Curation):
             parameters.read(self, checked, _TRAIN, changes)
         # Files are read again only when they are named again: they may be gone by now.
@@ -181,7 +201,7 @@ class LifterNode(Node):
         else:
             word = self._fence.layout("keypoint_layout", inputs.keypoint_layout)
             detector = find_layout("keypoint_layout", word)
-        return Pipeline(model, detector, inputs, lifting)
+        return Pipeline(model, detector, inputs, lifting, steadying)
 
     def _consider(self, changes: list[Parameter]) -> SetParametersResult:
         """Prepare for changed parameters, or refuse them with the reason."""

@@ -9,9 +9,12 @@ import numpy as np
 
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.node.model_folders import default_bags_dir, default_models_dir
+from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.nrsfm.placement import lift_at_place
+from deep_nrsfm_ros.nrsfm.steadying import Steadying, SteadyingOptions
 from deep_nrsfm_ros.observations.field_mapping import Size
 from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, InputType, read
 from deep_nrsfm_ros.observations.observation import MessageError, Observation
@@ -82,6 +85,7 @@ class Pipeline:
         detector: KeypointLayout | None,
         inputs: InputOptions,
         lifting: LiftingOptions,
+        steadying: SteadyingOptions,
     ) -> None:
         """Raise ValueError if the model and the detector's layout do not fit each other.
 
@@ -95,6 +99,8 @@ class Pipeline:
         self._min_confidence = inputs.min_confidence
         self._size = inputs.image_size
         self._min_visible, self._max_objects = lifting.min_visible, inputs.max_objects
+        self._steadying = steadying
+        self._steady: dict[str, Steadying] = {}
 
     def observe(self, message: Any, input_type: InputType, size: Size | None = None) -> Observation:
         """Return the objects in `message`, their keypoints as the model orders them.
@@ -110,19 +116,44 @@ class Pipeline:
             )
         return Observation(*self._map(seen.points, seen.confidence), seen.ids)
 
-    def lift(self, seen: Observation) -> Lifted:
-        """Return the shapes of the objects, of which there is at least one, all in one pass.
+    @property
+    def steadies(self) -> bool:
+        """Tell whether objects are filtered over time, for which their names matter."""
+        return self._steadying.enabled
 
-        Objects that cannot be lifted are NaN, unless all are: then MessageError is raised.
+    def lift(
+        self,
+        seen: Observation,
+        intrinsics: Intrinsics | None,
+        names: tuple[str, ...],
+        topic: str,
+        time: float,
+    ) -> tuple[Lifted, tuple[str, ...]]:
+        """Return the shapes of the objects and their names, all in one pass, steadied if asked for.
+
+        intrinsics: of the camera, for the shapes to be at their place; None: they are centred.
+        names: n identities of the objects on their topic, which may be none. time: of the message,
+        in seconds. Objects that are bridged come last; there may be none at all. Objects that
+        cannot be lifted are NaN, unless all are: then MessageError is raised.
         """
-        confidence = seen.confidence
-        lifted = self._lifter(seen.points, confidence)
-        if np.isnan(lifted.residual).all():
+        points, confidence = seen.points, seen.confidence
+        if intrinsics:
+            lifted = lift_at_place(self._lifter, intrinsics, points, confidence)
+        else:
+            lifted = self._lifter(points, confidence)
+        steady = self._steady.get(topic)
+        if steady is None:
+            steady = self._steady[topic] = Steadying(self._steadying)
+        lifted, names = steady(lifted, names, time)
+        if names and np.isnan(lifted.residual).all():
             most = (confidence > 0).sum(1).max()
             if most >= self._min_visible:
-                raise MessageError("message has its visible keypoints on one line or on one spot")
+                raise MessageError(
+                    "message has its visible keypoints on one line or on one spot"
+                    + ", or where the camera's lens sees nothing" * bool(intrinsics)
+                )
             raise MessageError(
                 f"message has at most {most} visible keypoints of the "
                 f"model's {len(self.model.layout)} in an object; min_visible is {self._min_visible}"
             )
-        return lifted
+        return lifted, names

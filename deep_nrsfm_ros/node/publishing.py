@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Duration
+from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Transform, Vector3
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from deep_nrsfm_ros.nrsfm.geometry import quaternion
+from deep_nrsfm_ros.nrsfm.geometry import centre, quaternion
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP
 
@@ -63,12 +63,19 @@ class PointCloud:
         self._values = np.frombuffer(message.data, "<f4").reshape(n, p, 4)
 
 
+def seconds(stamp: Time) -> float:
+    """Return a stamp in seconds, 0 if it was never set."""
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
 def camera_rotation(header: Header, rotation: NDArray[np.float32]) -> QuaternionStamped:
     """Return the rotation (3, 3) of an object as a quaternion."""
-    return QuaternionStamped(header=header, quaternion=_quaternion(rotation))
+    return QuaternionStamped(header=header, quaternion=to_quaternion(rotation))
 
 
-def objects(header: Header, lifted: Lifted, names: Sequence[str]) -> MultiDOFJointState:
+def objects(
+    header: Header, lifted: Lifted, names: Sequence[str], *, placed: bool = False
+) -> MultiDOFJointState:
     """Return who is in which row of the point cloud, and how each is turned.
 
     Of the standard messages this one alone holds a header, a list of names and a transform for
@@ -77,24 +84,42 @@ def objects(header: Header, lifted: Lifted, names: Sequence[str]) -> MultiDOFJoi
 
     names: n, "" for an object without one. A transform leads from the axes of the object, its
     origin the mean of its keypoints, to those of the cloud: its rotation is that of
-    ~/camera_rotation, its translation zero, as each object of the cloud is centred. NaN where the
-    object could not be lifted.
+    ~/camera_rotation, its translation the object's place, zero unless the shapes are `placed`. NaN
+    where the object could not be lifted.
     """
     message = MultiDOFJointState(header=header, joint_names=list(names))
-    message.transforms = [Transform(rotation=_quaternion(R)) for R in lifted.rotations]
+    message.transforms = transforms(lifted, placed=placed)
     return message
 
 
-def markers(header: Header, lifted: Lifted, edges: Sequence[tuple[int, int]]) -> MarkerArray:
+def transforms(lifted: Lifted, *, placed: bool) -> list[Transform]:
+    """Return what leads from the axes of each object to those of the camera."""
+    means = lifted.shapes.mean(1) if placed else np.zeros((len(lifted.shapes), 3))
+    moves = (Vector3(x=x, y=y, z=z) for x, y, z in means.tolist())
+    turns = map(to_quaternion, lifted.rotations)
+    return [Transform(translation=t, rotation=q) for t, q in zip(moves, turns, strict=True)]
+
+
+def to_quaternion(rotation: NDArray[np.float32]) -> Quaternion:
+    """Return a rotation (3, 3) as a message, NaN if it is."""
+    x, y, z, w = quaternion(rotation).tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def markers(
+    header: Header, lifted: Lifted, edges: Sequence[tuple[int, int]], *, placed: bool = False
+) -> MarkerArray:
     """Return each object as a list of lines, one an edge, and a list of spheres.
 
-    The first object is at the origin, as in the point cloud; the others stand beside it as they
-    do in the image. Objects that are NaN are left out.
+    placed: the shapes are at their place. Where they are not, the first object is at the origin,
+    as in the point cloud; the others stand beside it as they do in the image. Objects that are NaN
+    are left out.
     """
     array_of_markers = MarkerArray()
     lifted = Lifted(*(part[~np.isnan(lifted.residual)] for part in lifted))
-    sizes = np.sqrt((lifted.shapes**2).sum(-1).mean(-1)).tolist()
-    places = ((lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]).tolist()
+    sizes = np.sqrt((centre(lifted.shapes) ** 2).sum(-1).mean(-1)).tolist()
+    apart = (lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]
+    places = (np.zeros_like(apart) if placed else apart).tolist()
     for i, (shape, size, (x, y)) in enumerate(
         zip(lifted.shapes.tolist(), sizes, places, strict=True)
     ):
@@ -122,9 +147,3 @@ def status(
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
     )
-
-
-def _quaternion(rotation: NDArray[np.float32]) -> Quaternion:
-    """Return a rotation (3, 3) as a message, NaN if it is."""
-    x, y, z, w = quaternion(rotation).tolist()
-    return Quaternion(x=x, y=y, z=z, w=w)

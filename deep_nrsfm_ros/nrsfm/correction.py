@@ -8,6 +8,10 @@ left over of the keypoints, r = W - S M = E M + noise, the mean of a Gaussian E 
     Sigma H^T (H Sigma H^T + noise^2 I)^-1 r,    H E = E M.
 
 For Sigma = I and no noise this is back-projection, S + (W - S M) M^T. Ours, not in the paper.
+
+A perspective camera sees each point along its own ray (u, v, 1): with the depth d of the centre,
+x + t_x = u (z + d) says that the point's own M = R^T [e_x - u e_z, e_y - v e_z] takes it to
+W = d (u, v), up to the translation, and all of the above holds.
 """
 
 from __future__ import annotations
@@ -35,9 +39,9 @@ def correct(
 ) -> Floats:
     """Return S (n, p, 3) moved towards the visible of the keypoints W (n, p, 2).
 
-    M: (n, 3, 2) cameras. covariance: (3p, 3p) of the errors in the axes of S. noise: standard
-    deviation (n,) of the keypoints' coordinates; 0 meets them exactly, but for a translation,
-    which may be any. Missing keypoints follow the others.
+    M: (n, 3, 2) cameras, or (n, p, 3, 2), one of each point. covariance: (3p, 3p) of the errors in
+    the axes of S. noise: standard deviation (n,) of the keypoints' coordinates; 0 meets them
+    exactly, but for a translation, which may be any. Missing keypoints follow the others.
     """
     n, p, _ = S.shape
     noise = np.broadcast_to(noise, n)
@@ -46,9 +50,10 @@ def correct(
         return np.concatenate(
             [correct(S[b], M[b], W[b], visible[b], covariance, noise[b]) for b in blocks]
         )
-    M = M.astype(np.float64)
-    CH = (covariance.reshape(-1, 3) @ M).reshape(n, p, 3, 2 * p)
-    A = M[:, None].swapaxes(-1, -2) @ CH  # H Sigma H^T
+    M = (M if M.ndim == 4 else M[:, None]).astype(np.float64)
+    CH = covariance.reshape(3 * p, p, 3).swapaxes(0, 1) @ M  # (n, p, 3p, 2)
+    CH = CH.swapaxes(1, 2).reshape(n, p, 3, 2 * p)
+    A = M.swapaxes(-1, -2) @ CH  # H Sigma H^T
     unknown = _UNKNOWN * np.trace(covariance) / (3 * p)
     # Not quite zero, so that there is an answer even where M is no camera.
     spread = np.where(visible, np.square(noise)[:, None] + 1e-12 * unknown, unknown)  # (n, p)
@@ -56,7 +61,7 @@ def correct(
     for axis in range(2):
         A[:, :, axis, :, axis] += unknown  # of the translation, the same for all points
         A[:, range(p), axis, range(p), axis] += spread
-    r = (W - S @ M) * visible[..., None]
+    r = (W - (S[..., None, :] @ M)[..., 0, :]) * visible[..., None]
     x = np.linalg.solve(A.reshape(n, 2 * p, 2 * p), r.reshape(n, 2 * p, 1))
     E = (CH.reshape(n, 3 * p, 2 * p) @ x).reshape(n, p, 3)
     corrected: Floats = S + E.astype(S.dtype)

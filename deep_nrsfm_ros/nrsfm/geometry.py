@@ -164,6 +164,25 @@ def _moments(parts: tuple[Floats, ...], visible: NDArray[np.bool_]) -> tuple[Flo
     return mean[..., 0, :], (X.swapaxes(-1, -2) * m) @ X
 
 
+def rotation_vector(R: Floats) -> Floats:
+    """Return axis times angle (3,), at most pi long, of one rotation matrix R (3, 3)."""
+    q = quaternion(R)
+    sine = float(np.sqrt(q[:3] @ q[:3]))
+    vector: Floats = q[:3] * (2 * np.arctan2(sine, q[3]) / sine if sine > _TINY else 2.0)
+    return vector
+
+
+def rotation_from_vector(v: Floats) -> Floats:
+    """Return the rotation matrix (3, 3) of axis times angle v (3,): the way back."""
+    angle = float(np.sqrt(v @ v))
+    x, y, z = v
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    # sin(a) / a and (1 - cos(a)) / a^2, by sinc also where a is 0.
+    a, b = np.sinc(angle / np.pi), np.sinc(angle / (2 * np.pi)) ** 2 / 2
+    R: Floats = np.eye(3) + a * K + b * (K @ K)
+    return R
+
+
 def quaternion(R: Floats) -> Floats:
     """Return the unit quaternion (x, y, z, w), w >= 0, of one rotation matrix R (3, 3)."""
     # The largest of the four squares is the pivot: the others would lose digits near zero.
@@ -180,3 +199,17 @@ def quaternion(R: Floats) -> Floats:
         q[3] = R[k, j] - R[j, k]
     q /= np.linalg.norm(q) * (1 if q[3] >= 0 else -1)
     return q
+
+
+def rotation_from_quaternion(q: Floats) -> Floats:
+    """Return the rotation matrix (3, 3) of a quaternion (x, y, z, w) of any length but 0."""
+    x, y, z, w = q / np.linalg.norm(q)
+    half = np.array(
+        [
+            [-y * y - z * z, x * y - w * z, x * z + w * y],
+            [x * y + w * z, -x * x - z * z, y * z - w * x],
+            [x * z - w * y, y * z + w * x, -x * x - y * y],
+        ]
+    )
+    R: Floats = np.eye(3) + 2 * half
+    return R

@@ -108,6 +108,20 @@ class KeypointLayout:
         """Return the edges as pairs of places."""
         return [(self.index(a), self.index(b)) for a, b in self.edges]
 
+    def partners(self) -> list[int] | None:
+        """Return the place of each keypoint in the mirror image, left_ and right_ exchanged.
+
+        None if nothing is, or if the layout does not say where left is.
+        """
+        exchanged = {"left": "right", "right": "left"}
+        places = []
+        for i, name in enumerate(self.keypoints):
+            side, _, part = name.partition("_")
+            other = f"{exchanged.get(side, '')}_{part}"
+            places.append(self.index(other) if other in self.keypoints else i)
+        changed = places != list(range(len(self)))
+        return places if self.handedness and changed else None
+
     @classmethod
     def numbered(cls, p: int) -> KeypointLayout:
         """Return a layout of p nameless points, for an object nobody has described."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.nrsfm.confidence import near
 from deep_nrsfm_ros.nrsfm.correction import correct
 from deep_nrsfm_ros.nrsfm.geometry import (
     centre,
@@ -24,7 +26,10 @@ from deep_nrsfm_ros.nrsfm.normaliser import observe
 
 Float32 = NDArray[np.float32]
 
+# The mirror image of an object, whose y axis points to its left, and of an image.
+_ACROSS = np.array([1, -1, 1], np.float32)
 _BLOCK = 64  # objects lifted together by `lift_all`
+_NEAREST = np.float32(0.1)  # depth of a point, relative to its object's, that is not undercut
 _RESIDUAL_SPREAD = 0.02  # squared residual by which a turn loses all but 1/e of its weight
 
 
@@ -55,6 +60,12 @@ class LiftingOptions:
         low=1,
         high=64,
     )
+    mirror: bool = option(
+        False,
+        "lift the mirror image as well and average, where the layout has a handedness and left_ "
+        "and right_ of some keypoints: a little more accurate on average, at twice the time and "
+        "with a mirrored frame now and then",
+    )
     min_visible: int = option(
         4, "objects with fewer visible keypoints are not lifted", low=3, high=1000
     )
@@ -79,7 +90,13 @@ class Lifted(NamedTuple):
     scale: Float32  # (n,) pixels per output unit
     translation: Float32  # (n, 2) where the shape's centre is in the image
     residual: Float32  # (n,) relative reprojection error of the network, before correction
-    confidence: Float32  # (n, p) 0..1
+    confidence: Float32  # (n, p) chance that the point is near its true place, see `confidence`
+
+    @property
+    def object_confidence(self) -> Float32:
+        """The share (n,) of each object's points to be expected near their true places."""
+        share: Float32 = self.confidence.mean(1)
+        return share
 
 
 class Lifter:
@@ -94,15 +111,22 @@ class Lifter:
         c, s = np.cos(angles), np.sin(angles)
         self._turns = np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy()
         p = len(model.layout)
+        partners = model.layout.partners() if self.options.mirror else None
+        self._partners = None if partners is None else np.array(partners)
         turn = np.kron(np.eye(p), model.object_frame)
         learned = self.options.correction == "learned"
         self._covariance = turn.T @ model.error_covariance @ turn if learned else np.eye(3 * p)
+        self._spread = np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1))
         self._length = self.options.reference_length or model.layout.reference_length or 1.0
         self._reference = pair and (model.layout.index(pair[0]), model.layout.index(pair[1]))
 
-    def __call__(self, points: Float32, confidence: Float32) -> Lifted:
+    def __call__(
+        self, points: Float32, confidence: Float32, *, perspective: bool = False
+    ) -> Lifted:
         """Lift keypoints (n, p, 2) of confidence (n, p), 0 = missing, in the model's layout.
 
+        perspective: the points are where rays meet the plane z = 1 of a camera that looks at the
+        object (see `placement`), and the correction moves each along its own ray or across it.
         Raises ValueError if the shapes do not fit the model.
         """
         p = len(self.model.layout)
@@ -114,23 +138,40 @@ class Lifter:
         visible = confidence > 0
         mask = visible[..., None].astype(np.float32)
         whole = np.ones_like(mask)
-        fitted = self._fit(points, mask, visible)
+        fitted = self._fit(points, mask, visible, perspective)
         if not visible.all():
             for _ in range(self.options.refill):
                 S, _, _, unit, origin = fitted
-                filled = np.where(visible[..., None], points, unit * S[..., :2] + origin)
-                fitted = self._fit(filled, whole, visible)
+                seen = unit * S[..., :2] + origin
+                if perspective:
+                    seen /= np.maximum(1 + unit * S[..., 2:], _NEAREST)
+                filled = np.where(visible[..., None], points, seen)
+                fitted = self._fit(filled, whole, visible, perspective)
         S, R, residual, _, _ = fitted
         S = centre(S)
+        sure = self.sure(confidence, residual, S)
         S *= self._length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
-        lifted = Lifted(S, R, scale, translation, residual, self._sure(confidence, residual))
+        lifted = Lifted(S, R, scale, translation, residual, sure)
         lost = on_one_line(points, visible)
         lost |= visible.sum(1) < self.options.min_visible
-        return _blank(lifted, lost) if lost.any() else lifted
+        return blank(lifted, lost) if lost.any() else lifted
+
+    def sure(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
+        """Return the confidence (n, p) of shapes S (n, p, 3) in the network's unit, centred."""
+        return near(confidence, residual, self.spread(S))
+
+    def spread(self, S: Float32) -> Float32:
+        """Return the standard deviation (n, p) of the model's errors, relative to the RMS radius.
+
+        S: as in `sure`.
+        """
+        radius = np.sqrt((S * S).sum(2).mean(1))
+        spread: Float32 = self._spread / np.maximum(radius, 1e-9)[:, None]
+        return spread
 
     def _fit(
-        self, points: Float32, mask: Float32, visible: NDArray[np.bool_]
+        self, points: Float32, mask: Float32, visible: NDArray[np.bool_], perspective: bool
     ) -> tuple[Float32, Float32, Float32, Float32, Float32]:
         """Return S in camera axes, R, residual (n,), and what leads to the image: unit, origin.
 
@@ -138,31 +179,42 @@ class Lifter:
         """
         model = self.model
         W, gain, unit, origin = observe(model.network, model.normaliser, points, mask)
-        S, M, residual = self._average(gain * W, W, visible)
+        S, M, residual = self._average(gain * W, W, visible, unit if perspective else None)
         R = rotation_from_camera(M)
         if self.options.correction != "none":
             seen = visible[..., None]
             size = np.sqrt((W * W * seen).sum((1, 2)) / np.maximum(2 * seen.sum((1, 2)), 1))
             noise = self.options.noise * size
-            S = correct(S @ R, M, W, visible, self._covariance, noise) @ R.swapaxes(1, 2)
+            cameras = M[:, None] - R[:, None, 2, :, None] * points[:, :, None] if perspective else M
+            S = correct(S @ R, cameras, W, visible, self._covariance, noise) @ R.swapaxes(1, 2)
         return S, R, residual, unit, origin
 
     def _average(
-        self, x: Float32, W: Float32, visible: NDArray[np.bool_]
+        self, x: Float32, W: Float32, visible: NDArray[np.bool_], unit: Float32 | None
     ) -> tuple[Float32, Float32, Float32]:
         """Return S (n, p, 3) in camera axes, M (n, 3, 2) from the object's, residual (n,).
 
-        Means over the turns of the network's input x within the image plane, each by the residual
-        that it leaves of W.
+        Means over the turns of the network's input x within the image plane, and over their
+        mirror images, each by the residual that it leaves of W.
         """
         turns = self._turns  # (k, 2, 2)
-        k, (n, p, _) = len(turns), W.shape
-        turned = (x @ turns.swapaxes(1, 2)[:, None]).reshape(k * n, p, 2)
-        S, M = reconstruct(self.model.network, turned)
+        n, p, _ = W.shape
+        turned = x @ turns.swapaxes(1, 2)[:, None]  # (k, n, p, 2)
+        if self._partners is not None:
+            turned = np.concatenate((turned, (turned * _ACROSS[1:])[:, :, self._partners]))
+            turns = np.concatenate((turns, turns))
+        k = len(turns)
+        S, M = reconstruct(self.model.network, turned.reshape(k * n, p, 2))
         A = self.model.object_frame
-        M = (A.T @ M).reshape(k, n, 3, 2) @ turns[:, None]
-        S = (S @ A).reshape(k, n, p, 3) @ rotation_from_camera(M).swapaxes(-1, -2)
-        residual = reprojection_error(W, S[..., :2], visible)
+        S, M = (S @ A).reshape(k, n, p, 3), (A.T @ M).reshape(k, n, 3, 2)
+        if self._partners is not None:
+            half = k // 2
+            S[half:] = S[half:, :, self._partners] * _ACROSS
+            M[half:] *= _ACROSS[:, None] * _ACROSS[1:]
+        M = M @ turns[:, None]
+        S = S @ rotation_from_camera(M).swapaxes(-1, -2)
+        P = S[..., :2] if unit is None else S[..., :2] / np.maximum(1 + unit * S[..., 2:], _NEAREST)
+        residual = reprojection_error(W, P, visible)
         trust = np.exp((residual.min(0) ** 2 - residual**2) / _RESIDUAL_SPREAD)
         trust /= trust.sum(0)
         M = (trust[..., None, None] * M).sum(0)
@@ -182,27 +234,26 @@ class Lifter:
         held: Float32 = np.maximum(size, np.float32(1e-9))
         return held[:, None, None]
 
-    @staticmethod
-    def _sure(confidence: Float32, residual: Float32) -> Float32:
-        """Return confidence (n, p): the detector's, less what the residual takes from it.
 
-        A missing point counts half of the mean of those seen: the model guesses it from them.
-        """
-        seen = confidence > 0
-        mean = confidence.sum(1) / np.maximum(seen.sum(1), 1).astype(np.float32)
-        sure = np.where(seen, confidence, np.float32(0.5) * mean[:, None])
-        trust: Float32 = np.minimum(sure, 1) * np.maximum(1 - residual, 0)[:, None]
-        return trust
+def lift_all(
+    lifter: Lifter,
+    points: Float32,
+    confidence: Float32,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Lifted:
+    """Lift any number of objects, a few at a time: many at once leave the processor's cache.
 
-
-def lift_all(lifter: Lifter, points: Float32, confidence: Float32) -> Lifted:
-    """Lift any number of objects, a few at a time: many at once leave the processor's cache."""
-    starts = range(0, len(points), _BLOCK) or (0,)
-    parts = [lifter(points[i : i + _BLOCK], confidence[i : i + _BLOCK]) for i in starts]
+    on_progress: called with how many are done and how many there are.
+    """
+    parts = []
+    for start in range(0, len(points), _BLOCK) or (0,):
+        end = min(start + _BLOCK, len(points))
+        parts.append(lifter(points[start:end], confidence[start:end]))
+        on_progress(end, len(points))
     return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def _blank(lifted: Lifted, where: NDArray[np.bool_]) -> Lifted:
+def blank(lifted: Lifted, where: NDArray[np.bool_]) -> Lifted:
     """Return `lifted` with the chosen objects NaN and their confidence 0."""
     for array in lifted:
         array[where] = np.nan

@@ -55,6 +55,34 @@ def procrustes_distances(S: Floats, truth: Floats) -> Floats:
     return distances
 
 
+class CameraErrors(NamedTuple):
+    """Errors of lifted shapes, means over frames and points but for the rotation."""
+
+    aligned: float  # mm after the best similarity with a proper rotation
+    in_camera: float  # mm after the best scale and translation: the camera's view must fit too
+    rotation: float  # degrees between the two, median
+    mirrored: float  # share of frames that a reflection fits better
+
+
+def camera_errors(shapes: Floats, truth: Floats) -> CameraErrors:
+    """Compare shapes (f, p, 3) with truth (f, p, 3) in mm, both in the camera's frame.
+
+    Frames of which the truth is not wholly known are left out.
+    """
+    known = np.isfinite(truth).all((1, 2))
+    S, T = centre(shapes[known].astype(float)), centre(truth[known])
+    scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
+    apart = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
+    turn = align(S, T).rotation
+    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    return CameraErrors(
+        float(procrustes_distances(S, T).mean()),
+        float(apart.mean()),
+        float(np.degrees(np.median(angle))),
+        float(align(S, T, allow_reflection=True).mirrored.mean()),
+    )
+
+
 def signed_volumes(S: Floats, layout: KeypointLayout) -> Floats:
     """Return the signed volume (f,) of each shape's handedness tetrahedron.
 

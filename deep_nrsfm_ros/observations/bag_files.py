@@ -43,14 +43,21 @@ class Topic(NamedTuple):
         return self.type.replace("/msg/", "/")
 
 
+class Record(NamedTuple):
+    """A message as it was recorded: when, in ns, and its serialised bytes."""
+
+    time: int
+    raw: bytes
+
+
 class _Storage(Protocol):
     """What reads one bag or one of its files."""
 
     def topics(self) -> list[Topic]:
         """Return what is there."""
 
-    def messages(self, name: str) -> Iterator[bytes]:
-        """Yield the serialised messages of a topic; raise anything where the file is damaged."""
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic; raise anything where the file is damaged."""
 
     def close(self) -> None:
         """Free the file."""
@@ -77,11 +84,15 @@ class BagFile:
 
     def messages(self, topic: Topic) -> Iterator[bytes]:
         """Yield the serialised messages of `topic`, by time within each file."""
+        return (record.raw for record in self.records(topic))
+
+    def records(self, topic: Topic) -> Iterator[Record]:
+        """Yield the messages of `topic` with their times, by time within each file."""
         for storage in self._storages:
             try:
-                for raw in storage.messages(topic.name):
+                for record in storage.records(topic.name):
                     self._given[topic.name] += 1
-                    yield raw
+                    yield record
             except GeneratorExit:
                 raise
             except Exception as error:  # damaged files fail in many ways; what was read counts
@@ -126,6 +137,17 @@ def open_bag(path: Path) -> BagFile:
     return bag
 
 
+def answer_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
+    """Return the topics `points` and `camera_rotation` of every lifter that was recorded."""
+    topics = {topic.name: topic for topic in bag.topics}
+    pairs = []
+    for name, points in topics.items():
+        rotation = topics.get(f"{name.removesuffix('points')}camera_rotation")
+        if name.endswith("/points") and rotation:
+            pairs.append((points, rotation))
+    return pairs
+
+
 def _recorded_counts(path: Path) -> dict[str, int]:
     """Return the messages per topic that metadata.yaml speaks of, if it is there and sound."""
     with suppress(Exception):
@@ -156,11 +178,11 @@ class _Sound:
         """Return what is there."""
         return [_topic(c, c.msgcount) for c in self._reader.connections]
 
-    def messages(self, name: str) -> Iterator[bytes]:
-        """Yield the serialised messages of a topic."""
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic."""
         connections = [c for c in self._reader.connections if c.topic == name]
-        for _, _, raw in self._reader.messages(connections) if connections else ():
-            yield raw
+        for _, time, raw in self._reader.messages(connections) if connections else ():
+            yield Record(time, raw)
 
 
 class _CutMcap:
@@ -183,11 +205,11 @@ class _CutMcap:
         """Return what is there; how many messages is unknown."""
         return [_topic(c, 0) for c in self._reader.connections]
 
-    def messages(self, name: str) -> Iterator[bytes]:
-        """Yield the serialised messages of a topic up to the cut."""
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic up to the cut."""
         connections = [c for c in self._reader.connections if c.topic == name]
-        for _, _, raw in self._reader.messages_scan(connections):
-            yield raw
+        for _, time, raw in self._reader.messages_scan(connections):
+            yield Record(time, raw)
 
 
 class _CutSqlite:
@@ -213,12 +235,13 @@ class _CutSqlite:
             Topic(name, kind, 0, self._definitions.get(kind, "")) for _, name, kind in self._topics
         ]
 
-    def messages(self, name: str) -> Iterator[bytes]:
-        """Yield the serialised messages of a topic up to the cut."""
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic up to the cut."""
         wanted = {number for number, topic, _ in self._topics if topic == name}
-        for number, raw in self._file.execute("SELECT topic_id, data FROM messages"):
+        rows = self._file.execute("SELECT topic_id, timestamp, data FROM messages")
+        for number, time, raw in rows:
             if number in wanted:
-                yield raw
+                yield Record(time, raw)
 
     def close(self) -> None:
         """Free the file."""

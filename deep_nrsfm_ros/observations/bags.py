@@ -255,11 +255,15 @@ def _triples(frame: Frame) -> NDArray[np.float32]:
 def _point_cloud(frame: Frame) -> Any:
     """Return the frame as a PointCloud2."""
     values = _triples(frame)
-    n, q = frame.confidence.shape
+    return point_cloud(_header(frame), values[..., :2], values[..., 2])
+
+
+def point_cloud(header: Any, points: NDArray[np.floating], confidence: NDArray[np.floating]) -> Any:
+    """Return points (n, q, 2 or 3) with confidence (n, q) as a PointCloud2 for a bag."""
+    n, q = confidence.shape
     fields = [_make("sensor_msgs/msg/PointField", name, at, 7, 1) for name, at in POINT_FIELDS]
-    data = np.frombuffer(pack_points(values[..., :2], values[..., 2]), np.uint8)
+    data = np.frombuffer(pack_points(points, confidence), np.uint8)
     size = (POINT_STEP, POINT_STEP * q)
-    header = _header(frame)
     return _make("sensor_msgs/msg/PointCloud2", header, n, q, fields, False, *size, data, False)
 
 

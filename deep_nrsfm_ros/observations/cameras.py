@@ -8,6 +8,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
+
 Array: TypeAlias = NDArray[np.float64]
 
 _OUTLIER = 10.0  # pixels of reprojection error at which a detection counts half
@@ -34,40 +36,29 @@ class Camera:
         """Return world points (..., 3) in the optical frame."""
         return world @ self.rotation.T + self.translation
 
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Return what does not depend on where the camera stands."""
+        focal, principal = self.matrix.diagonal(), self.matrix[:2, 2]
+        return Intrinsics(
+            (float(focal[0]), float(focal[1])),
+            (float(principal[0]), float(principal[1])),
+            tuple(self.distortion.tolist()),
+        )
+
     def project(self, world: Array) -> Array:
         """Return the pixels (..., 2) of world points (..., 3)."""
         inside = self.to_camera(world)
-        return self._to_pixels(self._distort(inside[..., :2] / inside[..., 2:]))
+        return self.intrinsics.pixels(inside[..., :2] / inside[..., 2:])
 
     def undistort(self, pixels: Array) -> Array:
         """Return the pixels (..., 2) that a camera without a lens would have seen."""
-        distorted = (pixels - self.matrix[:2, 2]) / self.matrix.diagonal()[:2]
-        plain = distorted
-        for _ in range(10):  # a fixed point, as the distortion is slight
-            plain = plain + distorted - self._distort(plain)
-        return self._to_pixels(plain)
+        intrinsics = self.intrinsics
+        return intrinsics.without_lens().pixels(intrinsics.rays(pixels))
 
     def without_lens(self) -> Camera:
         """Return the camera that sees what `undistort` returns."""
         return replace(self, distortion=np.zeros(4))
-
-    def _distort(self, plain: Array) -> Array:
-        """Return image-plane points (..., 2) as the lens bends them."""
-        k1, k2, p1, p2 = self.distortion
-        x, y = plain[..., 0], plain[..., 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * k2)
-        return np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            -1,
-        )
-
-    def _to_pixels(self, plane: Array) -> Array:
-        """Return image-plane points (..., 2) in pixels."""
-        return plane * self.matrix.diagonal()[:2] + self.matrix[:2, 2]
 
 
 def triangulate(

@@ -139,6 +139,22 @@ def pack_points(points: NDArray[np.floating], confidence: NDArray[np.floating]) 
     return packed.tobytes()
 
 
+def read_points(message: Any) -> NDArray[np.float32]:
+    """Return (n, p, 4) of the lifter's PointCloud2: x, y, z, confidence.
+
+    Raises MessageError for a cloud of another make.
+    """
+    n, p = int(message.height), int(message.width)
+    found = tuple((str(field.name), int(field.offset)) for field in message.fields)
+    if found != POINT_FIELDS or int(message.point_step) != POINT_STEP:
+        raise MessageError(f"fields are {found}; a lifter's points have {POINT_FIELDS}")
+    data = memoryview(message.data).cast("B")
+    if len(data) != n * p * POINT_STEP:
+        raise MessageError(f"data has {len(data)} bytes; {n} x {p} points need {n * p * 16}")
+    order = ">f4" if message.is_bigendian else "<f4"
+    return np.frombuffer(data, order).reshape(n, p, 4).astype(np.float32)
+
+
 def _point_cloud(message: Any, keypoints: int) -> NDArray[np.floating]:
     """Return (n, q, 2 or 3) of a PointCloud2: fields x, y and, where there is one, confidence."""
     height, width, step = int(message.height), int(message.width), int(message.point_step)

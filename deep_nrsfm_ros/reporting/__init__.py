@@ -1,1 +1,1 @@
-"""What a training came to, as one HTML file that opens offline."""
+"""What there is to look at, as HTML files that open offline: reports and recordings."""

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
@@ -21,6 +18,7 @@ from deep_nrsfm_ros.observations.ensemble import Ensemble
 from deep_nrsfm_ros.observations.variation import Variation
 from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
 from deep_nrsfm_ros.reporting.shapes import LiftedFrames, fit, lift_sample, shape_space
+from deep_nrsfm_ros.reporting.template import embedded, render
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.nrsfm.progress import Progress
@@ -78,7 +76,6 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
     model, ensemble, variation = training.model, training.ensemble, training.variation
     found = lift_sample(model, ensemble)
     scenes: list[dict[str, Any]] = []
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     shapes = _shapes(model, found, scenes)
     order = np.argsort(found.lifted.residual, kind="stable")
     gap = _APART * len(ensemble)
@@ -86,7 +83,10 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         "Best": _frames(apart(order, found.frames, gap, _FRAMES), found, training, scenes),
         "Worst": _frames(apart(order[::-1], found.frames, gap, _FRAMES), found, training, scenes),
     }
-    return environment.from_string(_resource("report.html.j2")).render(
+    return render(
+        "report.html.j2",
+        ["report.css"],
+        ["orbit.js", "viewer.js"],
         model=model,
         name=training.path.stem,
         path=shlex.quote(str(training.path.resolve())),
@@ -108,20 +108,8 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
             for suspect in training.curated.suspects
         ],
         provenance=_rows(model.provenance),
-        scenes=Markup(_json(scenes)),
-        style=Markup(_resource("report.css")),
-        script=Markup(_resource("viewer.js")),
+        scenes=embedded(scenes),
     )
-
-
-def _resource(name: str) -> str:
-    """Return a file of this package."""
-    return (files(__package__) / name).read_text(encoding="utf-8")
-
-
-def _json(value: Any) -> str:
-    """Return JSON that cannot end the script element it stands in."""
-    return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
 
 
 def _curve(progress: Sequence[Progress], field: str, label: str) -> Markup:

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import deep_nrsfm_ros
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL, fetch_wheel
-from deep_nrsfm_ros.commands.demo.evaluation import errors, read_points
+from deep_nrsfm_ros.commands.demo.evaluation import read_points
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
 from deep_nrsfm_ros.nrsfm.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
@@ -25,32 +24,6 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.observations.cameras import Camera
 
 Start = Callable[..., "subprocess.Popen[str]"]
-
-
-def shapes(frames: int = 20) -> np.ndarray:
-    """Return (frames, 12, 3) random shapes in mm, away from the origin."""
-    return np.random.default_rng(0).normal([0, 0, 3000], 300, (frames, 12, 3))
-
-
-def test_errors_of_a_perfect_shape_at_any_scale_and_place() -> None:
-    truth = shapes()
-    truth[3, 5] = np.nan  # a frame that is not wholly known
-    S = np.nan_to_num(truth) * 0.001 + [1, 2, 3]
-    np.testing.assert_allclose(errors(S, truth), 0, atol=1e-4)
-
-
-def test_a_turned_shape_is_wrong_in_the_camera_only() -> None:
-    turn = Rotation.from_rotvec(np.radians([0, 30, 0])).as_matrix()
-    error = errors(shapes() @ turn, shapes())
-    assert error.aligned < 1e-6 and error.in_camera > 100
-    assert error.rotation == pytest.approx(30) and error.mirrored == 0
-
-
-def test_a_mirrored_shape_is_found_out() -> None:
-    half = shapes()
-    half[:10, :, 2] *= -1
-    error = errors(half, shapes())
-    assert error.mirrored == 0.5 and error.aligned > 50
 
 
 def test_the_wheel_is_fetched_only_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

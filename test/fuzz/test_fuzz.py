@@ -41,6 +41,7 @@ from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.object_file import ObjectFileError, read_object
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations import bags
 from deep_nrsfm_ros.observations.bags import BagError, frames, read_bags, write_bag
 from deep_nrsfm_ros.observations.curation import Curation
@@ -96,7 +97,7 @@ def lift(pipeline: Pipeline, message: Any, kind: str) -> Lifted:
     seen = pipeline.observe(message, kind)
     if not len(seen.confidence):
         raise ValueError("no object, which is no error and no answer either")
-    return pipeline.lift(seen)
+    return pipeline.lift(seen, None, ("one",) * len(seen.confidence), "topic", 0.0)[0]
 
 
 def loose(value: Any) -> Any:
@@ -176,9 +177,11 @@ def spoil(rng: random.Random, value: Any) -> None:
 
 def live(kind: str) -> Input:
     """Spoil a message and lift it: only ValueError may come of it, and no trace may stay."""
-    pipeline = Pipeline(model(), None, InputOptions(input_type=kind), LiftingOptions())
+    pipeline = Pipeline(
+        model(), None, InputOptions(input_type=kind), LiftingOptions(), SteadyingOptions()
+    )
     plain = LiftingOptions(correction="none", refill=0, turns=1)
-    quick = Pipeline(model(), None, InputOptions(input_type=kind), plain)
+    quick = Pipeline(model(), None, InputOptions(input_type=kind), plain, SteadyingOptions())
     valid, expected = message(kind), lift(pipeline, message(kind), kind)
 
     def one(rng: random.Random) -> Outcome:
@@ -309,7 +312,11 @@ def model_file(folder: Path) -> Input:
             assert "spoilt" in str(refusal)
             return "refused"
         try:
-            lift(Pipeline(loaded, None, InputOptions(), LiftingOptions()), valid, POINT_CLOUD)
+            lift(
+                Pipeline(loaded, None, InputOptions(), LiftingOptions(), SteadyingOptions()),
+                valid,
+                POINT_CLOUD,
+            )
         except ValueError:
             return "loaded, does not fit"
         return "loaded, lifts"
@@ -338,7 +345,7 @@ def parameters(folder: Path) -> Input:
     inputs = InputOptions(model="thing", models_dir=str(folder), bags_dir=str(folder))
     stub = SimpleNamespace(get_parameter_or=lambda name, default: default)
     stub._fence = Fence(folder, folder, ["thing"])
-    stub._pipeline = Pipeline(model(), None, inputs, LiftingOptions())
+    stub._pipeline = Pipeline(model(), None, inputs, LiftingOptions(), SteadyingOptions())
     stub._prepare = lambda changes: LifterNode._prepare(stub, changes)
     valid = message(POINT_CLOUD)
     expected = lift(stub._pipeline, valid, POINT_CLOUD)

@@ -26,11 +26,12 @@ def health(clock: Clock) -> Health:
 
 
 GOOD, POOR = np.full(2, 0.05, np.float32), np.full(2, 0.6, np.float32)
+SURE, UNSURE = np.full(2, 0.8, np.float32), np.full(2, 0.2, np.float32)
 
 
 def test_lifting_is_ok_and_measured(health, clock):
     for milliseconds in (1, 2, 9):
-        health.lifted(milliseconds / 1e3, GOOD)
+        health.lifted(milliseconds / 1e3, GOOD, SURE)
     clock.now += 2
     level, message, values = health.report()
     assert (level, message) == (OK, "lifting")
@@ -38,14 +39,15 @@ def test_lifting_is_ok_and_measured(health, clock):
     assert values["processing time p50 [ms]"] == "2.000"
     assert values["processing time max [ms]"] == "9.000"
     assert values["reprojection error"] == "0.0500"
+    assert values["confidence"] == "0.80"
     assert values["messages lifted"] == "3"
 
 
 def test_each_report_begins_anew_but_totals_stay(health, clock):
     health.rejected("too short")
-    health.lifted(0.001, POOR)
+    health.lifted(0.001, POOR, SURE)
     assert health.report().level == WARN
-    health.lifted(0.001, GOOD)
+    health.lifted(0.001, GOOD, SURE)
     clock.now += 1
     level, _, values = health.report()
     assert level == OK
@@ -81,20 +83,30 @@ def test_an_unheard_publisher_is_an_error_until_something_is_lifted(health):
     health.unheard("wrong type")
     assert health.report()[:2] == (ERROR, "wrong type")
     assert health.report().level == ERROR
-    health.lifted(0.001, GOOD)
+    health.lifted(0.001, GOOD, SURE)
     assert health.report().level == OK
 
 
 def test_a_poor_fit_is_a_warning(health):
-    health.lifted(0.001, POOR)
+    health.lifted(0.001, POOR, SURE)
     level, message, _ = health.report()
     assert level == WARN and "0.60" in message
 
 
+def test_low_confidence_is_a_warning_of_half_of_the_objects(health):
+    health.lifted(0.001, GOOD, UNSURE)
+    level, message, values = health.report()
+    assert level == WARN and "confidence" in message and values["confidence"] == "0.20"
+    for confidence in (UNSURE, SURE, SURE):
+        health.lifted(0.001, GOOD, confidence)
+    assert health.report().level == OK
+
+
 def test_objects_that_could_not_be_lifted_do_not_spoil_the_error(health):
-    health.lifted(0.001, np.array([np.nan, 0.1], np.float32))
-    assert health.report().values["reprojection error"] == "0.1000"
-    health.lifted(0.001, np.array([np.nan], np.float32))
+    health.lifted(0.001, np.array([np.nan, 0.1], np.float32), SURE)
+    values = health.report().values
+    assert (values["reprojection error"], values["confidence"]) == ("0.1000", "0.80")
+    health.lifted(0.001, np.array([np.nan], np.float32), SURE[:1])
     assert health.report().level == OK
 
 

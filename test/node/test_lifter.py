@@ -206,6 +206,35 @@ def test_markers_come_when_someone_listens(start_lifter, connect):
     assert all(m.scale.x > 0 for m in markers)
 
 
+def test_steadied_it_follows_slower_and_bridges_a_gap(start_lifter, connect):
+    start_lifter(**{"steady.enabled": True, "steady.bridge": 5.0})
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    here, there = (cloud(pixels(1, seed=seed)) for seed in (0, 1))
+
+    def answer(message: PointCloud2, seconds: int) -> np.ndarray:
+        """Return the first answer to the message; a repetition would pass as it is lifted."""
+        message.header.stamp.sec = seconds
+        client.exchange(publisher, message)
+        answers = client.heard["/lifter/points"]
+
+        def found() -> list[PointCloud2]:
+            return [m for m in answers if m.header.stamp.sec == seconds]
+
+        return unpack(client.wait(found, "that answer")[0]).copy()
+
+    first = answer(here, 100)
+    held = answer(cloud(pixels(0)), 101)
+    np.testing.assert_array_equal(held[..., :3], first[..., :3])
+    np.testing.assert_allclose(held[..., 3], 0.8 * first[..., 3], rtol=1e-4)
+    assert client.set_parameters(steady__min_cutoff=0.001, steady__beta=0) == ""
+    assert "at least 0" in client.set_parameters(steady__bridge=-1)
+    alone = answer(here, 200)
+    np.testing.assert_allclose(alone, first, rtol=1e-4)  # what was known is forgotten
+    steadied = answer(there, 201)
+    assert np.abs(steadied - alone)[..., :3].max() < 0.05 * np.abs(alone[..., :3]).max()
+
+
 def test_parameters_change_what_the_next_message_gets(start_lifter, connect):
     lifter = start_lifter()
     client = connect()

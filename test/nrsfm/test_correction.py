@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.nrsfm.correction import correct, error_covariance
-from deep_nrsfm_ros.nrsfm.geometry import back_project, centre, random_cameras
+from deep_nrsfm_ros.nrsfm.geometry import back_project, centre, random_cameras, rotation_from_camera
 
 some = settings(max_examples=25, deadline=None)
 
@@ -40,6 +40,20 @@ def test_it_is_the_conditional_mean_given_the_visible_points_up_to_a_translation
     E = covariance @ H.T @ np.linalg.solve(H @ covariance @ H.T + R, r)
     found = correct(S, M, W, visible[None], covariance, np.array([noise]))
     np.testing.assert_allclose(centre(found - S)[0], centre(E.reshape(p, 3)), atol=2e-2)
+
+
+@some
+@given(st.integers(4, 8), st.integers(0, 2**32 - 1))
+def test_perspective_moves_each_point_onto_its_own_ray(p: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    S, M, _, covariance = problem(p, seed)
+    R = rotation_from_camera(M)[0]
+    depth, rays = 20.0, rng.uniform(-0.3, 0.3, (p, 2))
+    cameras = M[:, None] - R[2][:, None] * rays[None, :, None]
+    found = correct(S, cameras, depth * rays[None], np.ones((1, p), bool), covariance)
+    x, y, z = (found[0] @ R.T).T
+    off = np.stack((x - rays[:, 0] * (z + depth), y - rays[:, 1] * (z + depth)), 1)
+    np.testing.assert_allclose(off - off.mean(0), 0, atol=1e-2)
 
 
 def test_equal_errors_everywhere_are_back_projection() -> None:

@@ -20,6 +20,8 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     random_cameras,
     reprojection_error,
     rotation_from_camera,
+    rotation_from_vector,
+    rotation_vector,
     spectral_norm,
     weak_perspective,
 )
@@ -223,6 +225,20 @@ def test_quaternion(make: Callable[[int, np.random.Generator], np.ndarray]) -> N
         np.testing.assert_allclose(matrix(q), R, atol=1e-9)
         np.testing.assert_allclose(matrix(quaternion(R.astype(np.float32))), R, atol=1e-5)
     np.testing.assert_allclose(quaternion(np.eye(3)), [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("make", [random_rotations, half_turns])
+def test_rotation_vector_and_back(make: Callable[[int, np.random.Generator], np.ndarray]) -> None:
+    for R in make(100, np.random.default_rng(2)):
+        v = rotation_vector(R)
+        assert np.linalg.norm(v) < np.pi + 1e-9
+        np.testing.assert_allclose(rotation_from_vector(v), R, atol=1e-8)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-13, 1e-7, 1e-3, 1.0, 3.1])
+def test_rotation_vector_is_axis_times_angle(angle: float) -> None:
+    v = angle * np.array([0.6, 0.0, 0.8])
+    np.testing.assert_allclose(rotation_vector(rotation_from_vector(v)), v, atol=1e-15, rtol=1e-9)
 
 
 def test_quaternion_is_scipys() -> None:

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointLayout, KeypointMap, layout
+from deep_nrsfm_ros.nrsfm.keypoints import (
+    HUMAN17,
+    LAYOUTS,
+    KeypointLayout,
+    KeypointMap,
+    layout,
+)
 
 every_preset = pytest.mark.parametrize("preset", LAYOUTS.values(), ids=LAYOUTS)
 
@@ -177,3 +183,14 @@ def test_a_map_needs_four_shared_keypoints(shared: int) -> None:
             KeypointMap(source, layout("human17"))
     else:
         assert KeypointMap(source, layout("human17"))(*detections(source))[1].any(0).sum() == 4
+
+
+def test_the_mirror_image_exchanges_left_and_right() -> None:
+    names = ("left_hand", "nose", "right_hand", "left_over", "leftovers")
+    handed = ("left_hand", "right_hand", "nose", "left_over")
+    assert KeypointLayout("x", names, handedness=handed).partners() == [2, 1, 0, 3, 4]
+    assert KeypointLayout("x", names).partners() is None
+    one_sided = KeypointLayout("x", names[1:], handedness=names[1:])
+    assert one_sided.partners() is None
+    partners = HUMAN17.partners()
+    assert partners is not None and [partners[i] for i in partners] == list(range(17))

@@ -95,6 +95,24 @@ def test_rotations_are_proper_and_shapes_stand_in_camera_axes(
     np.testing.assert_allclose(lifted.shapes.mean(1), 0, atol=1e-4)
 
 
+def test_the_mirror_image_is_lifted_to_the_mirror_image() -> None:
+    points, confidence = pixels(missing=0.3)
+    lifter = Lifter(random_model(), LiftingOptions(correction="back_projection", mirror=True))
+    partners = np.array(HUMAN17.partners())
+    lifted = lifter(points, confidence)
+    mirrored = lifter((points * [-1, 1]).astype(np.float32)[:, partners], confidence[:, partners])
+    size = np.abs(lifted.shapes).max()
+    np.testing.assert_allclose(
+        mirrored.shapes / size, lifted.shapes[:, partners] * [-1, 1, 1] / size, atol=1e-4
+    )
+    # The object's y axis points to its left.
+    np.testing.assert_allclose(
+        mirrored.rotations, lifted.rotations * [[-1, 1, -1], [1, -1, 1], [1, -1, 1]], atol=1e-4
+    )
+    alone = Lifter(random_model(), LiftingOptions())(points, confidence)
+    assert np.abs(alone.shapes - lifted.shapes).max() > 0.01 * size
+
+
 def test_types_and_shapes() -> None:
     lifted = Lifter(random_model())(*pixels())
     expected = Lifted((N, 17, 3), (N, 3, 3), (N,), (N, 2), (N,), (N, 17))  # type: ignore[arg-type]
@@ -234,21 +252,40 @@ def test_the_reference_length_is_that_of_the_object_unless_another_is_asked_for(
         np.testing.assert_allclose(np.linalg.norm(neck - hip, axis=1), expected, rtol=1e-4)
 
 
-def test_confidence_is_the_detectors_less_what_the_residual_takes(
-    figure_model: Model, figure: Any
-) -> None:
-    points = figure.points[:3].copy()
+def test_confidence_falls_where_less_is_known(figure_model: Model, figure: Any) -> None:
+    points = np.repeat(figure.points[:1], 3, 0)
     points[1] += 0.5 * np.random.default_rng(0).standard_normal(points[1].shape)
-    points[2] = points[0]
-    confidence = np.full((3, 12), 0.8, np.float32)
+    confidence = np.ones((3, 12), np.float32)
     confidence[2, :2] = [0.4, 0]
     lifted = Lifter(figure_model)(points, confidence)
+    whole, noisy, partial = lifted.confidence
     assert lifted.residual[0] < 0.1 < lifted.residual[1]
-    for i in range(2):
-        np.testing.assert_allclose(lifted.confidence[i], 0.8 * (1 - lifted.residual[i]), rtol=1e-5)
-    trust = lifted.confidence[2]
-    assert trust[2] == pytest.approx(2 * trust[0]) and 0 < trust[1] < trust[2]
-    assert ((lifted.confidence >= 0) & (lifted.confidence <= 1)).all()
+    assert (noisy < whole).all() and (partial < whole).all()
+    odds = partial / (1 - partial) * (1 - whole) / whole
+    assert odds[1] < odds[0] < odds[2:].min()
+    np.testing.assert_allclose(lifted.object_confidence, lifted.confidence.mean(1))
+    assert ((lifted.confidence > 0) & (lifted.confidence < 1)).all()
+
+
+def test_confidence_does_not_depend_on_the_size(figure_model: Model, figure: Any) -> None:
+    points, confidence = figure.points[:N], np.ones((N, 12), np.float32)
+    small, large = (
+        Lifter(figure_model, LiftingOptions(reference_length=length))(scale * points, confidence)
+        for length, scale in ((0.1, 1), (50.0, 300))
+    )
+    np.testing.assert_allclose(small.confidence, large.confidence, rtol=1e-3)
+
+
+def test_where_the_model_errs_more_confidence_is_less(figure_model: Model, figure: Any) -> None:
+    worse = np.diag(np.where(np.arange(36) < 3, 4, 1)).astype(np.float32)
+    lifters = (
+        Lifter(dataclasses.replace(figure_model, error_covariance=c))
+        for c in (0.01 * np.eye(36, dtype=np.float32), 0.01 * worse)
+    )
+    even, doubted = (
+        lift(figure.points[:N], np.ones((N, 12), np.float32)).confidence for lift in lifters
+    )
+    assert (doubted[:, 0] < 0.9 * even[:, 0]).all()
 
 
 @pytest.mark.parametrize(

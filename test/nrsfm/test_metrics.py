@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.metrics import (
+    camera_errors,
     object_frame,
     procrustes_distances,
     shape_errors,
@@ -159,3 +161,29 @@ def test_every_order_of_the_four_has_the_sign_of_its_permutation() -> None:
         layout = KeypointLayout("person", NAMES, handedness=names)
         sign = np.linalg.det(np.eye(4)[list(order)])
         assert np.sign(signed_volumes(STANDING[None], layout)[0]) == sign
+
+
+def person(frames: int = 20) -> np.ndarray:
+    """Return (frames, 12, 3) random shapes in mm, away from the origin."""
+    return np.random.default_rng(0).normal([0, 0, 3000], 300, (frames, 12, 3))
+
+
+def test_errors_of_a_perfect_shape_at_any_scale_and_place() -> None:
+    truth = person()
+    truth[3, 5] = np.nan  # a frame that is not wholly known
+    S = np.nan_to_num(truth) * 0.001 + [1, 2, 3]
+    np.testing.assert_allclose(camera_errors(S, truth), 0, atol=1e-4)
+
+
+def test_a_turned_shape_is_wrong_in_the_camera_only() -> None:
+    turn = Rotation.from_rotvec(np.radians([0, 30, 0])).as_matrix()
+    error = camera_errors(person() @ turn, person())
+    assert error.aligned < 1e-6 and error.in_camera > 100
+    assert error.rotation == pytest.approx(30) and error.mirrored == 0
+
+
+def test_a_mirrored_shape_is_found_out() -> None:
+    half = person()
+    half[:10, :, 2] *= -1
+    error = camera_errors(half, person())
+    assert error.mirrored == 0.5 and error.aligned > 50

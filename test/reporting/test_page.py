@@ -177,3 +177,16 @@ def test_other_models_are_compared_with(tmp_path: Path) -> None:
     figures = [len(re.findall(r"\d\.\d{3}", cells)) for _, cells in rows]
     assert figures == [7, 4, 7]
     assert sorted(f.name for f in tmp_path.glob("*mine*")) == ["mine.html", "mine.safetensors"]
+
+
+def test_shapes_are_drawn_and_turn_in_a_browser(tab: Any, text: str, tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text(text)
+    tab.open((tmp_path / "report.html").as_uri())
+    drawn = "[...document.querySelectorAll('canvas')].map(c => c.toDataURL())"
+    before = tab.evaluate(drawn)
+    assert len(set(before)) == len(before) == 17
+    still = "canvas:not(.large)"
+    tab.evaluate(f"document.querySelector({still!r}).scrollIntoView({{block: 'center'}})")
+    x, y = tab.middle(still)
+    tab.drag((x, y), (x + 50, y))
+    assert tab.evaluate(drawn)[5] != before[5]  # the first of the frames, after mean and modes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.commands.demo.client import Played
-from deep_nrsfm_ros.nrsfm.geometry import align, centre
-from deep_nrsfm_ros.nrsfm.metrics import procrustes_distances
+from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.observations.pose2sim import Session
 
 Floats = NDArray[Any]
@@ -30,34 +29,6 @@ _COLUMNS = {
     "rotation deg": ".1f",
     "mirrored %": ".0f",
 }
-
-
-class Errors(NamedTuple):
-    """Errors of lifted shapes, means over frames and points but for the rotation."""
-
-    aligned: float  # mm after the best similarity with a proper rotation
-    in_camera: float  # mm after the best scale and translation: the camera's view must fit too
-    rotation: float  # degrees between the two, median
-    mirrored: float  # share of frames that a reflection fits better
-
-
-def errors(shapes: Floats, truth: Floats) -> Errors:
-    """Compare shapes (f, p, 3) with truth (f, p, 3) in mm, both in the camera's frame.
-
-    Frames of which the truth is not wholly known are left out.
-    """
-    known = np.isfinite(truth).all((1, 2))
-    S, T = centre(shapes[known].astype(float)), centre(truth[known])
-    scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
-    apart = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
-    turn = align(S, T).rotation
-    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
-    return Errors(
-        float(procrustes_distances(S, T).mean()),
-        float(apart.mean()),
-        float(np.degrees(np.median(angle))),
-        float(align(S, T, allow_reflection=True).mirrored.mean()),
-    )
 
 
 def read_points(bag: Path, topic: str = "/lifter/points") -> dict[int, Floats]:
@@ -85,7 +56,7 @@ def table(
     for view, run in zip(session.views, played, strict=True):
         frames = [i for i, stamp in enumerate(run.stamps) if stamp in points]
         shapes = np.stack([points[run.stamps[i]][limbs] for i in frames])
-        error = errors(shapes, view.truth[frames])
+        error = camera_errors(shapes, view.truth[frames])
         rows.append(
             [
                 *(len(run.stamps), len(frames), run.rate, run.latency(50), run.latency(99)),

@@ -1,0 +1,147 @@
+"""Lift a file of 2D keypoints to 3D, without ROS: npz, JSON or bag in, npz, JSON or bag out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from tqdm import tqdm
+
+from deep_nrsfm_ros.commands.program import program
+from deep_nrsfm_ros.configuration import add_arguments, override
+from deep_nrsfm_ros.node.model_folders import model_folders
+from deep_nrsfm_ros.node.pipeline import MODEL_ORDER, InputOptions
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
+from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
+from deep_nrsfm_ros.nrsfm.object_file import find_layout
+from deep_nrsfm_ros.observations.detections import Detections
+from deep_nrsfm_ros.observations.keypoint_files import KINDS, read_keypoints
+from deep_nrsfm_ros.observations.lifted_files import check_output, write_recording
+from deep_nrsfm_ros.observations.mapping_file import read_mapping
+from deep_nrsfm_ros.observations.recording import Recording, lift_recording
+
+
+def arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(prog="lift", description=__doc__)
+    parser.add_argument("input", type=Path, help=f"keypoints: {KINDS}")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        required=True,
+        help="what to write, by its suffix: .npz, .json, or a bag (a name without suffix)",
+    )
+    add_reading_arguments(parser)
+    return parser
+
+
+def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what says how keypoints are read and lifted."""
+    parser.add_argument("--topic", default="", help="keypoints in a bag (default: the only ones)")
+    parser.add_argument(
+        "--mapping",
+        default="",
+        help="field mapping (.yaml) for messages in a bag of a type not known here",
+    )
+    parser.add_argument(
+        "--rate",
+        type=_positive,
+        default=30.0,
+        help="frames a second of input without stamps (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--objects",
+        default="all",
+        choices=("all", "largest"),
+        help="lift everyone in a frame, or who is largest in the image (default: %(default)s)",
+    )
+    add_arguments(parser, InputOptions, without=("input_type", "topics"))
+    add_arguments(parser, LiftingOptions)
+
+
+def read_model(given: argparse.Namespace) -> tuple[Model, KeypointLayout]:
+    """Return the model and the layout of the keypoints; raise ValueError if there is none."""
+    inputs = override(InputOptions(), given)
+    folders = model_folders(Path(inputs.models_dir).expanduser())
+    model = load_model(find_model(inputs.model, folders))
+    if inputs.keypoint_layout == MODEL_ORDER:
+        return model, model.layout
+    return model, find_layout("--keypoint-layout", inputs.keypoint_layout)
+
+
+def read_objects(given: argparse.Namespace, source: KeypointLayout) -> Detections:
+    """Return the objects in the input; raise ValueError if it cannot be read."""
+    inputs = override(InputOptions(), given)
+    with progress("reading") as on_progress:
+        seen = read_keypoints(
+            given.input,
+            len(source),
+            topic=given.topic,
+            rate=given.rate,
+            min_confidence=inputs.min_confidence,
+            on_progress=on_progress,
+            warn=warn,
+            mapping=read_mapping(Path(given.mapping).expanduser()) if given.mapping else None,
+            size=inputs.image_size,
+        )
+    return seen.largest() if given.objects == "largest" else seen
+
+
+def lift_objects(
+    given: argparse.Namespace, model: Model, source: KeypointLayout, seen: Detections
+) -> Recording:
+    """Return the objects lifted as the arguments say."""
+    lifter = Lifter(model, override(LiftingOptions(), given))
+    with progress("lifting") as on_progress:
+        return lift_recording(seen, source, lifter, on_progress)
+
+
+@contextmanager
+def progress(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield what shows how many of how many are done, on a terminal."""
+    with tqdm(desc=label, disable=None, leave=False, file=sys.stderr) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def warn(message: str) -> None:
+    """Tell what was not as it should be, though the work goes on."""
+    tqdm.write(f"warning: {message}", file=sys.stderr)
+
+
+def _positive(text: str) -> float:
+    """Return a number above 0; raise ValueError for another."""
+    if not 0 < (value := float(text)) < 1e6:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0")
+    return value
+
+
+@program
+def main(argv: Sequence[str] | None = None) -> None:
+    """Write the lifted objects; exit code 2 says that the input was at fault."""
+    given = arguments().parse_args(argv)
+    try:
+        check_output(given.output)
+        model, source = read_model(given)
+        recording = lift_objects(given, model, source, read_objects(given, source))
+        write_recording(given.output, recording, model.name)
+    except (ValueError, OSError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        sys.exit(2)
+    lifted, total = recording.sound.sum(), len(recording.seen)
+    frames = len(recording.seen.stamps)
+    print(f"{given.output}: {lifted} of {total} objects in {frames} frames lifted")
+    if lifted < total:
+        warn(f"{total - lifted} objects have too few visible keypoints, or all on one line")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""With CameraInfo, what the lifter answers is at its place."""
+
+from __future__ import annotations
+
+import importlib.util
+from array import array
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
+from std_msgs.msg import Header
+
+from deep_nrsfm_ros.node import publishing
+from deep_nrsfm_ros.node.transforms import frames
+from deep_nrsfm_ros.nrsfm.geometry import quaternion
+from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
+from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
+from deep_nrsfm_ros.nrsfm.lifting import Lifted
+from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP, pack_points
+
+P = len(HUMAN17)
+STREAM = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+DISTORTION = (-0.2, 0.05, 0.001, -0.001, 0.0)
+
+
+def info(focal: float = 600.0) -> CameraInfo:
+    return CameraInfo(
+        header=Header(frame_id="optical"),
+        distortion_model="plumb_bob",
+        d=DISTORTION,
+        k=[focal, 0.0, 320.0, 0.0, focal, 240.0, 0.0, 0.0, 1.0],
+    )
+
+
+def keypoints(frame: str = "") -> tuple[PointCloud2, np.ndarray]:
+    pixels = np.random.default_rng(0).uniform(200, 400, (1, P, 2)).astype(np.float32)
+    fields = [PointField(name=n, offset=o, datatype=7, count=1) for n, o in POINT_FIELDS]
+    message = PointCloud2(
+        header=Header(frame_id=frame),
+        height=1,
+        width=P,
+        fields=fields,
+        point_step=POINT_STEP,
+        row_step=P * POINT_STEP,
+        data=array("B", pack_points(pixels, np.ones((1, P)))),
+    )
+    return message, pixels
+
+
+def place(message: PointCloud2) -> np.ndarray:
+    """Return the mean (3,) of the first object's points."""
+    return np.frombuffer(message.data, np.float32).reshape(-1, 4)[:P, :3].mean(0)
+
+
+@pytest.mark.parametrize("qos", [STREAM, LATCHED], ids=["stream", "latched"])
+def test_objects_are_at_their_place_once_camera_info_is_heard(
+    start_lifter: Callable[..., Any], connect: Callable[..., Any], qos: QoSProfile
+) -> None:
+    start_lifter(camera_info="camera_info", reference_length=0.5)
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    message, pixels = keypoints()
+    sender = client.node.create_timer(0.1, lambda: publisher.publish(message))
+    client.wait_for_health(
+        lambda _, v: "/camera_info has not come yet" in v["last problem"] + v["camera"]
+    )
+    assert not client.heard["/lifter/points"]
+    client.node.destroy_timer(sender)
+
+    camera = client.node.create_publisher(CameraInfo, "camera_info", qos)
+    camera.publish(info())
+    resend = client.node.create_timer(0.2, lambda: camera.publish(info()))
+    if qos is LATCHED:
+        client.node.destroy_timer(resend)  # once is enough
+    client.wait_for_health(lambda _, v: v["camera"] == "plumb_bob, focal length 600.0 pixels")
+    answer = client.exchange(publisher, message)
+    assert answer.header.frame_id == "optical"
+    ray = Intrinsics((600.0, 600.0), (320.0, 240.0), DISTORTION).rays(pixels).mean(1)[0]
+    x, y, z = place(answer)
+    assert z > 0.5 and (x / z, y / z) == pytest.approx(ray, abs=0.05)
+    assert client.exchange(publisher, keypoints("other")[0]).header.frame_id == "other"
+
+
+def test_a_camera_that_is_not_calibrated_is_reported(
+    start_lifter: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    lifter = start_lifter(camera_info="camera_info")
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    camera = client.publisher(CameraInfo, topic="camera_info")
+    message, _ = keypoints()
+
+    def send() -> None:
+        camera.publish(info(focal=0.0))
+        publisher.publish(message)
+
+    sender = client.node.create_timer(0.1, send)
+    client.wait_for_health(lambda _, v: "the camera is not calibrated" in v["last problem"])
+    client.node.destroy_timer(sender)
+    assert lifter.process.poll() is None
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reason"),
+    [
+        ({"tf_prefix": "person_"}, "tf_prefix is 'person_' without camera_info"),
+        pytest.param(
+            {"tf_prefix": "person_", "camera_info": "camera_info"},
+            "tf2_msgs is missing; install it (apt install ros-jazzy-tf2-msgs)",
+            marks=pytest.mark.skipif(
+                importlib.util.find_spec("tf2_msgs") is not None, reason="tf2_msgs is there"
+            ),
+        ),
+    ],
+)
+def test_frames_that_cannot_be_sent_are_refused_at_the_start(
+    start_lifter: Callable[..., Any], parameters: dict[str, Any], reason: str
+) -> None:
+    lifter = start_lifter(listens=False, **parameters)
+    assert lifter.process.wait(60) == 1
+    assert reason in lifter.log and "Traceback" not in lifter.log
+
+
+def placed() -> Lifted:
+    """Return two objects at their place, and one between them that was not lifted."""
+    rng = np.random.default_rng(0)
+    shapes = rng.standard_normal((3, 5, 3)).astype(np.float32) + np.float32([1, 2, 30])
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
+    residual = np.array([0.1, np.nan, 0.1], np.float32)
+    shapes[1] = np.nan
+    return Lifted(
+        shapes,
+        np.tile(turn, (3, 1, 1)),
+        np.full(3, 20, np.float32),
+        np.array([[320, 240], [np.nan, np.nan], [322, 241]], np.float32),
+        residual,
+        np.ones((3, 5), np.float32),
+    )
+
+
+def test_frames_lead_from_the_objects_to_the_camera() -> None:
+    lifted = placed()
+    found = frames(Header(frame_id="optical"), lifted, ["a", "b", "c"])
+    assert [frame.child_frame_id for frame in found] == ["a", "c"]
+    for frame, i in zip(found, (0, 2), strict=True):
+        assert frame.header.frame_id == "optical"
+        move, turn = frame.transform.translation, frame.transform.rotation
+        assert (move.x, move.y, move.z) == pytest.approx(lifted.shapes[i].mean(0), rel=1e-5)
+        expected = quaternion(lifted.rotations[i])
+        assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx(expected, abs=1e-6)
+
+
+def test_markers_stand_where_the_points_are() -> None:
+    lifted = placed()
+    markers = publishing.markers(Header(), lifted, [(0, 1)], placed=True).markers
+    for marker in markers:
+        position = marker.pose.position
+        assert (position.x, position.y, position.z) == (0, 0, 0)
+    joints = [(q.x, q.y, q.z) for q in markers[1].points]
+    np.testing.assert_allclose(joints, lifted.shapes[0], rtol=1e-6)
+    assert markers[1].scale.x < 0.2  # of the size of the object, not of its distance
