@@ -2,7 +2,9 @@
 # make demo-live   from videos to 3D, with MediaPipe Pose as the detector
 # make test        environment, lint, types and all tests
 # make lint        lint and types only
+# make fuzz        100000 spoilt inputs of every kind; takes hours
 # make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
+# make audit       known vulnerabilities of the pins in requirements.lock
 # make lock        resolve requirements.lock anew
 # make clean       remove what building and testing left; .venv and downloads stay
 #
@@ -22,7 +24,7 @@ READY := .venv/.ready
 # Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
 EXAMPLES_READY := .venv/.ready-examples
 
-.PHONY: demo demo-live test lint benchmark lock clean
+.PHONY: demo demo-live test lint fuzz benchmark audit lock clean
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
@@ -37,6 +39,9 @@ lint: $(READY)
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
+
+fuzz: $(READY)
+	FUZZ=100000 $(PYTHON) -m pytest test/fuzz
 
 benchmark: $(READY)
 	@test -n "$(DATA)" || { echo "make benchmark DATA=DIR: DIR holds cmu/ and nrsfm/"; exit 2; }
@@ -59,6 +64,12 @@ $(EXAMPLES_READY): $(READY)
 	    "rm -rf .venv; make PYTHON3=python3.12 demo-live" % sys.version_info[:2])'
 	$(PYTHON) -m pip install --constraint requirements.lock --no-build-isolation --editable '.[examples]'
 	touch $@
+
+# In an environment of its own: what it needs is nothing that we need.
+audit:
+	$(PYTHON3) -m venv build/audit
+	build/audit/bin/pip install --quiet pip-audit
+	build/audit/bin/pip-audit --requirement requirements.lock --no-deps --disable-pip
 
 # Left out: the CUDA wheels, which torch itself pins, on the machines that want them.
 lock:

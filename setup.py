@@ -23,6 +23,7 @@ setup(
         (f"{SHARE}/launch", glob("launch/*.launch.py")),
         (f"{SHARE}/config", glob("config/*.yaml") + glob("config/*.rviz")),
         (f"{SHARE}/config/objects", glob("config/objects/*.yaml")),
+        (f"{SHARE}/config/security", glob("config/security/*.xml")),
         (f"{SHARE}/config/mappings", glob("config/mappings/*.yaml")),
         (f"{SHARE}/models", glob("models/*.safetensors") + glob("models/*.md")),
         (f"lib/{NAME}", glob("scripts/*")),

@@ -130,6 +130,7 @@ def test_share_has_what_the_source_has(prefix):
         "launch": ["*.launch.py"],
         "config": ["*.yaml", "*.rviz"],
         "config/objects": ["*.yaml"],
+        "config/security": ["*.xml"],
         "config/mappings": ["*.yaml"],
         "models": ["*.safetensors", "*.md"],
     }.items():

@@ -26,7 +26,9 @@ def parameter_rows(cls: type, prefix: str) -> list[str]:
     rows = []
     for field, _, opt in options(cls):
         default: Any = field.default
-        shown = {"models_dir": "$ROS_HOME/deep_nrsfm_ros/models", (): "none", "": "empty"}
+        home = "$ROS_HOME/deep_nrsfm_ros"
+        shown = {"models_dir": f"{home}/models", "bags_dir": f"{home}/bags"}
+        shown |= {(): "none", "": "empty"}
         text = shown.get(field.name) or shown.get(default, default)
         star = "*" if opt.read_only else ""
         rows.append(f"| `{name_of(field, prefix)}`{star} | {text} | {opt.description} |")

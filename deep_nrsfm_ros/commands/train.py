@@ -25,7 +25,7 @@ from deep_nrsfm_ros.commands.reporter import CancelledError, Reporter, SilentRep
 from deep_nrsfm_ros.commands.resuming import as_asked_before
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.node.model_folders import model_folders
-from deep_nrsfm_ros.node.unfinished import checkpoint_file, under_way, unwritable
+from deep_nrsfm_ros.node.unfinished import check_room, checkpoint_file, under_way, unwritable
 from deep_nrsfm_ros.nrsfm.distributed import join, rank
 from deep_nrsfm_ros.nrsfm.fine_tuning import inherit, keep_what_is_fixed, start_from
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
@@ -123,6 +123,7 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
         size = (given.image_width, given.image_height)
         reading = read_bags(
             *(given.bag, given.topic, source, target, given.min_confidence, report.reading),
+            max_frames=override(Limits(), given).max_frames,
             mapping=_mapping(given),
             size=size if all(size) else None,
         )
@@ -223,6 +224,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     if start:
         keep_what_is_fixed(start, preset)
     limits = override(WHOLE if given.cmu else Limits(), given)
+    check_room(given.output, limits.free_disk)
     if importlib.util.find_spec("torch") is None:
         raise ValueError("training needs torch, which is not installed: pip install torch")
     curated, variation = prepare(given, read_data(given, report), report.say)

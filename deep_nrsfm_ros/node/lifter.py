@@ -28,6 +28,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -38,17 +39,24 @@ from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.node import parameters, publishing
 from deep_nrsfm_ros.node.camera import CameraListener, CameraOptions
+from deep_nrsfm_ros.node.fence import Fence
 from deep_nrsfm_ros.node.health import Health
 from deep_nrsfm_ros.node.listening import Listener, Source
-from deep_nrsfm_ros.node.model_folders import model_folders
 from deep_nrsfm_ros.node.pipeline import MODEL_ORDER, InputOptions, Pipeline
-from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest, layouts
+from deep_nrsfm_ros.node.training_request import (
+    TrainingOptions,
+    TrainingRequest,
+    fenced,
+    layouts,
+    limited,
+    paths_of,
+)
 from deep_nrsfm_ros.node.training_service import TrainingService
 from deep_nrsfm_ros.node.transforms import Broadcaster
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.limits import Limits
-from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
+from deep_nrsfm_ros.nrsfm.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
@@ -58,6 +66,7 @@ _STEADY = "steady."
 _TRAIN = "train."
 _LOG_PERIOD = 2.0
 _REPORT_PERIOD = 1.0
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 _END_OF_TRAINING = 1.0  # seconds that a training has to save its model when the node ends
 
 
@@ -74,11 +83,15 @@ class LifterNode(Node):
         parameters.declare(self, LiftingOptions)
         camera = parameters.declare(self, CameraOptions)
         parameters.declare(self, SteadyingOptions, _STEADY)
-        parameters.declare(self, TrainingOptions, _TRAIN)
+        training = parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
         parameters.declare(self, Limits, _TRAIN)
         parameters.declare(self, Curation, _TRAIN)
-        self._models_dir = Path(self._inputs.models_dir).expanduser()
+        self._fence = Fence(
+            Path(self._inputs.models_dir).expanduser(),
+            Path(self._inputs.bags_dir).expanduser(),
+            (self._inputs.model, self._inputs.keypoint_layout, *paths_of(training)),
+        )
         self._pipeline = self._proposed = self._prepare(())
 
         self._camera = CameraListener(self, camera)
@@ -91,9 +104,12 @@ class LifterNode(Node):
         self._markers = self.create_publisher(MarkerArray, "~/markers", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._training = TrainingService(
-            *(self, self._training_request, self._activate, self._models_dir)
+            *(self, self._training_request, self._activate, self._fence.models_dir)
         )
-        self.create_timer(_REPORT_PERIOD, self._report)
+        # Not in ROS time: a simulation that pauses, or jumps back, would silence it.
+        self.create_timer(
+            _REPORT_PERIOD, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         self.add_on_set_parameters_callback(self._consider)
         self.add_post_set_parameters_callback(self._adopt)
         self.get_logger().info(
@@ -141,7 +157,7 @@ class LifterNode(Node):
 
     def _reject(self, source: Source, problem: Exception) -> None:
         """Count a message that could not be lifted; say why, but not too often."""
-        reason = str(problem) if isinstance(problem, ValueError) else f"internal error: {problem!r}"
+        reason = _words(problem)
         self._health.rejected(reason)
         self.get_logger().warning(
             f"message on {source.topic} dropped: {reason}", throttle_duration_sec=_LOG_PERIOD
@@ -175,7 +191,7 @@ class LifterNode(Node):
         model: Model
         detector: KeypointLayout | None
         if "model" in changed:
-            model = load_model(self._model_file(inputs.model))
+            model = load_model(self._fence.model("model", inputs.model))
         else:
             model = self._pipeline.model
         if "keypoint_layout" not in changed:
@@ -183,19 +199,16 @@ class LifterNode(Node):
         elif inputs.keypoint_layout == MODEL_ORDER:
             detector = None
         else:
-            detector = find_layout("keypoint_layout", inputs.keypoint_layout)
+            word = self._fence.layout("keypoint_layout", inputs.keypoint_layout)
+            detector = find_layout("keypoint_layout", word)
         return Pipeline(model, detector, inputs, lifting, steadying)
-
-    def _model_file(self, name: str) -> Path:
-        """Return the file of a model by name or path; raise ValueError if there is none."""
-        return find_model(name, model_folders(self._models_dir))
 
     def _consider(self, changes: list[Parameter]) -> SetParametersResult:
         """Prepare for changed parameters, or refuse them with the reason."""
         try:
             self._proposed = self._prepare(changes)
-        except (ValueError, OSError) as problem:
-            return SetParametersResult(successful=False, reason=str(problem))
+        except Exception as problem:  # whatever it is, the lifter goes on as it was
+            return SetParametersResult(successful=False, reason=_words(problem))
         return SetParametersResult(successful=True)
 
     def _adopt(self, changes: list[Parameter]) -> None:
@@ -206,12 +219,11 @@ class LifterNode(Node):
 
     def _training_request(self) -> TrainingRequest:
         """Return what ~/train is to do, as the parameters stand."""
-        wanted = parameters.read(self, TrainingOptions, _TRAIN)
         inputs = parameters.read(self, InputOptions)
-        start = str(self._model_file(wanted.from_)) if wanted.from_ else ""
-        topics = self._listener.topics
-        heard, model = inputs.keypoint_layout, self._model_file(inputs.model)
-        source, target = layouts(wanted, heard, model, start)
+        wanted = fenced(parameters.read(self, TrainingOptions, _TRAIN), self._fence)
+        heard = self._fence.layout("keypoint_layout", inputs.keypoint_layout)
+        topics, model = self._listener.topics, self._fence.model("model", inputs.model)
+        source, target = layouts(wanted, heard, model, wanted.from_)
         return TrainingRequest(
             wanted,
             parameters.read(self, Recipe, _TRAIN),
@@ -221,11 +233,11 @@ class LifterNode(Node):
             image_height=inputs.image_height,
             source_layout=source,
             target_layout=target,
-            start=start,
+            start=wanted.from_,
             min_confidence=inputs.min_confidence,
-            output=self._models_dir,
+            output=self._fence.models_dir,
             curation=parameters.read(self, Curation, _TRAIN),
-            limits=parameters.read(self, Limits, _TRAIN),
+            limits=limited(parameters.read(self, Limits, _TRAIN), wanted.max_minutes),
         )
 
     def _activate(self, path: str) -> None:
@@ -235,13 +247,21 @@ class LifterNode(Node):
             raise ValueError(result.reason)
 
 
+def _words(problem: Exception) -> str:
+    """Return what is wrong, as people are told."""
+    if isinstance(problem, (ValueError, OSError)):
+        return str(problem)
+    return f"internal error: {problem!r}"
+
+
 def main() -> None:
     """Run the node until SIGINT or SIGTERM; the exit code is 0 then, 1 if it cannot start."""
     # rclpy's handlers come on top of these and shut the context down, which ends `spin`. The
     # flag serves a signal that comes before, or amid a call to ROS, which then fails for it.
     signals: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _ENDING:
         signal.signal(number, lambda number, _: signals.append(number))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)  # scripts/lifter has held them back
     rclpy.init()
     try:
         if not signals:
@@ -254,7 +274,7 @@ def main() -> None:
     finally:
         rclpy.try_shutdown()
         # Launchers and terminals send the signal twice; Python's own end would die of the second.
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in _ENDING:
             signal.signal(number, signal.SIG_IGN)
 
 

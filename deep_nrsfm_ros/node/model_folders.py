@@ -1,4 +1,4 @@
-"""Where models are looked for."""
+"""Where models, bags and object files are looked for."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ from pathlib import Path
 
 PACKAGE = "deep_nrsfm_ros"
 
+_SOURCE_TREE = Path(__file__).resolve().parents[2]
+
 
 def default_models_dir() -> Path:
     """Return the folder for a user's own models: $ROS_HOME/deep_nrsfm_ros/models.
 
     ROS_HOME is ~/.ros unless it is set, as for everything else that ROS keeps for a user.
     """
-    home = os.environ.get("ROS_HOME")
-    return (Path(home) if home else Path.home() / ".ros") / PACKAGE / "models"
+    return _ros_home() / PACKAGE / "models"
+
+
+def default_bags_dir() -> Path:
+    """Return the folder for bags to train on: $ROS_HOME/deep_nrsfm_ros/bags."""
+    return _ros_home() / PACKAGE / "bags"
 
 
 def model_folders(models_dir: Path) -> list[Path]:
@@ -24,7 +30,20 @@ def model_folders(models_dir: Path) -> list[Path]:
     The user's own folder, then share/deep_nrsfm_ros/models of each installation on
     AMENT_PREFIX_PATH and of this Python environment, then models/ of a source tree.
     """
+    return [models_dir, *_shared("models"), _SOURCE_TREE / "models"]
+
+
+def object_folders() -> list[Path]:
+    """Return the folders of the object files that come with the package."""
+    return [*_shared("config/objects"), _SOURCE_TREE / "config" / "objects"]
+
+
+def _ros_home() -> Path:
+    home = os.environ.get("ROS_HOME")
+    return Path(home) if home else Path.home() / ".ros"
+
+
+def _shared(folder: str) -> list[Path]:
+    """Return a folder of each installation of this package, once each."""
     prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    shares = [Path(p) / "share" / PACKAGE / "models" for p in (*prefixes, sys.prefix)]
-    source_tree = Path(__file__).resolve().parents[2] / "models"
-    return [models_dir, *dict.fromkeys(shares), source_tree]
+    return [*dict.fromkeys(Path(p) / "share" / PACKAGE / folder for p in (*prefixes, sys.prefix))]

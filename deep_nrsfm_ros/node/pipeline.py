@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.node.model_folders import default_models_dir
+from deep_nrsfm_ros.node.model_folders import default_bags_dir, default_models_dir
 from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions
@@ -33,6 +33,11 @@ class InputOptions:
         "folder for trained models, looked through before those that come with the package",
         read_only=True,
     )
+    bags_dir: str = option(
+        str(default_bags_dir()),
+        "folder of the bags that train.bags may name, set by the owner; relative names begin here",
+        read_only=True,
+    )
     input_type: str = option(
         POINT_CLOUD,
         f"type of the keypoint messages: one of {', '.join(INPUT_TYPES)}; the path of a field "
@@ -53,6 +58,12 @@ class InputOptions:
         MODEL_ORDER,
         "order of the detector's keypoints: a preset, the path of an object file, or 'model' for "
         "the order of the model's own",
+    )
+    max_objects: int = option(
+        100,
+        "most objects in a message; one with more is dropped, not lifted for seconds",
+        low=1,
+        high=100_000,
     )
     min_confidence: float = option(
         0.1, "a keypoint with less confidence counts as missing", low=0, high=1
@@ -87,7 +98,7 @@ class Pipeline:
         self._lifter = Lifter(model, lifting)
         self._min_confidence = inputs.min_confidence
         self._size = inputs.image_size
-        self._min_visible = lifting.min_visible
+        self._min_visible, self._max_objects = lifting.min_visible, inputs.max_objects
         self._steadying = steadying
         self._steady: dict[str, Steadying] = {}
 
@@ -98,6 +109,11 @@ class Pipeline:
         """
         q = len(self.source)
         seen = read(message, input_type, q, self._min_confidence, size or self._size)
+        if len(seen.confidence) > self._max_objects:
+            raise MessageError(
+                f"message has {len(seen.confidence)} objects; expected at most "
+                f"{self._max_objects} (max_objects)"
+            )
         return Observation(*self._map(seen.points, seen.confidence), seen.ids)
 
     @property

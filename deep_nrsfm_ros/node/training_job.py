@@ -155,13 +155,14 @@ class TrainingJob:
 
 
 def _yield_to_others(pid: int) -> None:
-    """Give a process that leads a session the lowest priority.
+    """Give a process that leads a session the lowest priority, and let it go first for memory.
 
     Where Linux groups processes by session, as on a desktop, priorities count within a session
     only, and the session has one of its own.
     """
     with suppress(OSError):  # it ended already, or there are no such groups
         os.setpriority(os.PRIO_PROCESS, pid, _LOWEST)
+        Path(f"/proc/{pid}/oom_score_adj").write_text("1000")
         Path(f"/proc/{pid}/autogroup").write_text(str(_LOWEST))
 
 

@@ -8,12 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from deep_nrsfm_ros.configuration import option, to_arguments
+from deep_nrsfm_ros.node.fence import Fence
 from deep_nrsfm_ros.node.pipeline import MODEL_ORDER
-from deep_nrsfm_ros.node.unfinished import Unfinished, differences, find_unfinished, look
+from deep_nrsfm_ros.node.unfinished import (
+    Unfinished,
+    check_room,
+    checkpoint_file,
+    differences,
+    find_unfinished,
+    look,
+    record_file,
+)
 from deep_nrsfm_ros.nrsfm.fine_tuning import start_from
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.limits import Limits
-from deep_nrsfm_ros.nrsfm.model_file import check_name, load_model
+from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, check_name, load_model
 from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.observations.curation import Curation
@@ -42,12 +51,53 @@ class TrainingOptions:
     )
     name: str = option("trained", "name of the new model; an old one of this name is replaced")
     threads: int = option(1, "threads that the training may use", low=1, high=1024)
+    max_minutes: float = option(
+        0.0,
+        "most wall time that train.minutes may ask for, and what a training gets that asks for no "
+        "limit; 0: no limit",
+        low=0.0,
+        high=100_000.0,
+        read_only=True,
+    )
     resume: bool = option(
         False,
         "go on with the training of train.name that was cut off, with the bags and options that it "
         "began with",
     )
     activate: bool = option(True, "switch to the new model when the training has finished")
+
+
+def paths_of(wanted: TrainingOptions) -> tuple[str, ...]:
+    """Return every option that may be a path."""
+    return (*wanted.bags, wanted.object, wanted.keypoint_layout, wanted.from_)
+
+
+def fenced(wanted: TrainingOptions, fence: Fence) -> TrainingOptions:
+    """Return the options with whole paths; raise ValueError for what leads out of the fence."""
+    check_name("train.name", wanted.name)
+    folder, name = fence.models_dir, wanted.name
+    results = (folder / f"{name}{suffix}" for suffix in (MODEL_SUFFIX, ".html"))
+    traces = (checkpoint_file(folder, name), record_file(folder, name))
+    fence.outputs("train.name", (*results, *traces))
+    return dataclasses.replace(
+        wanted,
+        bags=tuple(fence.bag("train.bags", bag) for bag in wanted.bags),
+        object=fence.layout("train.object", wanted.object),
+        keypoint_layout=fence.layout("train.keypoint_layout", wanted.keypoint_layout),
+        from_=str(fence.model("train.from", wanted.from_)) if wanted.from_ else "",
+    )
+
+
+def limited(wished: Limits, max_minutes: float) -> Limits:
+    """Return the limits within the owner's; raise ValueError for a wish beyond them."""
+    if not max_minutes:
+        return wished
+    if wished.minutes > max_minutes:
+        raise ValueError(
+            f"train.minutes is {wished.minutes:g}; the owner of the lifter allows at most "
+            f"{max_minutes:g} (train.max_minutes)"
+        )
+    return dataclasses.replace(wished, minutes=wished.minutes or max_minutes)
 
 
 def layouts(wanted: TrainingOptions, heard: str, model: Path, start: str) -> tuple[str, str]:
@@ -90,6 +140,7 @@ class TrainingRequest:
     def check(self) -> str:
         """Return what should be known before, or ""; raise ValueError that says what is wrong."""
         check_name("train.name", self.options.name)
+        check_room(self.output, self.limits.free_disk)
         if self.options.resume and (found := self._unfinished()).asked:
             now = differences(found.asked, self._asked())
             said = f"{'; '.join(now)}; it keeps to what it began with" if now else ""
@@ -131,9 +182,9 @@ class TrainingRequest:
             "--image-width": str(self.image_width),
             "--image-height": str(self.image_height),
         }
-        words += [word for pair in named.items() for word in pair]
+        words += [f"{name}={value}" for name, value in named.items()]  # even one that begins with -
         for bag in self.options.bags:
-            words += ["--bag", str(Path(bag).expanduser())]
+            words += [f"--bag={Path(bag).expanduser()}"]
         for config in (self.recipe, self.limits, self.curation):
             words += to_arguments(config)
         return words

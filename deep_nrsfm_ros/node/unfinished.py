@@ -95,7 +95,7 @@ def look(folder: Path, name: str) -> Unfinished | None:
     try:
         with suppress(FileNotFoundError), record.open(encoding="utf-8") as file:
             running = not _lock(file, fcntl.LOCK_SH)
-            with suppress(ValueError):  # damaged: the checkpoint still counts
+            with suppress(ValueError, RecursionError):  # damaged: the checkpoint still counts
                 read = json.load(file)
                 asked = read if isinstance(read, dict) else {}
         saved = checkpoint.is_file()
@@ -167,6 +167,19 @@ def unwritable(folder: Path, error: Exception) -> str:
         "and see that it is writable, or choose another --output (models_dir of the lifter); a "
         "model that was there is as it was"
     )
+
+
+def check_room(folder: Path, megabytes: float) -> None:
+    """Raise ValueError unless the disk of a folder, which need not exist yet, has room."""
+    place = folder.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    free = shutil.disk_usage(place).free / 1e6
+    if free < megabytes:
+        raise ValueError(
+            f"{folder} is on a disk with {free:.0f} MB free; a training needs {megabytes:.0f} MB "
+            "(free_disk); make room, or choose another folder for models"
+        )
 
 
 def lasting(asked: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Edge = tuple[str, str]
+MOST_KEYPOINTS = 1000
+"""Of one object: what lifting takes grows with their square."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,11 @@ class KeypointLayout:
 
     def __post_init__(self) -> None:
         """Refuse a layout that repeats a keypoint or names one that it does not have."""
+        if len(self.keypoints) > MOST_KEYPOINTS:
+            raise ValueError(
+                f"layout {self.name!r} has {len(self.keypoints)} keypoints; at most "
+                f"{MOST_KEYPOINTS} are possible"
+            )
         seen = set(self.keypoints)
         if len(seen) != len(self.keypoints):
             twice = sorted({k for k in self.keypoints if self.keypoints.count(k) > 1})

@@ -32,6 +32,20 @@ class Limits:
         low=0.0,
         high=1.0,
     )
+    max_frames: int = option(
+        1_000_000,
+        "most frames that the bags may hold; more are refused, before they fill the memory",
+        low=10,
+        high=1_000_000_000,
+        read_only=True,
+    )
+    free_disk: float = option(
+        100.0,
+        "MB that must be free on the disk of the models when a training begins",
+        low=0.0,
+        high=1e9,
+        read_only=True,
+    )
     keep_best: bool = option(
         True, "keep the state with the best label-free quality, not the last one"
     )

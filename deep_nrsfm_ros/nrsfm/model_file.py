@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import load, save_file
 
 from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
@@ -25,6 +24,7 @@ MODEL_SUFFIX = ".safetensors"
 _FORMAT = "deep_nrsfm_ros model 2"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _MAX_BYTES = 64 * 2**20
+_MAX_HEADER = 2**20
 
 
 class ModelFileError(ValueError):
@@ -86,30 +86,51 @@ def save_model(path: Path, model: Model) -> None:
 
 def load_model(path: Path) -> Model:
     """Read a model; raise ModelFileError that says what is wrong with the file."""
+    content = _read(path)
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ModelFileError(f"{path} is larger than {_MAX_BYTES >> 20} MiB: not a model")
-        with safe_open(path, "numpy") as file:
-            metadata = file.metadata() or {}
-            weights = {name: file.get_tensor(name) for name in file.keys()}
-    except OSError as error:
-        raise ModelFileError(f"cannot read model {path}: {error.strerror or error}") from error
-    except (SafetensorError, AttributeError, TypeError) as error:  # the last two: no NumPy type
+        metadata, weights = _metadata(content), load(content)
+    except Exception as error:  # safetensors raises many kinds for a damaged file
         raise ModelFileError(f"{path} is damaged or no safetensors file: {error}") from error
     if metadata.get("format") != _FORMAT:
         raise ModelFileError(f"{path} is not a {_FORMAT!r} file; train or download one")
     try:
         return _build(json.loads(metadata["model"]), weights)
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise ModelFileError(f"{path} has a damaged header or weights: {error}") from error
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as e:
+        raise ModelFileError(f"{path} has a damaged header or weights: {e}") from e
+
+
+def _read(path: Path) -> bytes:
+    """Return what a file holds, its size bounded; raise ModelFileError.
+
+    Read, not mapped: a mapped file that somebody cuts off meanwhile kills whoever looks at it.
+    """
+    try:
+        if path.exists() and not path.is_file():  # reading a pipe would wait for ever
+            raise ModelFileError(f"cannot read model {path}: not a regular file")
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size <= _MAX_BYTES:
+                return file.read(_MAX_BYTES)
+    except OSError as error:
+        raise ModelFileError(f"cannot read model {path}: {error.strerror or error}") from error
+    raise ModelFileError(f"{path} is larger than {_MAX_BYTES >> 20} MiB: not a model")
+
+
+def _metadata(content: bytes) -> dict[str, Any]:
+    """Return the metadata of a safetensors file: 8 bytes of length, then a header of JSON."""
+    length = int.from_bytes(content[:8], "little")
+    if length > _MAX_HEADER:
+        raise ValueError(f"its header claims {length} bytes; at most {_MAX_HEADER} are allowed")
+    return dict(json.loads(content[8 : 8 + length]).get("__metadata__", {}))
 
 
 def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> Model:
     """Return the model of a parsed header, every shape checked against the architecture."""
     architecture = Architecture(**_tuples(header["architecture"]))
     normaliser = Normaliser(**header["normaliser"])
-    check(architecture)
-    check(normaliser)
+    for config in (architecture, normaliser):
+        _check_types(config)
+        check(config)
+    _check_names(header["layout"])
     layout = KeypointLayout(**_tuples(header["layout"]))
     p = len(layout)
     shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
@@ -146,6 +167,29 @@ def _tuples(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _tuples(item) for key, item in value.items()}
     return value
+
+
+def _check_types(config: Any) -> None:
+    """Raise ValueError for a value that has not the type of its default; JSON may hold anything."""
+    for field_ in dataclasses.fields(config):
+        default, value = field_.default, getattr(config, field_.name)
+        if isinstance(default, float) and type(value) is int:
+            continue
+        items = value if isinstance(default, tuple) and isinstance(value, tuple) else (value,)
+        kind = type(default[0] if isinstance(default, tuple) else default)
+        if type(value) is not type(default) or any(type(item) is not kind for item in items):
+            raise ValueError(f"{field_.name} is {value!r}; it must be like {default!r}")
+
+
+def _check_names(layout: dict[str, Any]) -> None:
+    """Raise ValueError unless every name in the header's layout is a text."""
+    derived = layout["derived"]
+    lists = [layout["keypoints"], *layout["edges"], layout["handedness"], layout["reference"]]
+    for names in ([layout["name"]], [*derived], *derived.values(), *lists):
+        if not isinstance(names, (list, type(None))) or any(
+            type(n) is not str for n in names or ()
+        ):
+            raise ValueError(f"layout has {str(names)[:60]} for names")
 
 
 def check_name(option: str, name: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 _MAX_BYTES = 64 * 2**10
+_DEEPEST = 8
 
 
 def read_fields(path: Path, example: str) -> dict[Any, Any]:
@@ -25,10 +26,11 @@ def read_fields(path: Path, example: str) -> dict[Any, Any]:
         raise ValueError(f"cannot be read: {error.strerror or error}") from error
     if len(text) > _MAX_BYTES:
         raise ValueError(f"is larger than {_MAX_BYTES >> 10} KiB: not a description")
+    _check_nesting(text)
     try:
         root = yaml.compose(text, yaml.SafeLoader)
         fields = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except Exception as error:  # PyYAML raises many kinds for what explicit tags say
         raise ValueError(f"is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(root, yaml.MappingNode) or not isinstance(fields, dict):
         raise ValueError(f"is {words(fields)}; it must hold fields like '{example}'")
@@ -36,6 +38,21 @@ def read_fields(path: Path, example: str) -> dict[Any, Any]:
     if times > 1:  # YAML itself would keep the last and forget the others
         raise ValueError(f"has the field {words(name)} {times} times")
     return fields
+
+
+def _check_nesting(text: bytes) -> None:
+    """Refuse what makes much out of little before it is made: aliases, deep nesting."""
+    depth = 0
+    try:
+        for event in yaml.parse(text, yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError(f"has the alias *{event.anchor}; write out what it stands for")
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if depth > _DEEPEST:
+                raise ValueError(f"is nested deeper than {_DEEPEST}: not a description")
+    except yaml.YAMLError as error:
+        raise ValueError(f"is not YAML: {' '.join(str(error).split())}") from error
 
 
 def words(value: Any) -> str:

@@ -64,6 +64,7 @@ def read_bags(
     target: KeypointLayout,
     min_confidence: float = 0.0,
     on_progress: Progress | None = None,
+    max_frames: int | None = None,
     mapping: FieldMapping | None = None,
     size: Size | None = None,
 ) -> BagReading:
@@ -73,6 +74,7 @@ def read_bags(
     topic: name of the topic, or of several by a `*` (see `topics.match`); "" takes the only one of
         the mapping's type, or of a type in `messages.INPUT_TYPES`.
     source: the layout in which the detector wrote the messages.
+    max_frames: more than these raise BagError.
     mapping: how messages of its type are read. size: of the image, for normalised keypoints.
     Memory stays within about twice the ensemble. Raises BagError naming the bag when one is
     missing, damaged beyond reading or without such a topic, or when no message is readable.
@@ -92,6 +94,11 @@ def read_bags(
                     except Exception as error:  # whatever bytes a bag holds, others still count
                         unreadable += 1
                         reason = reason or _text(error)
+                    if max_frames is not None and frames.count > max_frames:
+                        raise BagError(
+                            f"bag {path} brings the frames above {max_frames}, the most that are "
+                            "read (max_frames); name fewer bags, or allow more"
+                        )
                     if on_progress and messages % 256 == 0:
                         on_progress(messages, max(messages, done + chosen.total))
                 if warning := bag.warning(chosen):
@@ -137,12 +144,14 @@ class _Frames:
     def __init__(self, keypoint_map: KeypointMap) -> None:
         """Start empty."""
         self._map = keypoint_map
+        self.count = 0
         self._waiting: list[Observation] = []
         self._points: list[NDArray[np.float32]] = []
         self._visible: list[NDArray[np.bool_]] = []
 
     def add(self, observation: Observation) -> None:
         """Append the objects of one observation."""
+        self.count += len(observation.confidence)
         self._waiting.append(observation)
         if len(self._waiting) == _BLOCK:
             self._store()

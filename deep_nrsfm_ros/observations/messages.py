@@ -85,7 +85,7 @@ def read(
             return observation(reader(message, keypoints), min_confidence)
     except MessageError:
         raise
-    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+    except (AttributeError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise MessageError(f"expected a message of type {name_of(input_type)}: {error}") from None
     raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
 

@@ -122,7 +122,8 @@ def start_lifter(
         listens: bool = True,
         **parameters: Any,
     ) -> LifterProcess:
-        parameters = {"model": "person", "models_dir": str(models)} | parameters
+        folders = {"models_dir": str(models), "bags_dir": str(tmp_path)}
+        parameters = {"model": "person"} | folders | parameters
         lifter = LifterProcess([*program], parameters, tmp_path / f"lifter{len(started)}")
         started.append(lifter)
         if listens:

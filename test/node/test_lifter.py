@@ -249,7 +249,7 @@ def test_parameters_change_what_the_next_message_gets(start_lifter, connect):
     for refused, reason in {
         "broken": "damaged",
         "nowhere": "joints, person",
-        "/etc/passwd": "no model",
+        "/etc/passwd": "outside of bags_dir",
     }.items():
         assert reason in client.set_parameters(model=refused)
     assert "share" in client.set_parameters(model="joints", keypoint_layout="coco17")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -279,3 +280,37 @@ def test_find_model(tmp_path: Path) -> None:
         assert str(folders[0]) in str(caught.value) and repr(unknown) in str(caught.value)
     with pytest.raises(ModelFileError, match="there are none"):
         find_model("human", folders[2:])
+
+
+def test_a_header_that_claims_too_much_is_refused_before_it_is_read(file: Path) -> None:
+    for length in (2**20 + 1, 2**40, 2**64 - 1):
+        file.write_bytes(length.to_bytes(8, "little") + bytes(2**21))
+        assert "its header claims" in refused(file)
+
+
+def test_a_pipe_is_no_model(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.safetensors")
+    assert "not a regular file" in refused(tmp_path / "pipe.safetensors")
+
+
+def test_more_keypoints_than_can_be_lifted_are_refused() -> None:
+    with pytest.raises(ValueError, match="1001 keypoints; at most 1000"):
+        KeypointLayout.numbered(1001)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"architecture": {"widths": [8.0, 4]}},
+        {"architecture": {"widths": [8, True]}},
+        {"architecture": {"widths": [8, 4], "whitening": "1"}},
+        {"normaliser": {"scale": ["rms", "rms"]}},
+        {"layout": {**dataclasses.asdict(HUMAN17), "name": 5}},
+        {"layout": {**dataclasses.asdict(HUMAN17), "keypoints": [*range(17)]}},
+        {"layout": {**dataclasses.asdict(HUMAN17), "derived": {"nose": [{}]}}},
+    ],
+    ids=str,
+)
+def test_what_the_header_says_has_the_right_type(file: Path, changes: dict[str, Any]) -> None:
+    rewrite(file, lambda header, weights, metadata: header.update(changes))
+    assert "damaged header or weights" in refused(file)

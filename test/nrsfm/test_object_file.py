@@ -132,7 +132,7 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     "code": ("!!python/object/apply:os.system ['true']", "is not YAML"),
     "bytes": (b"\xff\xfe\x00\xd8", "is not YAML"),
     "impossible date": ("name: 2001-99-99", "is not YAML"),
-    "deep": ("[" * 30_000, "is not YAML"),
+    "deep": ("[" * 30_000, "nested deeper than 8"),
     "huge": ("#" * 100_000, "larger than 64 KiB"),
     "long value": (f"name: x\nkeypoints: {'a' * 10_000}", "aaa..."),
 }
@@ -150,7 +150,7 @@ def test_a_text_that_grows_without_end_is_refused_shortly(tmp_path: Path) -> Non
         "a0: &a0 [x, x]",
         *(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 20)),
     ]
-    assert "no field 'a0'" in refused(write(tmp_path, "\n".join(lines)))
+    assert "has the alias *a0" in refused(write(tmp_path, "\n".join(lines)))
     lines.append("name: *a19\nkeypoints: *a19")
     refused(write(tmp_path, "\n".join(lines)))
 
@@ -195,3 +195,23 @@ def test_a_layout_is_found_by_preset_object_file_and_model_file(
 def test_a_layout_that_is_not_there_is_refused(word: str, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         find_layout("--object", word)
+
+
+def test_little_text_that_stands_for_much_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.yaml"
+    merged = "".join(
+        f"a{i + 1}: &a{i + 1} {{<<: [{', '.join([f'*a{i}'] * 9)}]}}\n" for i in range(9)
+    )
+    for text, complaint in {
+        "a0: &a0 {x: y}\n" + merged: "has the alias *a0",
+        "name: &n x\nkeypoints: [*n, *n, *n, *n]": "has the alias *n",
+        "name: " + "[" * 30000: "nested deeper than 8",
+        "name: " + "{a: " * 9: "nested deeper than 8",
+        "name: !!int ''\nkeypoints: []": "is not YAML",
+        "name: !!timestamp x": "is not YAML",
+        "name: !!python/object/apply:os.system [true]": "is not YAML",
+    }.items():
+        path.write_text(text)
+        with pytest.raises(ObjectFileError) as refusal:
+            read_object(path)
+        assert complaint in str(refusal.value)

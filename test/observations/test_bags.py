@@ -241,3 +241,12 @@ def test_messages_without_objects_or_sense_do_not_count(tmp_path: Path) -> None:
     write_raw(tmp_path / "huge", {TOPIC: ("sensor_msgs/msg/PointCloud2", [huge])})
     with pytest.raises(BagError, match="no message in huge tells .*points need"):
         most_keypoints([tmp_path / "huge"], TOPIC)
+
+
+def test_more_frames_than_allowed_are_refused_before_they_fill_the_memory(tmp_path):
+    path = tmp_path / "bag"
+    points, confidence = np.ones((300, 17, 2)), np.ones((300, 17))
+    write_bag(path, "/k", frames(points, confidence))
+    with pytest.raises(BagError, match=r"above 299.*\(max_frames\)"):
+        read_bags([path], "/k", HUMAN17, HUMAN17, max_frames=299)
+    assert len(read_bags([path], "/k", HUMAN17, HUMAN17, max_frames=300).ensemble) == 300

@@ -1,0 +1,214 @@
+"""Check an installation from the imports to an answer over DDS, and say how to mend what is wrong.
+
+Exit code 0: all that lifting needs works; 1: something does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from deep_nrsfm_ros.commands.program import program
+from deep_nrsfm_ros.nrsfm.limits import Limits
+
+NEEDED = ("numpy", "safetensors", "yaml", "rosbags", "rclpy", "sensor_msgs", "diagnostic_msgs")
+TO_TRAIN = ("torch", "jinja2", "tqdm")
+RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+HIGHEST_DOMAIN = 101  # above it, DDS takes ports that Linux gives to others
+LEAST_SHM = 8e6  # bytes: each participant of Fast DDS takes a segment of about half a MB
+
+
+class Finding(NamedTuple):
+    """What a check saw. mend: what to do about it, "" if all is well. fatal: lifting needs it."""
+
+    seen: str
+    mend: str = ""
+    fatal: bool = True
+
+    @property
+    def word(self) -> str:
+        """Return how bad it is."""
+        return "ok" if not self.mend else "FAIL" if self.fatal else "warn"
+
+
+def check_imports() -> Finding:
+    """Return the versions of what is needed."""
+    seen = [f"Python {sys.version.split()[0]}"]
+    missing: list[str] = []
+    lacking: list[str] = []
+    distributions = importlib.metadata.packages_distributions()
+    for name in (*NEEDED, *TO_TRAIN):
+        if importlib.util.find_spec(name) is None:
+            (missing if name in NEEDED else lacking).append(name)
+            continue
+        if name != "torch":  # takes seconds to import
+            try:
+                importlib.import_module(name)
+            except Exception as error:  # a library of the wrong kind fails in many ways
+                mend = "install it anew; are two ROS installations mixed?"
+                return Finding(f"{name} does not import: {error}", mend)
+        for distribution in distributions.get(name, ())[:1]:  # none where apt has installed it
+            seen.append(f"{distribution} {importlib.metadata.version(distribution)}")
+    said = ", ".join(dict.fromkeys(seen))
+    if missing:
+        mend = f"pip install {' '.join(missing)}, or source the setup file of ROS 2"
+        return Finding(f"{', '.join(missing)} not found ({said})", mend)
+    if lacking:
+        mend = f"pip install {' '.join(lacking)}, if you want to train"
+        return Finding(f"{', '.join(lacking)} not found ({said})", mend, fatal=False)
+    return Finding(said)
+
+
+def check_environment() -> Finding:
+    """Return what decides whom ROS nodes find."""
+    said = os.environ.get
+    domain, reach = said("ROS_DOMAIN_ID", "0"), said("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    seen = f"ROS_DOMAIN_ID {domain}, discovery range {reach}"
+    if not domain.isdecimal() or int(domain) > HIGHEST_DOMAIN:
+        return Finding(seen, f"set ROS_DOMAIN_ID to a number from 0 to {HIGHEST_DOMAIN}")
+    if reach not in RANGES:
+        return Finding(seen, f"set ROS_AUTOMATIC_DISCOVERY_RANGE to one of {', '.join(RANGES)}")
+    if reach == "OFF" and not said("ROS_STATIC_PEERS"):
+        return Finding(seen, "with discovery OFF nothing is found: set it to LOCALHOST or SUBNET")
+    if said("ROS_LOCALHOST_ONLY", "0") == "1":
+        mend = "unset ROS_LOCALHOST_ONLY, which overrides it; LOCALHOST as range does the same"
+        return Finding(f"{seen}, ROS_LOCALHOST_ONLY 1", mend, fatal=False)
+    if said("ROS_SECURITY_ENABLE", "").lower() == "true":
+        keystore = said("ROS_SECURITY_KEYSTORE", "")
+        seen += f", security on with keystore {keystore or 'none'}"
+        if not (Path(keystore) / "enclaves").is_dir():
+            return Finding(seen, "set ROS_SECURITY_KEYSTORE to a keystore; see docs/security.md")
+    return Finding(seen)
+
+
+def check_room(models_dir: Path) -> Finding:
+    """Return whether models can be written, and whether DDS has shared memory."""
+    place = models_dir
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    seen = f"{models_dir}: {free / 1e9:.1f} GB free"
+    if not os.access(place, os.W_OK):
+        return Finding(seen, f"make {place} writable, or set models_dir, to train", fatal=False)
+    if free < 1e6 * Limits().free_disk:
+        return Finding(seen, "make room on its disk, to train", fatal=False)
+    shared = Path("/dev/shm")
+    if not os.access(shared, os.W_OK) or shutil.disk_usage(shared).free < LEAST_SHM:
+        mend = "give /dev/shm room (docker run --shm-size or --ipc host), or DDS is slow or deaf"
+        return Finding(f"{seen}; no shared memory", mend)
+    return Finding(seen)
+
+
+def check_model(name: str, models_dir: Path) -> Finding:
+    """Load a model and lift with it."""
+    import numpy as np
+
+    from deep_nrsfm_ros.node.model_folders import model_folders
+    from deep_nrsfm_ros.nrsfm.lifting import Lifter
+    from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
+
+    mend = "install the package anew; its models belong in share/deep_nrsfm_ros/models"
+    try:
+        path = find_model(name, model_folders(models_dir))
+        model = load_model(path)
+    except ValueError as error:
+        return Finding(str(error), mend)
+    p = len(model.layout)
+    points = np.random.default_rng(0).uniform(50, 600, (1, p, 2)).astype(np.float32)
+    lifted = Lifter(model)(points, np.ones((1, p), np.float32))
+    if not np.isfinite(lifted.shapes).all():
+        return Finding(f"{path} lifts to what is no number", mend)
+    return Finding(f"{path} of {p} keypoints lifts")
+
+
+def check_bags() -> Finding:
+    """Write and read a bag in both storages."""
+    import numpy as np
+
+    from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
+    from deep_nrsfm_ros.observations.bags import STORAGES, frames, read_bags, write_bag
+
+    points = np.random.default_rng(0).uniform(50, 600, (10, 17, 2))
+    for storage in STORAGES:
+        with tempfile.TemporaryDirectory() as folder:
+            bag = Path(folder) / "bag"
+            write_bag(bag, "/keypoints", frames(points, np.ones((10, 17))), storage)
+            read = read_bags([bag], "/keypoints", HUMAN17, HUMAN17).ensemble
+            if not np.allclose(read.points, points, rtol=1e-4):
+                mend = "pip install --force-reinstall rosbags"
+                return Finding(f"{storage}: what was read is not what was written", mend)
+    return Finding(f"written and read: {', '.join(STORAGES)}")
+
+
+def check_dds(name: str, models_dir: Path, seconds: float) -> Finding:
+    """Ask a lifter in another process for an answer."""
+    import numpy as np
+
+    from deep_nrsfm_ros.node.loopback import LoopbackError, ask_a_lifter
+    from deep_nrsfm_ros.node.model_folders import model_folders
+    from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
+
+    path = find_model(name, model_folders(models_dir))
+    points = np.random.default_rng(0).uniform(50, 600, (len(load_model(path).layout), 2))
+    try:
+        took = ask_a_lifter(str(path), points, seconds)
+    except LoopbackError as error:
+        mend = (
+            "let the firewall pass UDP 7400-7500 and multicast on this machine, or set "
+            "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; on a busy machine raise --timeout"
+        )
+        return Finding(str(error), mend)
+    return Finding(f"a lifter in another process answered {took:.1f} s after its start")
+
+
+def examine(given: argparse.Namespace) -> bool:
+    """Run every check and print what it found; return whether lifting works."""
+    checks: dict[str, Callable[[], Finding]] = {
+        "imports": check_imports,
+        "environment": check_environment,
+        "room": lambda: check_room(given.models_dir),
+        "model": lambda: check_model(given.model, given.models_dir),
+        "bags": check_bags,
+        "DDS": lambda: check_dds(given.model, given.models_dir, given.timeout),
+    }
+    well = True
+    for name, check in checks.items():
+        try:
+            found = check()
+        except Exception as error:  # whatever is broken, the other checks tell more
+            found = Finding(f"{type(error).__name__}: {error}", "mend what is wrong above first")
+        well &= found.word != "FAIL"
+        print(f"{found.word:4}  {name}: {found.seen}", flush=True)
+        if found.mend:
+            print(f"      -> {found.mend}", flush=True)
+    return well
+
+
+@program
+def main(argv: Sequence[str] | None = None) -> None:
+    """Examine this installation."""
+    from deep_nrsfm_ros.node.model_folders import default_models_dir
+
+    parser = argparse.ArgumentParser(prog="doctor", description=__doc__)
+    parser.add_argument("--model", default="human", help="model to lift with (default: human)")
+    parser.add_argument("--models-dir", type=Path, default=default_models_dir())
+    parser.add_argument("--timeout", type=float, default=30.0, help="seconds for an answer")
+    given = parser.parse_args(argv)
+    given.models_dir = given.models_dir.expanduser().absolute()
+    if not examine(given):
+        print("something that lifting needs does not work; mend it from the top", file=sys.stderr)
+        sys.exit(1)
+    print("all that lifting needs works")
+
+
+if __name__ == "__main__":
+    main()
