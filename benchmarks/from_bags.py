@@ -254,7 +254,7 @@ def _people(path: Path) -> Iterator[Frame]:
     with gzip.open(path) as lines:
         for i, line in enumerate(lines):
             people = read_people(line, len(BODY25))
-            yield Frame(round(i * 1e9 / VIDEO_RATE), *people, "camera")
+            yield Frame(round(i * 1e9 / VIDEO_RATE), people.points, people.confidence, "camera")
 
 
 def _work(recording: excavator.Recording) -> Iterator[Frame]:
