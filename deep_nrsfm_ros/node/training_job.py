@@ -21,7 +21,7 @@ ENDED = ("finished", "failed", "cancelled")
 TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
 
 _LAST_WORDS = 10
-_LOWEST = 19
+_NICENESS = 10  # a tenth of the share of others; at 19 it gets nothing on a busy machine
 _LINE_LIMIT = 65536
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -155,15 +155,15 @@ class TrainingJob:
 
 
 def _yield_to_others(pid: int) -> None:
-    """Give a process that leads a session the lowest priority, and let it go first for memory.
+    """Give a process that leads a session a low priority, and let it go first for memory.
 
     Where Linux groups processes by session, as on a desktop, priorities count within a session
     only, and the session has one of its own.
     """
     with suppress(OSError):  # it ended already, or there are no such groups
-        os.setpriority(os.PRIO_PROCESS, pid, _LOWEST)
+        os.setpriority(os.PRIO_PROCESS, pid, _NICENESS)
         Path(f"/proc/{pid}/oom_score_adj").write_text("1000")
-        Path(f"/proc/{pid}/autogroup").write_text(str(_LOWEST))
+        Path(f"/proc/{pid}/autogroup").write_text(str(_NICENESS))
 
 
 def parse_progress(line: str) -> Progress | None:

@@ -66,16 +66,16 @@ def test_the_process_is_in_its_own_session_and_yields_to_others():
     job, listener = start("finish")
     values = listener.next().values
     assert values["session"] == job.pid
-    assert os.getpriority(os.PRIO_PROCESS, 0) < 19
+    assert os.getpriority(os.PRIO_PROCESS, 0) < 10
     job.close(DEADLINE)
     # The priority is set right after the start; the process may have asked before.
-    assert values["niceness"] in (0, 19)
+    assert values["niceness"] in (0, 10)
 
 
 @pytest.mark.skipif(not AUTOGROUP.exists(), reason="this kernel does not group by session")
 def test_its_session_yields_to_others_too():
     job, _ = start("wait")
-    assert Path(f"/proc/{job.pid}/autogroup").read_text().endswith("nice 19\n")
+    assert Path(f"/proc/{job.pid}/autogroup").read_text().endswith("nice 10\n")
     job.close(DEADLINE)
 
 
