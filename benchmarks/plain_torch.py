@@ -20,6 +20,9 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset
 class PlainNetwork(nn.Module):
     """The network of "Deep Non-Rigid Structure from Motion", one convolution a layer."""
 
+    L: Tensor
+    L_inverse: Tensor
+
     def __init__(self, net: Network) -> None:
         """Take over the weights of `net`, NumPy or torch."""
         super().__init__()
@@ -66,7 +69,7 @@ class PlainTraining:
         """Take one gradient step."""
         chosen = torch.randint(len(self.points), (self.preset.recipe.batch,))
         self.optimiser.zero_grad()
-        self.loss(self.points[chosen]).backward()  # type: ignore[no-untyped-call]
+        self.loss(self.points[chosen]).backward()
         self.optimiser.step()
 
     def loss(self, points: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.speed import arguments, show
 from benchmarks.table import Table, bars
@@ -63,7 +64,7 @@ def measure(f: int) -> dict[str, float]:
     torch.set_num_threads(1)
     base, times = PRESETS["default"], [0.0]
 
-    def epoch(points: np.ndarray, visible: np.ndarray) -> None:
+    def epoch(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> None:
         steps = max(2, len(points) // base.recipe.batch)
         recipe = dataclasses.replace(base.recipe, steps=steps, seeds=1)
 
@@ -90,7 +91,7 @@ def measure(f: int) -> dict[str, float]:
     }
 
 
-def _ensemble(f: int) -> tuple[np.ndarray, np.ndarray]:
+def _ensemble(f: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return points (f, P, 2) and visibility of no shape in particular."""
     points = np.random.default_rng(0).standard_normal((f, P, 2), dtype=np.float32)
     return points, np.ones((f, P), bool)
