@@ -4,6 +4,7 @@
 # make lint        lint and types only
 # make fuzz        100000 spoilt inputs of every kind; takes hours
 # make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
+# make benchmark-speed     speed against floors and other ways, side by side; DATA=DIR adds time_to_error
 # make audit       known vulnerabilities of the pins in requirements.lock
 # make lock        resolve requirements.lock anew
 # make clean       remove what building and testing left; .venv and downloads stay
@@ -18,13 +19,15 @@ LOCK_TORCH ?= torch==2.13.0
 # In order: what an earlier one has trained, the later ones find in the output folder.
 BENCHMARKS := nrsfm_on_cmu mirror ablation unseen noise missing structure_from_category classic_sequences \
     coherence perspective reliability steadiness spoiled
+# In order: what is quick comes first; the machine should have nothing else to do.
+SPEED := where_time_goes forward bag_reading latency while_training training_speed training_scale
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
 # Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
 EXAMPLES_READY := .venv/.ready-examples
 
-.PHONY: demo demo-live test lint fuzz benchmark audit lock clean
+.PHONY: demo demo-live test lint fuzz benchmark benchmark-speed audit lock clean
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
@@ -47,6 +50,10 @@ benchmark: $(READY)
 	@test -n "$(DATA)" || { echo "make benchmark DATA=DIR: DIR holds cmu/ and nrsfm/"; exit 2; }
 	set -e; for name in $(BENCHMARKS); do \
 	    $(PYTHON) -m benchmarks.$$name --data $(DATA) --output runs/benchmarks; done
+
+benchmark-speed: $(READY)
+	set -e; for name in $(SPEED); do $(PYTHON) -m benchmarks.$$name; done
+	test -z "$(DATA)" || $(PYTHON) -m benchmarks.time_to_error --data $(DATA)
 
 # Editable, so that a stale copy never shadows the source; the tests install real copies elsewhere.
 $(READY): requirements.lock setup.py

@@ -58,6 +58,12 @@ setup(
             "matplotlib",  # the demo's picture and the benchmarks' plots
             "scipy",  # the demo's ground truth: triangulation from four calibrated cameras
         ],
+        # Not in requirements.lock: only the table of benchmarks.forward has a row for it.
+        "speed": [
+            "onnxruntime",  # what the forward pass is measured against
+            "onnx",  # the format, for torch's exporter
+            "onnxscript",  # torch's exporter is written in it
+        ],
         "examples": [
             "mediapipe==0.10.14",  # the detector; this wheel carries the weights of its pose model
         ],

@@ -1,0 +1,55 @@
+"""The floor under any lifter in Python: a node that hears keypoints and sends them back.
+
+It receives a PointCloud2 on `keypoints` and publishes it again on ~/points, with a quaternion on
+~/camera_rotation: what ROS costs, and nothing else. The parameter `input` names another topic.
+"""
+
+from __future__ import annotations
+
+import rclpy
+from geometry_msgs.msg import QuaternionStamped
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import PointCloud2
+
+
+class RelayNode(Node):
+    """Sends back what it hears."""
+
+    def __init__(self) -> None:
+        """Begin to listen, by the quality of service of the lifter."""
+        super().__init__("relay")
+        self._points = self.create_publisher(PointCloud2, "~/points", 10)
+        self._rotation = self.create_publisher(QuaternionStamped, "~/camera_rotation", 10)
+        self.create_subscription(
+            PointCloud2,
+            str(self.declare_parameter("input", "keypoints").value),
+            self._send_back,
+            QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+    def _send_back(self, message: PointCloud2) -> None:
+        """Publish the message, and a quaternion."""
+        self._points.publish(message)
+        self._rotation.publish(QuaternionStamped(header=message.header))
+
+
+def main() -> None:
+    """Run the node until a signal."""
+    rclpy.init()
+    try:
+        # As the lifter does: rclpy.spin takes the same executor.
+        executor = SingleThreadedExecutor()
+        executor.add_node(RelayNode())
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()
