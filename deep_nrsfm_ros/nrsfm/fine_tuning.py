@@ -89,6 +89,6 @@ def inherit(trained: Model, start: Model) -> Model:
     """
     origin = {"model": start.name, "data": start.provenance.get("data", "unknown")}
     model = dataclasses.replace(trained, provenance=trained.provenance | {"from": origin})
-    if trained.layout.handedness is None:
+    if not trained.layout.handedness:
         model = dataclasses.replace(model, object_frame=start.object_frame)
     return model

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Edge = tuple[str, str]
+Tetrahedron = tuple[str, str, str, str]
 MOST_KEYPOINTS = 1000
 """Of one object: what lifting takes grows with their square."""
 
@@ -24,9 +25,10 @@ class KeypointLayout:
     """Names of p keypoints in the order in which they come.
 
     edges: pairs of names, for drawing.
-    handedness: (left, right, up, front), four keypoints of which the tetrahedron has positive
-        volume on the real object: seen from behind, `left` is left of `right`, `up` is above
-        them and `front` before them. None: depth may come out mirrored.
+    handedness: one or more (left, right, up, front), four keypoints of which the tetrahedron has
+        positive volume on the real object: seen from behind, `left` is left of `right`, `up` is
+        above them and `front` before them. Each is a vote on whether depth is mirrored; the
+        first also gives the object's axes. Empty: depth may come out mirrored.
     reference: the pair of keypoints whose distance is the reference length. None: the RMS
         radius of the shape takes its place.
     derived: keypoints that a source without them can give as the mean of others.
@@ -37,7 +39,7 @@ class KeypointLayout:
     name: str
     keypoints: tuple[str, ...]
     edges: tuple[Edge, ...] = ()
-    handedness: tuple[str, str, str, str] | None = None
+    handedness: tuple[Tetrahedron, ...] = ()
     reference: Edge | None = None
     derived: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     reference_length: float | None = None
@@ -55,15 +57,15 @@ class KeypointLayout:
             raise ValueError(f"layout {self.name!r} names {', '.join(twice)} more than once")
         groups: list[tuple[str, int, tuple[str, ...]]]
         groups = [("edge", 2, edge) for edge in self.edges]
-        groups += [("handedness", 4, self.handedness)] if self.handedness else []
+        groups += [("handedness", 4, four) for four in self.handedness]
         groups += [("reference", 2, self.reference)] if self.reference else []
         for what, size, group in groups:
             if isinstance(group, str) or len(group) != size:
                 raise ValueError(f"layout {self.name!r}: {what} {group!r} must be {size} names")
             if len(set(group)) != size:
                 raise ValueError(f"layout {self.name!r}: {what} {group!r} repeats a name")
-        named = [*(n for edge in self.edges for n in edge), *(self.handedness or ())]
-        for keypoint in [*named, *(self.reference or ()), *self.derived]:
+        named = [name for _, _, group in groups for name in group]
+        for keypoint in [*named, *self.derived]:
             if keypoint not in seen:
                 raise ValueError(f"layout {self.name!r} has no keypoint {keypoint!r}")
         for keypoint, parts in self.derived.items():
@@ -193,6 +195,15 @@ def _sides(*parts: str) -> tuple[str, ...]:
     return tuple(f"{side}_{part}" for part in parts for side in ("left", "right"))
 
 
+def _leg_votes(hips: Edge, ankle: str, *fronts: str) -> tuple[Tetrahedron, ...]:
+    """Return votes on a person's handedness: `fronts` are before the plane of hips and ankle.
+
+    Seen from behind, and upside down: the ankle is up, and the right hip on the left.
+    """
+    left, right = hips
+    return tuple((right, left, ankle, front) for front in fronts)
+
+
 _LIMBS = _both(("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
 _TRUNK: tuple[Edge, ...] = (("left_shoulder", "right_shoulder"), ("left_hip", "right_hip"))
 _FLANKS = _both(("shoulder", "hip"))
@@ -209,7 +220,11 @@ HUMAN17 = KeypointLayout(
         ("neck", "mid_hip"),
         ("neck", "nose"),
     ),
-    handedness=("left_hip", "right_hip", "neck", "nose"),
+    handedness=(
+        ("left_hip", "right_hip", "neck", "nose"),
+        *_leg_votes(("left_hip", "right_hip"), "left_ankle", "left_knee", "left_big_toe"),
+        *_leg_votes(("left_hip", "right_hip"), "right_ankle", "right_knee", "right_big_toe"),
+    ),
     reference=("neck", "mid_hip"),
     derived={
         "neck": ("left_shoulder", "right_shoulder"),
@@ -233,7 +248,11 @@ CMU31 = KeypointLayout(
     "cmu31",
     ("root", *(bone for bone, _ in _CMU_EDGES)),
     edges=_CMU_EDGES,
-    handedness=("ltibia", "rtibia", "lfemur", "ltoes"),
+    handedness=(  # a bone's name is that of its end: ltibia is the left ankle, lfemur the knee
+        ("ltibia", "rtibia", "lfemur", "ltoes"),
+        *_leg_votes(("lhipjoint", "rhipjoint"), "ltibia", "lfemur", "ltoes"),
+        *_leg_votes(("lhipjoint", "rhipjoint"), "rtibia", "rfemur", "rtoes"),
+    ),
     reference=("root", "thorax"),
 )
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.geometry import align, centre
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 
 Floats = NDArray[Any]
 
@@ -86,38 +85,3 @@ def degrees(turns: Floats) -> Floats:
     cosine = (np.trace(turns, axis1=-2, axis2=-1) - 1) / 2
     angles: Floats = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     return angles
-
-
-def signed_volumes(S: Floats, layout: KeypointLayout) -> Floats:
-    """Return the signed volume (f,) of each shape's handedness tetrahedron.
-
-    Positive on the real object (`KeypointLayout.handedness`), negative where depth is mirrored.
-    Raises ValueError if the layout has none.
-    """
-    if layout.handedness is None:
-        raise ValueError(f"layout {layout.name!r} has no handedness; name its four keypoints")
-    left, right, up, front = (S[:, layout.index(name)] for name in layout.handedness)
-    volumes: Floats = np.linalg.det(np.stack((left - right, up - right, front - right), 1))
-    return volumes
-
-
-def object_frame(S: Floats, layout: KeypointLayout) -> NDArray[np.float32]:
-    """Return the orthonormal A (3, 3) that takes reconstructed axes to the object's: S A.
-
-    Reflects (det -1) where the shapes S (f, p, 3) are mirrored on the whole, and turns the mean
-    shape so that x points to the front, y to the left and z up (REP-103). Layouts without a
-    handedness keep the network's axes.
-    """
-    A = np.eye(3)
-    if layout.handedness is None:
-        return A.astype(np.float32)
-    if signed_volumes(S, layout).sum() < 0:
-        A[2, 2] = -1
-    mean = (S @ A).mean(0)
-    left, right, up, _ = (mean[layout.index(name)] for name in layout.handedness)
-    y = (left - right) / np.linalg.norm(left - right)
-    z = up - (left + right) / 2
-    z -= (z @ y) * y
-    z /= np.linalg.norm(z)
-    axes = np.stack((np.cross(y, z), y, z), 1)
-    return np.asarray(A @ axes, np.float32)

@@ -130,8 +130,7 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     for config in (architecture, normaliser):
         _check_types(config)
         check(config)
-    _check_names(header["layout"])
-    layout = KeypointLayout(**_tuples(header["layout"]))
+    layout = _layout(header["layout"])
     p = len(layout)
     shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
     for name, shape in shapes.items():
@@ -181,10 +180,20 @@ def _check_types(config: Any) -> None:
             raise ValueError(f"{field_.name} is {value!r}; it must be like {default!r}")
 
 
+def _layout(header: dict[str, Any]) -> KeypointLayout:
+    """Return the layout of a header."""
+    handedness = header["handedness"] or []
+    if handedness and isinstance(handedness[0], str):  # the one of an older file
+        handedness = [handedness]
+    header = header | {"handedness": handedness}
+    _check_names(header)
+    return KeypointLayout(**_tuples(header))
+
+
 def _check_names(layout: dict[str, Any]) -> None:
     """Raise ValueError unless every name in the header's layout is a text."""
     derived = layout["derived"]
-    lists = [layout["keypoints"], *layout["edges"], layout["handedness"], layout["reference"]]
+    lists = [layout["keypoints"], *layout["edges"], *layout["handedness"], layout["reference"]]
     for names in ([layout["name"]], [*derived], *derived.values(), *lists):
         if not isinstance(names, (list, type(None))) or any(
             type(n) is not str for n in names or ()

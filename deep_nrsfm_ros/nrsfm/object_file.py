@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, Edge, KeypointLayout
+from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, Edge, KeypointLayout, Tetrahedron
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, load_model
 from deep_nrsfm_ros.nrsfm.yaml_file import read_fields, words
 
@@ -99,20 +99,24 @@ class _Description:
         edges = self._list("edges", self._fields.get("edges", []))
         return tuple(self._pair(f"edges[{i}]", edge) for i, edge in enumerate(edges))
 
-    def _handedness(self) -> tuple[str, str, str, str] | None:
-        if "handedness" not in self._fields:
-            return None
-        given = self._mapping("handedness")
+    def _handedness(self) -> tuple[Tetrahedron, ...]:
+        given = self._fields.get("handedness", [])
+        if not isinstance(given, list):
+            return (self._tetrahedron("handedness", given),)
+        return tuple(self._tetrahedron(f"handedness[{i}]", four) for i, four in enumerate(given))
+
+    def _tetrahedron(self, where: str, value: Any) -> Tetrahedron:
+        given = self._mapping(where, value)
         if set(given) != set(HANDEDNESS):
             raise ObjectFileError(
-                f"handedness names {', '.join(map(words, given)) or 'nothing'}; "
+                f"{where} names {', '.join(map(words, given)) or 'nothing'}; "
                 f"it must name {', '.join(HANDEDNESS)}"
             )
-        left, right, up, front = (self._text(f"handedness.{s}", given[s]) for s in HANDEDNESS)
+        left, right, up, front = (self._text(f"{where}.{s}", given[s]) for s in HANDEDNESS)
         return left, right, up, front
 
     def _derived(self) -> dict[str, tuple[str, ...]]:
-        given = self._mapping("derived") if "derived" in self._fields else {}
+        given = self._mapping("derived", self._fields.get("derived", {}))
         return {
             self._text("a name in derived", name): self._names(f"derived.{name}", parts)
             for name, parts in given.items()
@@ -141,8 +145,7 @@ class _Description:
             raise ObjectFileError(f"{where} is {words(value)}; it must be a list")
         return value
 
-    def _mapping(self, where: str) -> dict[Any, Any]:
-        value = self._fields[where]
+    def _mapping(self, where: str, value: Any) -> dict[Any, Any]:
         if not isinstance(value, dict):
             raise ObjectFileError(f"{where} is {words(value)}; it must be a mapping")
         return value

@@ -20,10 +20,10 @@ from deep_nrsfm_ros.nrsfm.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.nrsfm.correction import error_covariance
 from deep_nrsfm_ros.nrsfm.distributed import ALONE, Team
 from deep_nrsfm_ros.nrsfm.geometry import Floats
+from deep_nrsfm_ros.nrsfm.handedness import object_frame
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.limits import WHOLE, Limits
 from deep_nrsfm_ros.nrsfm.losses import Frames, visible_centre
-from deep_nrsfm_ros.nrsfm.metrics import object_frame
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Network, coherence, complete, reconstruct
 from deep_nrsfm_ros.nrsfm.progress import Clock, Progress
@@ -248,7 +248,8 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         return *reconstruct(net, seen.W), seen.W
 
     sample = trainer.sample(min(_COVARIANCE_FRAMES, 4 * len(trainer.frames.points)))
-    W, _ = complete(net, sample.points.cpu().numpy(), sample.mask.cpu().numpy())
+    mask = sample.mask.cpu().numpy()
+    W, _ = complete(net, sample.points.cpu().numpy(), mask)
     S, _, _ = lift(W)
     covariance = error_covariance(lift, W, np.random.default_rng(trainer.seed))
     return Model(
@@ -256,7 +257,7 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         net,
         layout,
         normaliser,
-        object_frame(S, layout),
+        object_frame(S, layout, mask[..., 0] > 0),
         error_covariance=covariance,
         provenance={
             "data": source,

@@ -161,7 +161,7 @@ def _page(
     head = {
         "source": _drawn(source),
         "target": _drawn(target),
-        "upright": target.handedness is not None,
+        "upright": bool(target.handedness),
         "frames": shown,
     }
     return render(
@@ -170,7 +170,7 @@ def _page(
         ["orbit.js", "player.js"],
         title=title,
         notes=notes,
-        upright=target.handedness is not None,
+        upright=bool(target.handedness),
         live=shown is None,
         recording=embedded(head),
     )

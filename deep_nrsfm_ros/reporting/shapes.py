@@ -95,7 +95,7 @@ def _to_screen(model: Model, mean: Floats) -> Floats:
 
     An object without a known front stands upright along its longest extent.
     """
-    if model.layout.handedness is not None:
+    if model.layout.handedness:
         return np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # x front, y left, z up
     axes = np.linalg.eigh(mean.T @ mean)[1]  # shortest first
     turn: Floats = axes[:, [1, 2, 0]]

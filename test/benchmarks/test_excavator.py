@@ -2,7 +2,7 @@ import numpy as np
 
 from benchmarks import excavator
 from benchmarks.from_bags import EXCAVATOR
-from deep_nrsfm_ros.nrsfm.metrics import signed_volumes
+from deep_nrsfm_ros.nrsfm.handedness import votes
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
 
 LAYOUT = find_layout("--object", str(EXCAVATOR))
@@ -11,7 +11,7 @@ LAYOUT = find_layout("--object", str(EXCAVATOR))
 def test_it_is_the_machine_of_the_object_file() -> None:
     truth = excavator.record(200, 0).truth
     assert truth.shape == (200, len(LAYOUT), 3)
-    assert (signed_volumes(truth, LAYOUT) > 0).all()
+    assert (votes(truth, LAYOUT) > 0).all()
     a, b = map(LAYOUT.index, LAYOUT.reference or ())
     lengths = np.linalg.norm(truth[:, a] - truth[:, b], axis=1)
     np.testing.assert_allclose(lengths, LAYOUT.reference_length or 0, rtol=1e-6)

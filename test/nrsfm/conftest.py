@@ -36,7 +36,7 @@ def figure() -> Figure:
     """An object of 12 points that deforms: a mean shape and three non-negative modes."""
     rng = np.random.default_rng(0)
     names = ("left", "right", "up", "front", *(f"point_{i}" for i in range(4, 12)))
-    layout = KeypointLayout("figure", names, handedness=names[:4], reference=("left", "right"))
+    layout = KeypointLayout("figure", names, handedness=(names[:4],), reference=("left", "right"))
     mean = rng.standard_normal((12, 3))
     mean[:4] = [[0, 1.5, 0], [0, -1.5, 0], [0, 0, 1.5], [1.5, 0, 0]]
     modes = 0.6 * rng.standard_normal((3, 12, 3))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,13 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.metrics import (
     camera_errors,
-    object_frame,
     procrustes_distances,
     shape_errors,
-    signed_volumes,
 )
 
 some = settings(max_examples=25, deadline=None)
@@ -101,66 +96,6 @@ def test_mirrored_frames_are_counted(count: int) -> None:
 def test_procrustes_never_reflects() -> None:
     truth, _, _ = frames(2)
     assert procrustes_distances(truth * MIRROR, truth).mean() > 0.1
-
-
-NAMES = ("left_hip", "nose", "right_hip", "neck", "tail")
-PERSON = KeypointLayout("person", NAMES, handedness=("left_hip", "right_hip", "neck", "nose"))
-# x to the front, y to the left, z up.
-STANDING = np.array([[0, 0.2, 0], [0.3, 0, 0.8], [0, -0.2, 0], [0, 0, 0.6], [-0.2, 0, 0.1]])
-
-
-def people(seed: int, f: int = 30) -> np.ndarray:
-    return STANDING + np.random.default_rng(seed).normal(0, 0.02, (f, *STANDING.shape))
-
-
-def test_signed_volume_is_positive_for_a_person_as_they_are() -> None:
-    # det[(0, .4, 0), (0, .2, .6), (.3, .2, .8)] by hand.
-    np.testing.assert_allclose(signed_volumes(STANDING[None], PERSON), 0.4 * 0.6 * 0.3)
-    turned = people(0) @ rotations(30, np.random.default_rng(0))
-    assert (signed_volumes(turned, PERSON) > 0).all()
-    for axis in np.eye(3):
-        mirror = np.eye(3) - 2 * np.outer(axis, axis)
-        np.testing.assert_allclose(
-            signed_volumes(turned @ mirror, PERSON), -signed_volumes(turned, PERSON)
-        )
-
-
-@some
-@given(seeds, st.booleans())
-def test_object_frame_rights_an_ensemble_and_names_its_axes(seed: int, mirrored: bool) -> None:
-    rng = np.random.default_rng(seed)
-    network_axes = rotations(1, rng)[0] * (-1 if mirrored else 1)
-    S = people(seed) @ network_axes
-    assert ((signed_volumes(S, PERSON) < 0) == mirrored).all()
-    A = object_frame(S, PERSON)
-    np.testing.assert_allclose(A @ A.T, np.eye(3), atol=1e-5)
-    assert np.linalg.det(A) == pytest.approx(-1 if mirrored else 1, abs=1e-5)
-    right = S @ A
-    assert (signed_volumes(right, PERSON) > 0).all()
-    np.testing.assert_allclose(right.mean(0), STANDING, atol=0.06)
-
-
-def test_the_majority_decides_which_way_round() -> None:
-    S = people(3)
-    S[:10] *= MIRROR
-    assert np.linalg.det(object_frame(S, PERSON)) > 0
-    S[10:25] *= MIRROR
-    assert np.linalg.det(object_frame(S, PERSON)) < 0
-
-
-def test_layouts_without_handedness_keep_their_axes_and_have_no_volume() -> None:
-    nameless = KeypointLayout.numbered(5)
-    np.testing.assert_array_equal(object_frame(people(0), nameless), np.eye(3))
-    with pytest.raises(ValueError, match="points5.*handedness"):
-        signed_volumes(people(0), nameless)
-
-
-def test_every_order_of_the_four_has_the_sign_of_its_permutation() -> None:
-    for order in itertools.permutations(range(4)):
-        names = tuple(("left_hip", "right_hip", "neck", "nose")[i] for i in order)
-        layout = KeypointLayout("person", NAMES, handedness=names)
-        sign = np.linalg.det(np.eye(4)[list(order)])
-        assert np.sign(signed_volumes(STANDING[None], layout)[0]) == sign
 
 
 def person(frames: int = 20) -> np.ndarray:

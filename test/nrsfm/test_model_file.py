@@ -73,6 +73,12 @@ def test_round_trip(tmp_path: Path, layout: KeypointLayout, widths: tuple[int, .
     assert [f.name for f in (tmp_path / "models").iterdir()] == ["m.safetensors"]
 
 
+@pytest.mark.parametrize("older", [["left_hip", "right_hip", "neck", "nose"], None])
+def test_a_file_from_when_handedness_was_one(file: Path, older: list[str] | None) -> None:
+    rewrite(file, lambda header, weights, metadata: header["layout"].update(handedness=older))
+    assert load_model(file).layout.handedness == (() if older is None else (tuple(older),))
+
+
 def refused(path: Path) -> str:
     """Return what load_model says against the file, which it must name."""
     with pytest.raises(ModelFileError) as caught:

@@ -52,11 +52,21 @@ def test_every_field_arrives(tmp_path: Path) -> None:
         "door",
         ("hinge_top", "hinge_bottom", "handle", "corner_top", "corner_bottom"),
         edges=(("hinge_top", "hinge_bottom"), ("corner_top", "corner_bottom")),
-        handedness=("hinge_bottom", "corner_bottom", "hinge_top", "handle"),
+        handedness=(("hinge_bottom", "corner_bottom", "hinge_top", "handle"),),
         reference=("hinge_top", "hinge_bottom"),
         derived={"handle": ("corner_top", "corner_bottom")},
         reference_length=2.0,
     )
+
+
+def test_handedness_may_be_several(tmp_path: Path) -> None:
+    text = (
+        "handedness:\n"
+        "  - {left: a, right: b, up: c, front: d}\n"
+        "  - {front: c, up: a, right: d, left: b}\n"
+    )
+    several = read_object(write(tmp_path, LEAST + text)).handedness
+    assert several == (("a", "b", "c", "d"), ("b", "d", "a", "c"))
 
 
 def test_name_and_keypoints_are_enough(tmp_path: Path) -> None:
@@ -108,7 +118,15 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     "edge to itself": (LEAST + "edges: [[a, a]]", "repeats a name"),
     "edges are a mapping": (LEAST + "edges: {a: b}", "edges is a mapping"),
     "edge is a text": (LEAST + "edges: [a-b]", "edges[0] is 'a-b'"),
-    "handedness is a list": (LEAST + "handedness: [a, b, c, d]", "handedness is a list"),
+    "handedness of names": (
+        LEAST + "handedness: [a, b, c, d]",
+        "handedness[0] is 'a'; it must be a ma",
+    ),
+    "handedness is a text": (LEAST + "handedness: a", "handedness is 'a'; it must be a mapping"),
+    "half of the second": (
+        LEAST + "handedness: [{left: a, right: b, up: c, front: d}, {up: a}]",
+        "handedness[1] names 'up'",
+    ),
     "half of handedness": (LEAST + "handedness: {left: a, right: b}", "must name left, right, up"),
     "handedness repeats": (LEAST + "handedness: {left: a, right: b, up: c, front: c}", "repeats"),
     "handedness of a stranger": (

@@ -13,10 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from deep_nrsfm_ros.nrsfm import training
 from deep_nrsfm_ros.nrsfm.geometry import align
+from deep_nrsfm_ros.nrsfm.handedness import votes
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.losses import Frames
-from deep_nrsfm_ros.nrsfm.metrics import shape_errors, signed_volumes
+from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.progress import Progress
@@ -70,7 +71,7 @@ def test_a_low_rank_object_is_recovered(figure: Any, trained: Trainer) -> None:
     assert shape_errors(np.tile(mean, (len(figure.shapes), 1, 1)), figure.shapes).shape > 0.2
     # The right way round, and object axes x front, y left, z up.
     in_object_axes = lifted.shapes @ lifted.rotations
-    assert (signed_volumes(in_object_axes, figure.layout) > 0).mean() > 0.99
+    assert (votes(in_object_axes, figure.layout) > 0).mean() > 0.99
     left, right, up, front = in_object_axes.mean(0)[:4]
     assert left[1] > 0 > right[1] and up[2] > 0 and front[0] > 0
     # And the cameras are those that took the pictures, up to one turn of the object axes.

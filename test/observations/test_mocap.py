@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.nrsfm.handedness import votes
 from deep_nrsfm_ros.nrsfm.keypoints import CMU31, COCO17, HUMAN17, layout
-from deep_nrsfm_ros.nrsfm.metrics import signed_volumes
 from deep_nrsfm_ros.observations.mocap import (
     KEYPOINTS_OF,
     METRES,
@@ -325,4 +325,4 @@ def test_the_paper_counts_9502_frames_of_subject_127() -> None:
 @pytest.mark.parametrize("name", KEYPOINTS_OF)
 def test_real_people_are_right_handed(name: str) -> None:
     ensemble = read_trials(trials(Path(str(DATA)) / "cmu", "02")[:3], layout(name))
-    assert (signed_volumes(ensemble.shapes, ensemble.layout) > 0).mean() > 0.9
+    assert ((votes(ensemble.shapes, ensemble.layout) > 0).mean(0) > 0.9).all()
