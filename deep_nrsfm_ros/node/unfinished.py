@@ -174,8 +174,10 @@ def check_room(folder: Path, megabytes: float) -> None:
     place = folder.absolute()
     while not place.exists() and place != place.parent:
         place = place.parent
-    free = shutil.disk_usage(place).free / 1e6
-    if free < megabytes:
+    disk = shutil.disk_usage(place)
+    free = disk.free / 1e6
+    # What has no size at all is no disk, and writing there says so better.
+    if disk.total and free < megabytes:
         raise ValueError(
             f"{folder} is on a disk with {free:.0f} MB free; a training needs {megabytes:.0f} MB "
             "(free_disk); make room, or choose another folder for models"
