@@ -55,9 +55,11 @@ def test_keypoints_and_answers_are_joined(
             publisher.publish(message(second))
             executor.spin_once(timeout_sec=0.2)
             found = [r for r in shown if r.seen.confidence.any() and r.sound.all()]
+            # The rotation is a message of its own, which may come too late for a frame.
+            found = [r for r in found if np.isfinite(r.lifted.rotations[0]).all()]
             return found[-1] if found else None
 
-        recording = client.wait(joined, "a frame with keypoints and answer")
+        recording = client.wait(joined, "a frame with keypoints, points and rotation")
     finally:
         executor.shutdown()
         watcher.destroy_node()
