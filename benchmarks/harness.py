@@ -34,9 +34,8 @@ CHECKPOINT_SECONDS = 30.0
 LIFTING_LEGEND = {
     "network alone": "one pass of the network, nothing after it",
     "back-projected": "one pass, then moved within the image plane onto the keypoints",
-    "as shipped": f"averaged over {LiftingOptions().turns} turns of the image, and of its mirror "
-    "image where the layout has left_ and right_, then corrected by what the model knows of its "
-    "own errors",
+    "as shipped": f"averaged over {LiftingOptions().turns} turns of the image, then corrected by "
+    "what the model knows of its own errors",
     "as shipped, noise 0": "the same, told that the keypoints are without noise, as they are here: "
     "they are met exactly",
 }

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.node.pipeline import InputOptions
 from deep_nrsfm_ros.nrsfm.keypoints import BODY25B, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
@@ -28,7 +29,6 @@ CAMERA_CONVENTIONS = {
     "place mm at 0.5 m": "the same, for a reference length of 0.5 m",
 }
 """What each figure of `camera_table` means."""
-_MIN_CONFIDENCE = 0.1  # the lifter's own default
 _USUAL = 500.0  # mm from neck to mid-hip of an adult, as the README advises
 
 
@@ -53,7 +53,7 @@ def figures(model: Model, view: View, session: Session, *, intrinsics: bool) -> 
     intrinsics: whether the lifter is told them.
     """
     values = np.concatenate((view.points, view.confidence[..., None]), -1)
-    seen = observation(values, _MIN_CONFIDENCE)
+    seen = observation(values, InputOptions().min_confidence)
     points, confidence = KeypointMap(BODY25B, model.layout)(seen.points, seen.confidence)
     length = reference_length(session)
     lifter = Lifter(model, LiftingOptions(reference_length=length))

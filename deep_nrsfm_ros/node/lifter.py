@@ -41,7 +41,7 @@ from deep_nrsfm_ros.node import parameters, publishing
 from deep_nrsfm_ros.node.camera import CameraListener, CameraOptions
 from deep_nrsfm_ros.node.fence import Fence
 from deep_nrsfm_ros.node.health import Health
-from deep_nrsfm_ros.node.listening import Listener, Source
+from deep_nrsfm_ros.node.listening import LOG_PERIOD, Listener, Source
 from deep_nrsfm_ros.node.pipeline import MODEL_ORDER, InputOptions, Pipeline
 from deep_nrsfm_ros.node.training_request import (
     TrainingOptions,
@@ -64,7 +64,6 @@ from deep_nrsfm_ros.observations.curation import Curation
 
 _STEADY = "steady."
 _TRAIN = "train."
-_LOG_PERIOD = 2.0
 _REPORT_PERIOD = 1.0
 _ENDING = (signal.SIGINT, signal.SIGTERM)
 _END_OF_TRAINING = 1.0  # seconds that a training has to save its model when the node ends
@@ -160,7 +159,7 @@ class LifterNode(Node):
         reason = _words(problem)
         self._health.rejected(reason)
         self.get_logger().warning(
-            f"message on {source.topic} dropped: {reason}", throttle_duration_sec=_LOG_PERIOD
+            f"message on {source.topic} dropped: {reason}", throttle_duration_sec=LOG_PERIOD
         )
 
     def _header(self) -> Header:

@@ -22,7 +22,8 @@ from deep_nrsfm_ros.observations.tracker import Tracker
 DEFAULT_TOPIC = "keypoints"
 SENSOR_INPUT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-_LOG_PERIOD = 2.0
+LOG_PERIOD = 2.0
+"""Seconds in which the same complaint is logged once."""
 
 
 @dataclass(frozen=True)
@@ -194,4 +195,4 @@ class Listener:
     def _complain(self, reason: str) -> None:
         """Tell of a publisher that cannot be heard."""
         self._on_trouble(reason)
-        self._log.error(reason, throttle_duration_sec=_LOG_PERIOD)
+        self._log.error(reason, throttle_duration_sec=LOG_PERIOD)

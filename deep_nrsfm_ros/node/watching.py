@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
+from deep_nrsfm_ros.node.listening import LOG_PERIOD
 from deep_nrsfm_ros.node.message_types import message_class
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
@@ -25,7 +26,6 @@ from deep_nrsfm_ros.observations.observation import Observation
 from deep_nrsfm_ros.observations.recording import Recording, lifted_before
 
 _KEPT = 100  # observations that wait for their answers
-_LOG_PERIOD = 2.0
 _LOOK = 0.5  # seconds between looks for the keypoints' topic
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -117,4 +117,4 @@ class Watcher(Node):
             self._complain(str(problem))
 
     def _complain(self, problem: str) -> None:
-        self.get_logger().warning(problem, throttle_duration_sec=_LOG_PERIOD)
+        self.get_logger().warning(problem, throttle_duration_sec=LOG_PERIOD)
