@@ -76,7 +76,7 @@ WORDS = ("", "x", "y", "confidence", "a" * 300, "é\ud800", "../..", "\0", "%s{}
 STORE = get_typestore(Stores.ROS2_JAZZY)
 KINDS = (POINT_CLOUD, MULTI_ARRAY, POLYGON)
 NAMES = ("left", "right", "up", "front", "tip", "tail")
-LAYOUT = KeypointLayout("thing", NAMES, (("left", "right"),), NAMES[:4], ("up", "tip"))
+LAYOUT = KeypointLayout("thing", NAMES, (("left", "right"),), (NAMES[:4],), ("up", "tip"))
 
 Outcome = str
 Input = Callable[[random.Random], Outcome]
