@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchmarks.plain_torch import PlainTraining
 from benchmarks.speed import arguments, by_turns, show
@@ -52,7 +51,7 @@ def contenders(name: str, data: Frames) -> tuple[Trainer, PlainTraining]:
     """Return both, with the same weights."""
     chosen = preset(name, BATCH)
     ours = Trainer(data, chosen, 0)
-    return ours, PlainTraining(ours.net.map(Tensor.detach), data.points, chosen)
+    return ours, PlainTraining(ours.net, data.points, chosen)
 
 
 def steps(given: Namespace) -> Table:

@@ -46,7 +46,7 @@ class Best:
         quality = trainer.quality()
         if quality < self.quality:
             self.quality, self.step = quality, trainer.step
-            self.weights = trainer.weights.detach().clone()
+            self.weights = trainer.weights.clone()
         if quality < self.reference * (1 - _NOTEWORTHY):
             self.reference, self.improved = quality, trainer.progress
         idle = trainer.progress - self.improved

@@ -1,57 +1,71 @@
-"""The gradient of the network, written out: torch's own bookkeeping costs more than the sums.
+"""The gradient of the loss, written out: torch's own bookkeeping costs more than the sums.
 
-`differentiable` is `network.forward` as one operation of torch's autograd. What follows runs the
-network's own layers and walks back through them, symbols as in the package's legend; X_bar is
-the gradient of the loss by X.
+What follows runs the network's own layers and walks back through them, symbols as in the
+package's legend; X_bar is the gradient of the loss by X. Options of the network that the default
+recipe does not use take torch's own gradient.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
+from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective
 from deep_nrsfm_ros.nrsfm.network import (
     Architecture,
     Network,
     decode,
     encode,
-    forward,
     recover,
     unwhiten,
     whiten,
 )
 
 
-def differentiable(net: Network, W: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `forward(net, W)` for W (b, p, 2); its gradient reaches the weights, not W."""
+def descend(
+    objective: Objective,
+    net: Network,
+    frames: Frames,
+    known: Tensor | None,
+    generator: torch.Generator,
+) -> tuple[Losses, list[Tensor]]:
+    """Return the losses, as the objective does, and the gradients of their total.
+
+    The gradients are by what the network has learned, in the order of `Network.learned`.
+    """
     options = net.architecture
     if (options.threshold, options.recovery, options.camera) != _WRITTEN_OUT:
-        return forward(net, W)
-    S, M = _Forward.apply(net, W, *(weight for _, weight in net.learned()))  # type: ignore[no-untyped-call]
-    return S, M
+        return _by_torch(objective, net, frames, known, generator)
+    with torch.inference_mode():
+        task = objective.task(net, frames, known, generator)
+        Psi = encode(net, task.x)
+        psi_n, M = recover(net, Psi[-1])
+        S, psi = decode(net, psi_n)
+        left = objective.differences(net, task, S, M)
+        S_bar, M_bar = objective.gradient(net, task, S, M, left)
+        D_bar, b__bar, psi_bar = _through_decoder(net, psi, S_bar)
+        heads_bar, Psi_bar = _through_recovery(net, Psi[-1], M, psi_bar, M_bar)
+        b_bar = _through_encoder(net, task.x, Psi, Psi_bar, D_bar)
+        return objective.losses(net, S, M, left), [*D_bar, *b_bar, *b__bar, *heads_bar]
 
 
 _WRITTEN_OUT = (Architecture().threshold, Architecture().recovery, Architecture().camera)
 
 
-class _Forward(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, net: Network, W: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
-        Psi = encode(net, W)
-        psi_n, M = recover(net, Psi[-1])
-        S, psi = decode(net, psi_n)
-        ctx.net, ctx.W, ctx.Psi, ctx.psi, ctx.M = net, W, Psi, psi, M
-        return S, M
-
-    @staticmethod
-    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        net, (S_bar, M_bar) = ctx.net, bars
-        D_bar, b__bar, psi_bar = _through_decoder(net, ctx.psi, S_bar)
-        heads_bar, Psi_bar = _through_recovery(net, ctx.Psi[-1], ctx.M, psi_bar, M_bar)
-        b_bar = _through_encoder(net, ctx.W, ctx.Psi, Psi_bar, D_bar)
-        return (None, None, *D_bar, *b_bar, *b__bar, *heads_bar)
+def _by_torch(
+    objective: Objective,
+    net: Network,
+    frames: Frames,
+    known: Tensor | None,
+    generator: torch.Generator,
+) -> tuple[Losses, list[Tensor]]:
+    """Return what `descend` does, by torch's autograd."""
+    weights = {name: weight.detach() for name, weight in net.named()}
+    learned = [weights[name].requires_grad_() for name, _ in net.learned()]
+    net = Network.from_named(net.architecture, weights)
+    losses = objective(net, frames, known, generator)
+    bars = torch.autograd.grad(losses.total, learned, materialize_grads=True)
+    return Losses(*(term.detach() for term in losses)), list(bars)
 
 
 def _through_decoder(

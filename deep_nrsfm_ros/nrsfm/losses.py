@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
-from deep_nrsfm_ros.nrsfm.gradient import differentiable
-from deep_nrsfm_ros.nrsfm.network import Network, whiten
+from deep_nrsfm_ros.nrsfm.network import Network, forward, whiten
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser, observe
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
@@ -35,13 +34,49 @@ class Frames(NamedTuple):
     mask: Tensor  # (b, p, 1), 1 visible, 0 missing
 
 
+class Task(NamedTuple):
+    """What a batch gives the network to see, and what it should make of it."""
+
+    x: Tensor  # (b + c, p, 2) input: b frames, then c known shapes by random cameras
+    W: Tensor  # (b, p, 2) what S M of the frames should be, centred on the visible points
+    mask: Tensor  # (b, p, 1)
+    T: Tensor | None  # (c, p, 3) the known shapes
+
+
+class Relative(NamedTuple):
+    """||E|| / ||X|| of each of a batch."""
+
+    E: Tensor  # (b, p, d)
+    error: Tensor  # (b,) ||E||_F
+    size: Tensor  # (b,) ||X||_F
+
+    def mean(self) -> Tensor:
+        """Return the mean over the batch."""
+        return (self.error / self.size).mean()
+
+    def gradient(self) -> Tensor:
+        """Return the gradient (b, p, d) of the mean by E."""
+        return self.E / (len(self.E) * self.error * self.size)[:, None, None]
+
+
+class Differences(NamedTuple):
+    """What a reconstruction of a batch leaves, before it becomes numbers."""
+
+    residual: Tensor  # (b, p, 2) of the reprojection, over the visible points
+    reprojection: Relative
+    cycle: Relative | None
+
+
 def frobenius(X: Tensor) -> Tensor:
     """Return the Frobenius norm (b,) of X (b, p, d), with a finite gradient at zero."""
     return ((X * X).sum((-2, -1)) + 1e-12).sqrt()
 
 
 def visible_centre(X: Tensor, mask: Tensor) -> Tensor:
-    """Return C X for C = diag(mask)(I - 1 mask^T / visible points), X (b, p, d)."""
+    """Return C X for C = diag(mask)(I - 1 mask^T / visible points), X (b, p, d).
+
+    C is symmetric, so a gradient goes back through it the same way.
+    """
     mean = (X * mask).sum(-2, keepdim=True) / mask.sum(-2, keepdim=True).clamp(min=1)
     return (X - mean) * mask
 
@@ -65,6 +100,15 @@ class Objective:
         one pass of the network serves both losses, and takes half the time of two. It is 0 for
         None.
         """
+        task = self.task(net, frames, known, generator)
+        S, M = forward(net, task.x)
+        return self.losses(net, S, M, self.differences(net, task, S, M))
+
+    @torch.no_grad()
+    def task(
+        self, net: Network, frames: Frames, known: Tensor | None, generator: torch.Generator
+    ) -> Task:
+        """Return what the batch, and the shapes `known` by random cameras, ask of the network."""
         if not self.recipe.cycle:
             known = None
         b = len(frames.points)
@@ -73,29 +117,59 @@ class Objective:
             replay = known @ Q.mT, torch.ones_like(known[..., :1])
             frames = Frames(*(torch.cat(pair) for pair in zip(frames, replay, strict=True)))
         x, W, unit = self._observe(net, frames, generator)
-        S, M = differentiable(net, x)
-        S, again, M, W, mask = S[:b], S[b:], M[:b], W[:b], frames.mask[:b]
-        W = visible_centre(W, mask)
-        residual = W - visible_centre(S @ M, mask)
-        total = reprojection = self._relative(net, residual, W)
+        mask = frames.mask[:b]
+        T = None if known is None else known / unit[b:]
+        return Task(x, visible_centre(W[:b], mask), mask, T)
+
+    def differences(self, net: Network, task: Task, S: Tensor, M: Tensor) -> Differences:
+        """Return what S (b + c, p, 3) and M (b + c, 3, 2), the answer to a task, leave."""
+        b = len(task.W)
+        residual = task.W - visible_centre(S[:b] @ M[:b], task.mask)
+        cycle = None
+        if task.T is not None:
+            again = S[b:]
+            cycle = self._relative(net, again - again.mean(-2, keepdim=True) - task.T, task.T)
+        return Differences(residual, self._relative(net, residual, task.W), cycle)
+
+    def losses(self, net: Network, S: Tensor, M: Tensor, left: Differences) -> Losses:
+        """Return the losses of what the answer S, M to a task has left."""
+        M = M[: len(left.residual)]
+        total = reprojection = left.reprojection.mean()
         if net.architecture.camera == "free":
             total = total + self.recipe.spectral * spectral_norm(M.mT).mean()
         cycle = torch.zeros_like(reprojection)
-        if known is not None:
-            T = known / unit[b:]
-            cycle = self._relative(net, again - again.mean(-2, keepdim=True) - T, T)
+        if left.cycle is not None:
+            cycle = left.cycle.mean()
             total = total + self.recipe.cycle * cycle
         with torch.no_grad():
-            shapes = S + residual @ M.mT
+            shapes = S[: len(M)] + left.residual @ M.mT
             # Contiguous, as a checkpoint keeps it: the layout decides the last bit of a product.
             shapes = (shapes - shapes.mean(-2, keepdim=True)).contiguous()
         return Losses(reprojection, cycle, total, shapes)
 
-    def _relative(self, net: Network, error: Tensor, X: Tensor) -> Tensor:
-        """Return the mean of ||error|| / ||X|| over a batch, both whitened."""
-        if self.whitened:
-            error, X = whiten(net, error), whiten(net, X)
-        return (frobenius(error) / frobenius(X)).mean()
+    def gradient(
+        self, net: Network, task: Task, S: Tensor, M: Tensor, left: Differences
+    ) -> tuple[Tensor, Tensor]:
+        """Return the gradients by S and by an orthonormal M of the total of `losses`."""
+        b = len(task.W)
+        S_bar, M_bar = torch.zeros_like(S), torch.zeros_like(M)
+        residual_bar = self._weighed(net, left.reprojection.gradient())
+        P_bar = visible_centre(residual_bar, task.mask).neg_()
+        torch.matmul(P_bar, M[:b].mT, out=S_bar[:b])
+        torch.matmul(S[:b].mT, P_bar, out=M_bar[:b])
+        if left.cycle is not None:
+            again_bar = self._weighed(net, self.recipe.cycle * left.cycle.gradient())
+            torch.sub(again_bar, again_bar.mean(-2, keepdim=True), out=S_bar[b:])
+        return S_bar, M_bar
+
+    def _relative(self, net: Network, error: Tensor, X: Tensor) -> Relative:
+        E = self._weighed(net, error)
+        return Relative(E, frobenius(E), frobenius(self._weighed(net, X)))
+
+    def _weighed(self, net: Network, X: Tensor) -> Tensor:
+        """Return L X, or X; L is symmetric, so a gradient goes back through it the same way."""
+        weighed: Tensor = whiten(net, X) if self.whitened else X
+        return weighed
 
     def _observe(
         self, net: Network, frames: Frames, generator: torch.Generator

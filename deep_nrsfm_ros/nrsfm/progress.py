@@ -52,7 +52,7 @@ class Clock:
         self.reported = time.monotonic()
         pace = (self.reported - self.began) / max(trainer.step - self.first, 1)
         loss, cycle = trainer.measure()
-        sharpness = coherence(trainer.net.map(lambda w: w.detach().cpu().numpy()))
+        sharpness = coherence(trainer.net.map(lambda w: w.cpu().numpy()))
         left = 0.0 if trainer.ended else pace * (self.steps - trainer.step)
         if self.limit:
             left = min(left, max(self.limit - self.seconds(), 0.0))

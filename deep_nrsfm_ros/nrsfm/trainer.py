@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.distributed import ALONE, Team
+from deep_nrsfm_ros.nrsfm.gradient import descend
 from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
 from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
@@ -63,7 +64,8 @@ class Trainer:
             initial = dataclasses.replace(initial, L=L, L_inverse=L_inverse)
         self.initial = initial.map(lambda w: torch.from_numpy(w).to(device))
         # All weights in one tensor: Adam costs a tenth of a step on one, a fifth on fifty.
-        self.weights = torch.cat([w.flatten() for _, w in self.initial.learned()]).requires_grad_()
+        self.weights = torch.cat([w.flatten() for _, w in self.initial.learned()])
+        self.net = self._views()
         self.optimiser = torch.optim.Adam([self.weights], lr=recipe.learning_rate, fused=True)
         self.objective = Objective(normaliser, recipe)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
@@ -72,9 +74,8 @@ class Trainer:
         self.shapes: Tensor | None = None  # of the last batch, for the cycle loss
         self.probe = self.sample(1024)
 
-    @property
-    def net(self) -> Network:
-        """Return the network as it is; what is learned in it are views of `weights`."""
+    def _views(self) -> Network:
+        """Return the network; what is learned in it are views of `weights`."""
         learned = dict(self.initial.learned())
         parts = torch.split(self.weights, [w.numel() for w in learned.values()])
         views = (part.view(w.shape) for part, w in zip(parts, learned.values(), strict=True))
@@ -100,12 +101,12 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.preset.recipe, self.step, self.time_gone)
         batch = self.sample(self.batch, self.step)
-        losses = self.objective(self.net, batch, self.shapes, self.generator)
+        losses, bars = descend(self.objective, self.net, batch, self.shapes, self.generator)
         self.shapes = losses.shapes
-        self.optimiser.zero_grad(set_to_none=True)
-        losses.total.backward()  # type: ignore[no-untyped-call]
-        if self.team.size > 1 and self.weights.grad is not None:
-            self.team.total(self.weights.grad.mul_(self.batch / self.preset.recipe.batch))
+        gradient = torch.cat([bar.flatten() for bar in bars])
+        if self.team.size > 1:
+            self.team.total(gradient.mul_(self.batch / self.preset.recipe.batch))
+        self.weights.grad = gradient
         self.optimiser.step()
         self.step += 1
         self.cpu_seconds += time.process_time() - began
@@ -131,7 +132,7 @@ class Trainer:
     def state(self) -> dict[str, Tensor]:
         """Return everything that `restore` needs, as named tensors."""
         tensors = {name: torch.tensor(getattr(self, name)) for name in _COUNTS}
-        tensors |= {"weights": self.weights.detach(), "L": self.initial.L}
+        tensors |= {"weights": self.weights, "L": self.initial.L}
         if self.shapes is not None:
             tensors["shapes"] = self.shapes
         moments = self.optimiser.state.get(self.weights, {})

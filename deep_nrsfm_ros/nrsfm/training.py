@@ -240,7 +240,7 @@ def _usable(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> Frames:
 def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> Model:
     """Return the trained model with its object frame, provenance and label-free quality."""
     loss, cycle = trainer.measure()
-    net = trainer.net.map(lambda w: w.detach().cpu().numpy())
+    net = trainer.net.map(lambda w: w.cpu().numpy())
     normaliser = trainer.preset.normaliser
 
     def lift(W: Floats) -> tuple[Floats, Floats, Floats]:

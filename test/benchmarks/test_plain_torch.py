@@ -42,7 +42,7 @@ def test_has_the_same_losses(name: str, points: torch.Tensor) -> None:
     )
     frames = Frames(points, torch.ones(len(points), P, 1))
     ours = Trainer(frames, preset, 0)
-    plain = PlainTraining(ours.net.map(torch.Tensor.detach), points, preset)
+    plain = PlainTraining(ours.net, points, preset)
     generator = torch.Generator().manual_seed(3)
     shapes = ours.objective(ours.net, frames, None, generator).shapes
     losses = ours.objective(ours.net, frames, shapes, generator)

@@ -35,7 +35,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[float]], dict[int, n
         weights: dict[int, np.ndarray] = {}
 
         def quality(trainer: Trainer) -> float:
-            weights.setdefault(trainer.step, trainer.weights.detach().numpy().copy())
+            weights.setdefault(trainer.step, trainer.weights.numpy().copy())
             return qualities[min(trainer.step // 4 - 1, len(qualities) - 1)]
 
         monkeypatch.setattr(Trainer, "quality", quality)
@@ -47,7 +47,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[float]], dict[int, n
 def test_the_best_state_is_kept(figure: Any, told: Any) -> None:
     weights = told([5, 4, 3, 9, 6, 5, 4])
     trainer = run(figure, limits=Limits())
-    np.testing.assert_array_equal(trainer.weights.detach(), weights[12])
+    np.testing.assert_array_equal(trainer.weights, weights[12])
     assert (trainer.step, trainer.kept, trainer.ended) == (40, 12, "all steps were taken")
     assert finish(trainer, "figure", figure.layout, "test").provenance["kept_step"] == 12
 
@@ -61,7 +61,7 @@ def test_the_last_state_is_kept(
     told(qualities)
     trainer, last = run(figure, limits=limits), run(figure)
     assert trainer.kept is None
-    np.testing.assert_array_equal(trainer.weights.detach(), last.weights.detach())
+    np.testing.assert_array_equal(trainer.weights, last.weights)
     assert "kept_step" not in finish(trainer, "figure", figure.layout, "test").provenance
 
 
@@ -82,11 +82,11 @@ def test_what_is_cancelled_keeps_the_best_and_goes_on_from_the_last(
     how = {"limits": Limits(), "checkpoint": tmp_path / "checkpoint"}
     cancelled = run(figure, **how, should_stop=lambda: next(calls) >= 18)
     assert (cancelled.step, cancelled.kept, cancelled.ended) == (18, 8, "")
-    np.testing.assert_array_equal(cancelled.weights.detach(), weights[8])
+    np.testing.assert_array_equal(cancelled.weights, weights[8])
     steps: list[int] = []
     went_on = run(figure, **how, on_step=lambda trainer: steps.append(trainer.step))
     assert steps == list(range(18, 41)) and went_on.kept == whole.kept == 8
-    np.testing.assert_array_equal(went_on.weights.detach(), whole.weights.detach())
+    np.testing.assert_array_equal(went_on.weights, whole.weights)
 
 
 def test_the_patience_goes_on_too(figure: Any, told: Any, tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_the_patience_goes_on_too(figure: Any, told: Any, tmp_path: Path) -> Non
 def test_looking_does_not_change_the_training(figure: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(best, "interval", lambda recipe: 3)
     last = run(figure, limits=Limits(keep_best=False, patience=1.0))
-    np.testing.assert_array_equal(last.weights.detach(), run(figure).weights.detach())
+    np.testing.assert_array_equal(last.weights, run(figure).weights)
 
 
 @pytest.mark.parametrize("recipe", [preset.recipe for preset in PRESETS.values()])

@@ -54,7 +54,7 @@ def error(net: Network, points: np.ndarray) -> float:
 
 
 def learned(trainer: Trainer) -> Network:
-    return trainer.net.map(lambda w: w.detach().numpy())
+    return trainer.net.map(lambda w: w.numpy())
 
 
 def test_with_the_same_keypoints_it_starts_as_good_as_its_source(
@@ -62,7 +62,7 @@ def test_with_the_same_keypoints_it_starts_as_good_as_its_source(
 ) -> None:
     start = tuned(source, figure.layout, stretched, steps=0)
     for (name, weight), (_, old) in zip(start.net.named(), source.network.named(), strict=True):
-        np.testing.assert_array_equal(weight.detach().numpy(), old, err_msg=name)
+        np.testing.assert_array_equal(weight.numpy(), old, err_msg=name)
     on_new_data = Trainer(start.frames, start.preset, 0, source.network)
     assert start.measure() == on_new_data.measure()
 

@@ -180,7 +180,7 @@ def test_the_gradient_reaches_every_weight(threshold: str, recovery: str) -> Non
 
 
 def test_noise_and_hidden_points_spoil_the_input_not_the_target(trained: Any, figure: Any) -> None:
-    net, f = trained.net.map(torch.Tensor.detach), 500
+    net, f = trained.net, 500
     points = torch.from_numpy(figure.points[:f])
     frames = Frames(points, torch.ones(f, points.shape[1], 1))
 

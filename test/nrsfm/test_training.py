@@ -48,7 +48,7 @@ def stop_after(steps: int) -> Any:
 
 
 def weights(trainer: Trainer) -> dict[str, np.ndarray]:
-    return {name: w.detach().numpy().copy() for name, w in trainer.net.named()}
+    return {name: w.numpy().copy() for name, w in trainer.net.named()}
 
 
 def assert_same(a: Trainer, b: Trainer) -> None:
