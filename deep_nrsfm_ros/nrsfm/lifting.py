@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.nrsfm.compiled import Constants, Kernel
 from deep_nrsfm_ros.nrsfm.confidence import near
 from deep_nrsfm_ros.nrsfm.correction import correct
 from deep_nrsfm_ros.nrsfm.geometry import (
@@ -119,6 +120,28 @@ class Lifter:
         self._spread = np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1))
         self._length = self.options.reference_length or model.layout.reference_length or 1.0
         self._reference = pair and (model.layout.index(pair[0]), model.layout.index(pair[1]))
+        self._kernel = self._compiled()
+
+    def _compiled(self) -> Kernel | None:
+        """Return the kernel that lifts as `_lift` does, if there is one for the model."""
+        constants = Constants(
+            self.model.network,
+            self.model.normaliser.scale == "rms",
+            self.model.object_frame,
+            self._turns,
+            None if self._partners is None else self._partners.tolist(),
+            None if self.options.correction == "none" else self._covariance,
+            self._spread,
+            self.options.noise,
+            self.options.refill,
+            self._length,
+            self._reference,
+            self.options.min_visible,
+        )
+        try:
+            return Kernel(constants)
+        except ValueError:
+            return None
 
     def __call__(
         self, points: Float32, confidence: Float32, *, perspective: bool = False
@@ -135,6 +158,17 @@ class Lifter:
                 f"points are {points.shape} and confidence {confidence.shape}; "
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
+        if self._kernel:
+            arrays, lost = self._kernel(points, confidence, perspective)
+            lifted = Lifted(*arrays)
+        else:
+            lifted, lost = self._lift(points, confidence, perspective)
+        return blank(lifted, lost) if lost.any() else lifted
+
+    def _lift(
+        self, points: Float32, confidence: Float32, perspective: bool
+    ) -> tuple[Lifted, NDArray[np.bool_]]:
+        """Return what `__call__` does, and (n,) where there is nothing to lift."""
         visible = confidence > 0
         mask = visible[..., None].astype(np.float32)
         whole = np.ones_like(mask)
@@ -152,10 +186,9 @@ class Lifter:
         sure = self.sure(confidence, residual, S)
         S *= self._length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
-        lifted = Lifted(S, R, scale, translation, residual, sure)
         lost = on_one_line(points, visible)
         lost |= visible.sum(1) < self.options.min_visible
-        return blank(lifted, lost) if lost.any() else lifted
+        return Lifted(S, R, scale, translation, residual, sure), lost
 
     def sure(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
         """Return the confidence (n, p) of shapes S (n, p, 3) in the network's unit, centred."""
