@@ -40,34 +40,34 @@ typedef struct {
 #define INLINE static inline __attribute__((always_inline))
 typedef float vector __attribute__((vector_size(4 * LANES / 2), aligned(4), may_alias));
 
-/* Add to out (rows, n) the product of `rows` rows of X (., k) and A (k, n); n a multiple of LANES. */
+/* The first LANES columns of out (rows, n) = X A, as `product`; for a constant number of rows. */
 INLINE void tile(const int rows, int k, int n, const float *X, int stride, const float *A,
                  float *out) {
-    for (int j = 0; j < n; j += LANES) {
-        vector sums[6][2] = {{{0}}};
-        for (int i = 0; i < k; i++) {
-            const vector *a = (const vector *)(A + (size_t)i * n + j);
-            vector left = a[0], right = a[1];
-            for (int r = 0; r < rows; r++) {
-                float x = X[r * stride + i];
-                sums[r][0] += x * left;
-                sums[r][1] += x * right;
-            }
+    vector sums[6][2] = {{{0}}};
+    for (int i = 0; i < k; i++) {
+        const vector *a = (const vector *)(A + (size_t)i * n);
+        vector left = a[0], right = a[1];
+        for (int r = 0; r < rows; r++) {
+            float x = X[r * stride + i];
+            sums[r][0] += x * left;
+            sums[r][1] += x * right;
         }
-        for (int r = 0; r < rows; r++)
-            for (int h = 0; h < 2; h++) ((vector *)(out + (size_t)r * n + j))[h] = sums[r][h];
     }
+    for (int r = 0; r < rows; r++)
+        for (int h = 0; h < 2; h++) ((vector *)(out + (size_t)r * n))[h] = sums[r][h];
 }
 
-/* out (rows, n) = X A for X (rows, k), whose rows are `stride` apart, and A (k, n). */
+/* out (rows, n) = X A for X (rows, k), whose rows are `stride` apart, and A (k, n); n is PADDED.
+
+   Column by column, so that what is read of A stays in the cache for all rows. */
 INLINE void product_inline(int rows, int k, int n, const float *X, int stride, const float *A,
                            float *out) {
-    for (; rows >= 6; rows -= 6, X += 6 * stride, out += 6 * n) tile(6, k, n, X, stride, A, out);
-    if (rows >= 3) {
-        tile(3, k, n, X, stride, A, out);
-        rows -= 3, X += 3 * stride, out += 3 * n;
+    for (int j = 0; j < n; j += LANES) {
+        int r = 0;
+        for (; r + 6 <= rows; r += 6) tile(6, k, n, X + r * stride, stride, A + j, out + r * n + j);
+        for (; r + 3 <= rows; r += 3) tile(3, k, n, X + r * stride, stride, A + j, out + r * n + j);
+        for (; r < rows; r++) tile(1, k, n, X + r * stride, stride, A + j, out + r * n + j);
     }
-    for (; rows; rows--, X += stride, out += n) tile(1, k, n, X, stride, A, out);
 }
 
 /* Solve A x = b for a symmetric positive definite A (n, n), of which the upper half is read and spoilt. */
