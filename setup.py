@@ -14,12 +14,15 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]},
+    package_data={
+        NAME: ["py.typed", "nrsfm/*.pyi", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]
+    },
     # Optional: without a C compiler the lifter does the same in NumPy, some ten times slower.
     ext_modules=[
         Extension(
             f"{NAME}.nrsfm._kernel",
-            [f"{NAME}/nrsfm/_kernel.c"],
+            glob(f"{NAME}/nrsfm/kernel/*.c"),
+            depends=glob(f"{NAME}/nrsfm/kernel/*.h"),
             extra_compile_args=["-O3", "-fno-math-errno", "-fno-trapping-math"],
             optional=True,
         )

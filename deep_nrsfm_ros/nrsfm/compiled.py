@@ -1,4 +1,4 @@
-"""The lifter's sums as one compiled call: `_kernel.c`, where it was compiled at installation.
+"""The lifter's sums as one compiled call: `kernel/`, where it was compiled at installation.
 
 Without it, and for options of the network that the default recipe does not use, NumPy does the same
 some ten times slower.

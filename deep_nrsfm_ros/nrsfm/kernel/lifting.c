@@ -5,119 +5,23 @@
    it does and why, and the tests hold both to the same results. Symbols as in the package's legend.
    Shapes are stored with the points last, S (3, p), so that every layer is one `product`.
 */
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+#include "lifting.h"
+
 #include <math.h>
 #include <string.h>
+
+#include "algebra.h"
 
 #define TINY 1e-12
 #define NEAREST 0.1f          /* lifting._NEAREST */
 #define RESIDUAL_SPREAD 0.02  /* lifting._RESIDUAL_SPREAD */
 #define UNKNOWN 1e4           /* correction._UNKNOWN */
 #define LEAST_RESIDUAL 0.02   /* confidence._LEAST_RESIDUAL */
-#define MOST_LAYERS 64
-#define LANES 16
-#define PADDED(n) (((n) + LANES - 1) / LANES * LANES)
 
 typedef double camera[3][2];
 typedef double rotation[3][3];
 
-typedef struct {
-    int p, layers, turns, mirrored, whitened, rms, corrected, refill, reference[2], min_visible;
-    const int *widths, *partners;
-    const float *L, *L_inverse, *encoder[MOST_LAYERS], *b[MOST_LAYERS], *decoder[MOST_LAYERS],
-        *b_[MOST_LAYERS], *code_head, *camera_head, *spread;
-    const double *filling, *turn, *frame, *covariance, *calibration;
-    double noise, length, unknown;
-    void *memory;
-    /* Scratch. */
-    float *x, *V, *Psi[2], *psi[2], *shapes, *S, *W, *points, *mask;
-    double *M, *cameras, *CH, *A, *r, *residual;
-} Plan;
-
-/* ---- Linear algebra --------------------------------------------------------------------------- */
-
-#define INLINE static inline __attribute__((always_inline))
-typedef float vector __attribute__((vector_size(4 * LANES / 2), aligned(4), may_alias));
-
-/* The first LANES columns of out (rows, n) = X A, as `product`; for a constant number of rows. */
-INLINE void tile(const int rows, int k, int n, const float *X, int stride, const float *A,
-                 float *out) {
-    vector sums[6][2] = {{{0}}};
-    for (int i = 0; i < k; i++) {
-        const vector *a = (const vector *)(A + (size_t)i * n);
-        vector left = a[0], right = a[1];
-        for (int r = 0; r < rows; r++) {
-            float x = X[r * stride + i];
-            sums[r][0] += x * left;
-            sums[r][1] += x * right;
-        }
-    }
-    for (int r = 0; r < rows; r++)
-        for (int h = 0; h < 2; h++) ((vector *)(out + (size_t)r * n))[h] = sums[r][h];
-}
-
-/* out (rows, n) = X A for X (rows, k), whose rows are `stride` apart, and A (k, n); n is PADDED.
-
-   Column by column, so that what is read of A stays in the cache for all rows. */
-INLINE void product_inline(int rows, int k, int n, const float *X, int stride, const float *A,
-                           float *out) {
-    for (int j = 0; j < n; j += LANES) {
-        int r = 0;
-        for (; r + 6 <= rows; r += 6) tile(6, k, n, X + r * stride, stride, A + j, out + r * n + j);
-        for (; r + 3 <= rows; r += 3) tile(3, k, n, X + r * stride, stride, A + j, out + r * n + j);
-        for (; r < rows; r++) tile(1, k, n, X + r * stride, stride, A + j, out + r * n + j);
-    }
-}
-
-/* Solve A x = b for a symmetric positive definite A (n, n), of which the upper half is read and spoilt. */
-INLINE void solve_inline(int n, double *A, int columns, double *b) {
-    for (int k = 0; k < n; k++) {
-        double *row = A + (size_t)k * n;
-        double scale = 1 / sqrt(fmax(row[k], 1e-300));
-        for (int j = k; j < n; j++) row[j] *= scale;
-        for (int c = 0; c < columns; c++) b[k * columns + c] *= scale;
-        for (int i = k + 1; i < n; i++) {
-            double *below = A + (size_t)i * n, factor = row[i];
-            for (int j = i; j < n; j++) below[j] -= factor * row[j];
-            for (int c = 0; c < columns; c++) b[i * columns + c] -= factor * b[k * columns + c];
-        }
-    }
-    for (int k = n - 1; k >= 0; k--)
-        for (int c = 0; c < columns; c++) {
-            double sum = b[k * columns + c];
-            for (int j = k + 1; j < n; j++) sum -= A[(size_t)k * n + j] * b[j * columns + c];
-            b[k * columns + c] = sum / A[(size_t)k * n + k];
-        }
-}
-
-static void product_anywhere(int rows, int k, int n, const float *X, int stride, const float *A,
-                             float *out) {
-    product_inline(rows, k, n, X, stride, A, out);
-}
-static void solve_anywhere(int n, double *A, int columns, double *b) {
-    solve_inline(n, A, columns, b);
-}
-
-static void (*product)(int, int, int, const float *, int, const float *, float *) = product_anywhere;
-static void (*solve)(int, double *, int, double *) = solve_anywhere;
-
-#ifdef __x86_64__
-#define AVX2 __attribute__((target("avx2,fma")))
-AVX2 static void product_avx2(int rows, int k, int n, const float *X, int stride, const float *A,
-                              float *out) {
-    product_inline(rows, k, n, X, stride, A, out);
-}
-AVX2 static void solve_avx2(int n, double *A, int columns, double *b) {
-    solve_inline(n, A, columns, b);
-}
-static void choose(void) {
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-        product = product_avx2, solve = solve_avx2;
-}
-#else
-static void choose(void) {}
-#endif
+void choose_instructions(void) { choose(); }
 
 /* ---- geometry.py ------------------------------------------------------------------------------ */
 
@@ -449,9 +353,8 @@ static double fit(Plan *k, float *points, float *mask, const float *visible, int
     return residual;
 }
 
-/* Lift one object; `Lifter.__call__`. Return whether there is nothing to lift. */
-static int lift(Plan *k, const float *given, const float *confidence, int perspective, float *shape,
-                float *rotated, float *scale, float *translation, float *left, float *sure) {
+int lift(Plan *k, const float *given, const float *confidence, int perspective, float *shape,
+         float *rotated, float *scale, float *translation, float *left, float *sure) {
     int p = k->p, wide = PADDED(p);
     float *points = k->mask + 2 * p, *mask = k->mask, *visible = k->mask + p;
     double unit, origin[2], seen = 0;
@@ -501,18 +404,10 @@ static int lift(Plan *k, const float *given, const float *confidence, int perspe
     return on_one_line(m) || seen < k->min_visible;
 }
 
-/* ---- Python ----------------------------------------------------------------------------------- */
+/* ---- compiled.py ------------------------------------------------------------------------------ */
 
-static const char NAME[] = "deep_nrsfm_ros.nrsfm._kernel.plan";
-
-static void forget(PyObject *capsule) {
-    Plan *k = PyCapsule_GetPointer(capsule, NAME);
-    if (k) PyMem_Free(k->memory), PyMem_Free(k);
-}
-
-/* Point `k` at its parts of the three arrays, then at scratch; return the bytes of scratch. */
-static int lay_out(Plan *k, const int *header, const float *floats, const double *doubles,
-                   Py_ssize_t lengths[3]) {
+int lay_out(Plan *k, const int *header, const float *floats, const double *doubles,
+            const ptrdiff_t lengths[3]) {
     const int *h = header;
     const float *f = floats;
     const double *d = doubles;
@@ -544,7 +439,7 @@ static int lay_out(Plan *k, const int *header, const float *floats, const double
     return h - header == lengths[0] && f - floats == lengths[1] && d - doubles == lengths[2];
 }
 
-static size_t scratch(Plan *k, char *at) {
+size_t scratch(Plan *k, char *at) {
     int p = k->p, wide = PADDED(p), rows = 6 * k->turns, widest = 0, all = k->turns * (1 + k->mirrored);
     for (int i = 0; i < k->layers; i++)
         if (k->widths[i] > widest) widest = k->widths[i];
@@ -571,74 +466,4 @@ static size_t scratch(Plan *k, char *at) {
     ROOM(residual, double, all)
 #undef ROOM
     return used;
-}
-
-/* plan(header int32, floats float32, doubles float64) -> capsule; `compiled.plan` says what is in them. */
-static PyObject *plan(PyObject *module, PyObject *args) {
-    Py_buffer parts[3];
-    if (!PyArg_ParseTuple(args, "y*y*y*", &parts[0], &parts[1], &parts[2])) return NULL;
-    size_t aligned[4] = {0};
-    for (int i = 0; i < 3; i++) aligned[i + 1] = aligned[i] + (parts[i].len + 63) / 64 * 64;
-    const int *header = parts[0].buf;
-    Py_ssize_t lengths[3] = {parts[0].len / 4, parts[1].len / 4, parts[2].len / 8};
-    int sound = lengths[0] > 12 && header[0] > 0 && header[1] > 0 && header[1] <= MOST_LAYERS;
-    sound = sound && lengths[0] == 11 + header[0] + header[1];
-    Plan *k = sound ? PyMem_Calloc(1, sizeof(Plan)) : NULL;
-    char *memory = NULL;
-    if (k && lay_out(k, header, parts[1].buf, parts[2].buf, lengths)) {
-        size_t needed = scratch(k, NULL);
-        memory = k->memory = PyMem_Calloc(1, aligned[3] + needed);
-        for (int i = 0; memory && i < 3; i++) memcpy(memory + aligned[i], parts[i].buf, parts[i].len);
-        if (memory) {
-            lay_out(k, (int *)memory, (float *)(memory + aligned[1]), (double *)(memory + aligned[2]),
-                    lengths);
-            scratch(k, memory + aligned[3]);
-        }
-    }
-    for (int i = 0; i < 3; i++) PyBuffer_Release(&parts[i]);
-    if (!memory) {
-        PyMem_Free(k);
-        PyErr_SetString(PyExc_ValueError, "the arrays are not those of a plan, or too large");
-        return NULL;
-    }
-    return PyCapsule_New(k, NAME, forget);
-}
-
-/* lift(plan, points, confidence, perspective, shapes, rotations, scale, translation, residual, sure, lost):
-   fill the last seven, arrays as in `lifting.Lifted`, and lost (n,) of bytes. */
-static PyObject *lift_objects(PyObject *module, PyObject *args) {
-    PyObject *capsule;
-    Py_buffer b[9];
-    int perspective;
-    if (!PyArg_ParseTuple(args, "Oy*y*pw*w*w*w*w*w*w*", &capsule, &b[0], &b[1], &perspective, &b[2],
-                          &b[3], &b[4], &b[5], &b[6], &b[7], &b[8]))
-        return NULL;
-    Plan *k = PyCapsule_GetPointer(capsule, NAME);
-    int sound = k != NULL;
-    if (k) {
-        Py_ssize_t n = b[8].len, p = k->p;
-        const Py_ssize_t each[8] = {2 * p, p, 3 * p, 9, 1, 2, 1, p};
-        for (int i = 0; i < 8; i++) sound = sound && b[i].len == 4 * n * each[i];
-        float *a[8];
-        for (int i = 0; i < 8; i++) a[i] = b[i].buf;
-        for (Py_ssize_t i = 0; sound && i < n; i++) {
-            ((char *)b[8].buf)[i] = (char)lift(k, a[0], a[1], perspective, a[2], a[3], a[4], a[5],
-                                               a[6], a[7]);
-            for (int j = 0; j < 8; j++) a[j] += each[j];
-        }
-        if (!sound) PyErr_SetString(PyExc_ValueError, "the arrays do not fit the plan and each other");
-    }
-    for (int i = 0; i < 9; i++) PyBuffer_Release(&b[i]);
-    if (!sound) return NULL;
-    Py_RETURN_NONE;
-}
-
-static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
-                                {"lift", lift_objects, METH_VARARGS, NULL},
-                                {NULL, NULL, 0, NULL}};
-static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", NULL, -1, methods, NULL, NULL, NULL, NULL};
-
-PyMODINIT_FUNC PyInit__kernel(void) {
-    choose();
-    return PyModule_Create(&module);
 }
