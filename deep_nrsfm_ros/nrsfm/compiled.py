@@ -1,18 +1,18 @@
 """The lifter's sums as one compiled call: `kernel/`, where it was compiled at installation.
 
-Without it, and for options of the network that the default recipe does not use, NumPy does the same
-some ten times slower.
+Without it, and for options of the network that the default recipe does not use, `fitting` does the
+same some ten times slower.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.confidence import CALIBRATED
+from deep_nrsfm_ros.nrsfm.fitting import Constants
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, filling
 
 try:
@@ -24,35 +24,23 @@ AVAILABLE = _kernel is not None
 _LANES = 16  # of the kernel: rows are padded to a multiple of it
 
 
-class Constants(NamedTuple):
-    """What a lifter knows before it sees any keypoints; names as in `lifting.Lifter`."""
-
-    network: Network
-    rms: bool  # whether the normaliser divides by the RMS radius
-    frame: NDArray[np.float32]  # (3, 3)
-    turns: NDArray[np.float32]  # (k, 2, 2)
-    partners: Sequence[int] | None  # None: no mirror images
-    covariance: NDArray[np.float64] | None  # (3p, 3p) by which to correct; None: not at all
-    spread: NDArray[np.float32]  # (p,)
-    noise: float
-    refill: int
-    length: float
-    reference: tuple[int, int] | None
-    min_visible: int
+def fits(network: Network) -> bool:
+    """Tell whether there is a kernel, and it knows the network's options."""
+    options = network.architecture
+    return AVAILABLE and (options.threshold, options.recovery, options.camera) == _KNOWN
 
 
 class Kernel:
     """A lifter's constants, laid out for the kernel."""
 
     def __init__(self, constants: Constants) -> None:
-        """Raise ValueError if the kernel does not know the network's options."""
+        """Take the constants, of a network that the kernel `fits`."""
         net, p = constants.network, constants.network.p
         options = net.architecture
-        if _kernel is None or (options.threshold, options.recovery, options.camera) != _KNOWN:
-            raise ValueError("no kernel for this network")
         covariance = np.eye(3 * p) if constants.covariance is None else constants.covariance
         header = [p, len(options.widths), len(constants.turns), constants.partners is not None]
-        header += [bool(options.whitening), constants.rms, constants.covariance is not None]
+        header += [bool(options.whitening), constants.normaliser.scale == "rms"]
+        header += [constants.covariance is not None]
         header += [constants.refill, *(constants.reference or (-1, -1)), constants.min_visible]
         header += [*options.widths, *(constants.partners or range(p))]
         floats = [_padded(net.L), _padded(net.L_inverse)]

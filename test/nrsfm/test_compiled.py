@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.nrsfm import _kernel
-from deep_nrsfm_ros.nrsfm.compiled import AVAILABLE
+from deep_nrsfm_ros.nrsfm.compiled import AVAILABLE, Kernel
+from deep_nrsfm_ros.nrsfm.fitting import Fit
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model
@@ -75,12 +76,13 @@ def test_lifts_as_numpy_does(
     points = rng.standard_normal((4, p, 2)).astype(np.float32) * (0.2 if perspective else 1)
     confidence = rng.uniform(0.2, 1.2, (4, p)).astype(np.float32)
     confidence[rng.random((4, p)) < missing] = 0
-    assert lifter._kernel is not None
-    arrays, lost = lifter._kernel(points, confidence, perspective)
-    expected, lost_too = lifter._lift(points, confidence, perspective)
+    assert isinstance(lifter.fit, Kernel)
+    arrays, lost = lifter.fit(points, confidence, perspective)
+    by_numpy = Fit(lifter.constants)
+    expected, lost_too = by_numpy(points, confidence, perspective)
     # Where the last digits of the input matter, no more can be asked of the last of the output.
     moved = points + 1e-6 * rng.standard_normal(points.shape).astype(np.float32)
-    nearby, _ = lifter._lift(moved, confidence, perspective)
+    nearby, _ = by_numpy(moved, confidence, perspective)
     np.testing.assert_array_equal(lost, lost_too)
     for fields in zip(arrays, expected, nearby, strict=True):
         for ours, numpy, near in zip(*(field[~lost] for field in fields), strict=True):
@@ -106,11 +108,9 @@ def test_what_cannot_be_lifted_is_nan(shown: int) -> None:
     "options", [("block",), ("relu", "closed_form"), ("relu", "learned", "free")]
 )
 def test_other_options_of_the_network_are_left_to_numpy(options: tuple[str, ...]) -> None:
-    random = model(0, HUMAN17, (12, 6), 0.0, "rms")
     network = initialise(Architecture((12, 6), *options), 17, np.random.default_rng(0))
-    assert (
-        Lifter(random)._kernel and not Lifter(dataclasses.replace(random, network=network))._kernel
-    )
+    random = dataclasses.replace(model(0, HUMAN17, (12, 6), 0.0, "rms"), network=network)
+    assert isinstance(Lifter(random).fit, Fit)
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
@@ -118,7 +118,6 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         _kernel.plan(np.zeros(40, np.int32), np.zeros(9, np.float32), np.zeros(9))
     with pytest.raises(ValueError, match="not those of a plan"):
         _kernel.plan(b"", b"", b"")
-    kernel = Lifter(model(0, HUMAN17, (12, 6), 1.0, "rms"))._kernel
-    assert kernel is not None
+    kernel = Kernel(Lifter(model(0, HUMAN17, (12, 6), 1.0, "rms")).constants)
     with pytest.raises(ValueError, match="do not fit"):
         kernel(np.zeros((2, 16, 2), np.float32), np.ones((2, 17), np.float32), False)

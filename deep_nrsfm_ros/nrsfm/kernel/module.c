@@ -3,7 +3,7 @@
 #include <Python.h>
 #include <string.h>
 
-#include "lifting.h"
+#include "fitting.h"
 
 static const char NAME[] = "deep_nrsfm_ros.nrsfm._kernel.plan";
 

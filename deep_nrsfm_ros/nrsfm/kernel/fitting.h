@@ -1,6 +1,6 @@
 /* A plan: what a lifter knows before it sees any keypoints; `compiled.py` fills it. */
-#ifndef LIFTING_H
-#define LIFTING_H
+#ifndef FITTING_H
+#define FITTING_H
 
 #include <stddef.h>
 
@@ -29,7 +29,7 @@ int lay_out(Plan *k, const int *header, const float *floats, const double *doubl
 /* Point `k` at its scratch memory, which begins at `at`; return how many bytes it takes. */
 size_t scratch(Plan *k, char *at);
 
-/* Lift one object; `lifting.Lifter.__call__`. Return whether there is nothing to lift. */
+/* Lift one object; `fitting.Fit.__call__`. Return whether there is nothing to lift. */
 int lift(Plan *k, const float *given, const float *confidence, int perspective, float *shape,
          float *rotated, float *scale, float *translation, float *left, float *sure);
 

@@ -1,11 +1,11 @@
-/* The sums of `lifting.Lifter` for one object at a time, in C.
+/* The sums of `fitting.Fit` for one object at a time, in C.
 
    A lift is some four hundred small NumPy calls, and calling them costs ten times what they compute.
    This file does the same in one: each function carries the name of the Python function that says what
    it does and why, and the tests hold both to the same results. Symbols as in the package's legend.
    Shapes are stored with the points last, S (3, p), so that every layer is one `product`.
 */
-#include "lifting.h"
+#include "fitting.h"
 
 #include <math.h>
 #include <string.h>
@@ -13,8 +13,8 @@
 #include "algebra.h"
 
 #define TINY 1e-12
-#define NEAREST 0.1f          /* lifting._NEAREST */
-#define RESIDUAL_SPREAD 0.02  /* lifting._RESIDUAL_SPREAD */
+#define NEAREST 0.1f          /* fitting._NEAREST */
+#define RESIDUAL_SPREAD 0.02  /* fitting._RESIDUAL_SPREAD */
 #define UNKNOWN 1e4           /* correction._UNKNOWN */
 #define LEAST_RESIDUAL 0.02   /* confidence._LEAST_RESIDUAL */
 
@@ -210,7 +210,7 @@ static void forward(Plan *k, const float *x, int across, float *shapes, camera *
     }
 }
 
-/* ---- lifting.py ------------------------------------------------------------------------------- */
+/* ---- fitting.py ------------------------------------------------------------------------------- */
 
 /* S (3, p) = A S for A (3, 3); rows are PADDED(p) apart. */
 static void rotate(int p, rotation A, float *S) {
