@@ -236,7 +236,7 @@ class Lifter:
 
 
 def lift_all(
-    lifter: Lifter,
+    lifter: Callable[[Float32, Float32], Lifted],
     points: Float32,
     confidence: Float32,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
