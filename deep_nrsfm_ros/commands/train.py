@@ -44,7 +44,7 @@ from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.observations.bags import most_keypoints, read_bags
 from deep_nrsfm_ros.observations.curation import Curated, Curation
-from deep_nrsfm_ros.observations.ensemble import Ensemble, with_mirror_images
+from deep_nrsfm_ros.observations.ensemble import Ensemble
 from deep_nrsfm_ros.observations.field_mapping import FieldMapping
 from deep_nrsfm_ros.observations.mapping_file import read_mapping
 from deep_nrsfm_ros.observations.variation import Variation
@@ -74,12 +74,6 @@ def arguments() -> argparse.ArgumentParser:
     for side in ("width", "height"):
         text = f"{side} of the image in pixels, for normalised keypoints"
         data.add_argument(f"--image-{side}", type=int, default=0, help=text)
-    data.add_argument(
-        "--mirrored",
-        action="store_true",
-        help="add the mirror image of each frame, left and right swapped: twice the poses of an "
-        "object that is as likely to be seen the other way round",
-    )
     data.add_argument("--cmu", type=Path, help="folder of the CMU database (NN/NN.asf, *.amc)")
     data.add_argument("--subjects", nargs="*", default=["01"], help="CMU subjects")
     data.add_argument(
@@ -124,11 +118,6 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
     """Return the ensemble that the arguments name; raise ValueError if there is none."""
     if bool(given.bag) == bool(given.cmu):
         raise ValueError("name what to train on: --bag (repeatable), or --cmu with --subjects")
-    found = _read_frames(given, report)
-    return with_mirror_images(found) if given.mirrored else found
-
-
-def _read_frames(given: argparse.Namespace, report: Reporter) -> Ensemble:
     source, target = read_layouts(given)
     if given.bag:
         size = (given.image_width, given.image_height)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,26 +67,3 @@ def concatenate(ensembles: list[Ensemble]) -> Ensemble:
         "; ".join(dict.fromkeys(e.source for e in ensembles)),
         np.concatenate(shapes) if len(shapes) == len(ensembles) else None,
     )
-
-
-def with_mirror_images(ensemble: Ensemble) -> Ensemble:
-    """Return the frames, and after them their mirror images, in which left is right.
-
-    For an object that is as likely to be seen the other way round: a person, an animal. Raises
-    ValueError for a layout that does not say where left is.
-    """
-    partners = ensemble.layout.partners()
-    if partners is None:
-        raise ValueError(
-            f"layout {ensemble.layout.name!r} does not say where left is: mirror images need a "
-            "handedness, and keypoints named left_... and right_..."
-        )
-    shapes = ensemble.shapes
-    mirrored = replace(
-        ensemble,
-        points=(ensemble.points * np.array([-1, 1], np.float32))[:, partners],
-        visible=ensemble.visible[:, partners],
-        source="their mirror images",
-        shapes=None if shapes is None else (shapes * np.array([-1, 1, 1], np.float32))[:, partners],
-    )
-    return concatenate([ensemble, mirrored])

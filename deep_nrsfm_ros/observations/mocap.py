@@ -146,25 +146,21 @@ _HUMAN17_FROM_CMU = {
     "ankle": "tibia",
     "big_toe": "toes",
 }
-# Detectors see hips further out and shoulders further in than CMU's skeletons have them: by these
-# factors their distances become the 0.43 and 0.71 torso lengths that OpenPose measures on a
-# person who faces the camera, in a real video of thousands of frames.
-_APART = {"hip": 1.25, "shoulder": 0.92}
-_NOSE_BEFORE_HEAD = 0.11  # m from the head bone's end, which is as high as OpenPose's nose
 
 
 def human17(motion: Motion) -> NDArray[np.float32]:
     """Return the keypoints of HUMAN17 (f, 17, 3) as a detector would place them."""
     at = CMU31.index
     points: dict[str, NDArray[Any]] = {}
-    for part, bone in _HUMAN17_FROM_CMU.items():
-        left, right = (motion.joints[:, at(side + bone)] for side in "lr")
-        outwards = np.float32(_APART.get(part, 1) - 1) / 2 * (left - right)
-        points |= {f"left_{part}": left + outwards, f"right_{part}": right - outwards}
+    for side in ("left", "right"):
+        for part, bone in _HUMAN17_FROM_CMU.items():
+            points[f"{side}_{part}"] = motion.joints[:, at(side[0] + bone)]
     points["neck"] = (points["left_shoulder"] + points["right_shoulder"]) / 2
     points["mid_hip"] = (points["left_hip"] + points["right_hip"]) / 2
-    forward = motion.head @ np.array([0, 0, _NOSE_BEFORE_HEAD], np.float32)
-    points["nose"] = motion.joints[:, at("head")] + forward
+    base, top = motion.joints[:, at("upperneck")], motion.joints[:, at("head")]
+    # The head bone's end is the crown; the nose sits 35 % up it and 0.11 m before it.
+    forward = motion.head @ np.array([0, 0, 0.11], np.float32)
+    points["nose"] = base + np.float32(0.35) * (top - base) + forward
     return np.stack([points[name] for name in HUMAN17.keypoints], 1)
 
 

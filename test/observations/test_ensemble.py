@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
-from deep_nrsfm_ros.observations.ensemble import Ensemble, concatenate, with_mirror_images
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.observations.ensemble import Ensemble, concatenate
 
 FIVE = KeypointLayout.numbered(5)
 
@@ -79,26 +79,3 @@ def test_concatenate_refuses_nothing_and_different_layouts() -> None:
     other = KeypointLayout("other", tuple("abcde"))
     with pytest.raises(ValueError, match="2 different keypoint layouts"):
         concatenate([ensemble(), ensemble(layout=other)])
-
-
-def test_mirror_images_are_of_the_mirrored_object() -> None:
-    rng = np.random.default_rng(0)
-    S, M = rng.standard_normal((3, 17, 3)), np.eye(3)[:, :2]
-    visible = rng.random((3, 17)) < 0.7
-    points = np.where(visible[..., None], S @ M, 0)
-    one = Ensemble(points.astype(np.float32), visible, HUMAN17, "a", S.astype(np.float32))
-    both = with_mirror_images(one)
-    assert len(both) == 6 and both.source == "a; their mirror images"
-    np.testing.assert_array_equal(both.points[:3], one.points)
-    assert both.shapes is not None
-    seen = both.shapes @ M.astype(np.float32) * both.visible[..., None]
-    np.testing.assert_array_equal(both.points, seen)
-    left, right = HUMAN17.index("left_knee"), HUMAN17.index("right_knee")
-    np.testing.assert_array_equal(both.points[3:, left], one.points[:, right] * [-1, 1])
-    np.testing.assert_array_equal(both.visible[3:, left], visible[:, right])
-    assert with_mirror_images(both[slice(3, 6)]).points[3:].tolist() == one.points.tolist()
-
-
-def test_mirror_images_need_a_left_and_a_right() -> None:
-    with pytest.raises(ValueError, match="where left is"):
-        with_mirror_images(ensemble())
