@@ -18,12 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.real_detections import SUBJECTS
 from benchmarks.steadiness import VIDEO, Clip, filmed
+from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.node.model_folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
 from deep_nrsfm_ros.nrsfm.keypoints import CMU31, HUMAN17, KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, lift_all
+from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, LiftingOptions, lift_all
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
-from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
+from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.placement import lift_at_place
 from deep_nrsfm_ros.observations.mocap import read_trials, trials
 from deep_nrsfm_ros.observations.pose2sim import JOINTS
@@ -106,9 +107,9 @@ def as_filmed(shapes: Floats, rng: np.random.Generator) -> Seen:
     return Seen(W.astype(np.float32), found.astype(np.float32), 1000 * X[:, limbs])
 
 
-def errors(model: Model, seen: Seen, *, intrinsics: bool) -> dict[str, float]:
-    """Return the errors of a model that is told the camera's intrinsics or not."""
-    lifter, limbs = Lifter(model), [HUMAN17.index(joint) for joint in JOINTS]
+def errors(lifter: Lifter, seen: Seen, *, intrinsics: bool) -> dict[str, float]:
+    """Return the errors of a lifter that is told the camera's intrinsics or not."""
+    limbs = [HUMAN17.index(joint) for joint in JOINTS]
 
     def placed(points: Floats, confidence: Floats) -> Lifted:
         return lift_at_place(lifter, CAMERA, points, confidence)
@@ -134,7 +135,7 @@ def show(title: str, rows: Mapping[str, Mapping[str, float]]) -> None:
     print(flush=True)
 
 
-def benchmark(models: Mapping[str, Model], data: Path) -> None:
+def benchmark(lifters: Mapping[str, Lifter], data: Path) -> None:
     """Print both tables."""
     video, folder = filmed(data / VIDEO), data / "cmu"
     trunk = [HUMAN17.index(joint) for joint in _TRUNK]
@@ -153,11 +154,11 @@ def benchmark(models: Mapping[str, Model], data: Path) -> None:
     held_out = [captured(trials(folder, subject), HUMAN17) for subject in HELD_OUT]
     seen = [as_filmed(shapes, np.random.default_rng(1)) for shapes in held_out]
     rows: dict[str, dict[str, float]] = {}
-    for name, model in models.items():
-        lifted = lift_all(Lifter(model), points, confidence)
+    for name, lifter in lifters.items():
+        lifted = lift_all(lifter, points, confidence)
         rows[name] = {"residual": float(np.nanmedian(lifted.residual))}
         for told, word in ((False, ""), (True, ", intrinsics")):
-            each = [errors(model, one, intrinsics=told) for one in seen]
+            each = [errors(lifter, one, intrinsics=told) for one in seen]
             rows[name] |= {
                 f"{key}{word}": float(np.mean([e[key] for e in each])) for key in each[0]
             }
@@ -170,10 +171,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("models", nargs="*", default=["human"], help="models of `human17`")
     parser.add_argument("--data", type=Path, required=True, help="holds cmu/ and detections/")
+    add_arguments(parser, LiftingOptions)
     given = parser.parse_args(argv)
+    options = override(LiftingOptions(), given)
     folders = model_folders(default_models_dir())
     try:
-        benchmark({n: load_model(find_model(n, folders)) for n in given.models}, given.data)
+        models = {name: load_model(find_model(name, folders)) for name in given.models}
+        benchmark({name: Lifter(model, options) for name, model in models.items()}, given.data)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)
