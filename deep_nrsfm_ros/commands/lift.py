@@ -18,6 +18,7 @@ from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
+from deep_nrsfm_ros.observations.camera_file import read_camera_file
 from deep_nrsfm_ros.observations.detections import Detections
 from deep_nrsfm_ros.observations.keypoint_files import KINDS, read_keypoints
 from deep_nrsfm_ros.observations.lifted_files import check_output, write_recording
@@ -59,6 +60,18 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("all", "largest"),
         help="lift everyone in a frame, or who is largest in the image (default: %(default)s)",
     )
+    parser.add_argument(
+        "--intrinsics",
+        default="",
+        metavar="FILE",
+        help="CameraInfo of the camera (.yaml, as `ros2 topic echo --once` or camera calibration "
+        "writes it): objects come out at their place before it",
+    )
+    parser.add_argument(
+        "--rectified",
+        action="store_true",
+        help="the keypoints are those of the rectified image, to which CameraInfo's P belongs",
+    )
     add_arguments(parser, InputOptions, without=("input_type", "topics"))
     add_arguments(parser, LiftingOptions)
 
@@ -96,8 +109,10 @@ def lift_objects(
 ) -> Recording:
     """Return the objects lifted as the arguments say."""
     lifter = Lifter(model, override(LiftingOptions(), given))
+    file = Path(given.intrinsics).expanduser()
+    intrinsics = read_camera_file(file, rectified=given.rectified) if given.intrinsics else None
     with progress("lifting") as on_progress:
-        return lift_recording(seen, source, lifter, on_progress)
+        return lift_recording(seen, source, lifter, on_progress, intrinsics)
 
 
 @contextmanager

@@ -141,7 +141,7 @@ def _constants(model: Model, options: LiftingOptions) -> Constants:
 
 
 def lift_all(
-    lifter: Lifter,
+    lifter: Callable[[Float32, Float32], Lifted],
     points: Float32,
     confidence: Float32,
     on_progress: Callable[[int, int], None] = lambda done, total: None,

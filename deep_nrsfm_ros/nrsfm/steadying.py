@@ -32,16 +32,16 @@ class SteadyingOptions:
     enabled: bool = option(
         False,
         "filter shape and rotation over time, each object by its identity and the stamps of its "
-        "messages; lags by some 28 ms at walking speed",
+        "messages; lags by some 40 ms at walking speed",
     )
     min_cutoff: float = option(
-        0.5,
+        0.2,
         "cutoff in Hz for what rests: less trembles less and lags more",
         low=0.001,
         high=1000.0,
     )
     beta: float = option(
-        6.0,
+        4.0,
         "Hz by which the cutoff rises with the speed, in RMS radii of the object, or in radians, "
         "a second: more lags less and trembles more",
         low=0.0,

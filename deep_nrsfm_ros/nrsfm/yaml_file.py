@@ -26,6 +26,7 @@ def read_fields(path: Path, example: str) -> dict[Any, Any]:
         raise ValueError(f"cannot be read: {error.strerror or error}") from error
     if len(text) > _MAX_BYTES:
         raise ValueError(f"is larger than {_MAX_BYTES >> 10} KiB: not a description")
+    text = text.rstrip().removesuffix(b"\n---")  # so `ros2 topic echo` ends each message
     _check_nesting(text)
     try:
         root = yaml.compose(text, yaml.SafeLoader)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.geometry import centre, weak_perspective
+from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, lift_all
+from deep_nrsfm_ros.nrsfm.placement import lift_at_place
 from deep_nrsfm_ros.observations.answers import Answer
 from deep_nrsfm_ros.observations.detections import Detections, gather
 from deep_nrsfm_ros.observations.observation import Observation
@@ -42,14 +45,17 @@ def lift_recording(
     source: KeypointLayout,
     lifter: Lifter,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
+    intrinsics: Intrinsics | None = None,
 ) -> Recording:
     """Lift everyone in `seen`, whose keypoints are those of `source`.
 
-    Raises ValueError if too few of them are the model's.
+    intrinsics: of the camera, for the shapes to be at their place; None: they are centred. Raises
+    ValueError if too few of them are the model's.
     """
     target = lifter.model.layout
     points, confidence = KeypointMap(source, target)(seen.points, seen.confidence)
-    return Recording(source, target, seen, lift_all(lifter, points, confidence, on_progress))
+    lift = partial(lift_at_place, lifter, intrinsics) if intrinsics else lifter
+    return Recording(source, target, seen, lift_all(lift, points, confidence, on_progress))
 
 
 def lifted_before(

@@ -121,3 +121,39 @@ def test_has_the_options_of_the_lifter() -> None:
     for field, _, _ in options(LiftingOptions):
         assert f"--{field.name.replace('_', '-')}" in usage
     assert "--min-confidence" in usage and "--input-type" not in usage
+
+
+CAMERA = "k: [600, 0, 320, 0, 600, 240, 0, 0, 1]\nd: []\ndistortion_model: plumb_bob\n"
+
+
+def test_with_intrinsics_people_come_out_at_their_place(people: Path, tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    main(
+        [
+            *(str(people), "--keypoint-layout", "coco17", "--output", str(tmp_path / "out.npz")),
+            *("--intrinsics", str(tmp_path / "camera.yaml"), "--reference-length", "0.5"),
+        ]
+    )
+    with np.load(tmp_path / "out.npz") as file:
+        x, _, z = file["shapes"].mean(1).T
+        small = file["ids"][file["frame"] == 3].tolist().index("0")
+        here = np.flatnonzero(file["frame"] == 3)
+        # 60 pixels of 600 from shoulders to hips, 0.5 m apart: 0.5 * 600 / 60 m away.
+        np.testing.assert_allclose(z[file["frame"] < 3], 0.5 * 600 / 60, rtol=0.25)
+        assert (np.abs(x[file["frame"] < 3]) < 0.3).all()
+        assert z[here[small]] > 1.8 * z[here[1 - small]]  # 0.4 of the size, so much farther
+        assert x[here[small]] > 1
+
+
+def test_a_camera_file_that_says_nothing(
+    people: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "camera.yaml").write_text("name: mine")
+    with pytest.raises(SystemExit):
+        main(
+            [
+                *(str(people), "--keypoint-layout", "coco17", "--intrinsics"),
+                *(str(tmp_path / "camera.yaml"), "--output", str(tmp_path / "out.npz")),
+            ]
+        )
+    assert "neither k nor camera_matrix" in capsys.readouterr().err

@@ -71,9 +71,12 @@ def draw(
 
 
 def _fit(truth: Floats, shape: Floats) -> Floats:
-    """Return truth (j, 3) at the scale and centre of shape (j, 3)."""
+    """Return truth (j, 3) at the size and centre of shape (j, 3).
+
+    The scale of least squares would be near zero where a detector takes left for right.
+    """
     T, S = truth - truth.mean(0), shape - shape.mean(0)
-    fitted: Floats = T * ((S * T).sum() / (T * T).sum()) + shape.mean(0)
+    fitted: Floats = T * (np.linalg.norm(S) / np.linalg.norm(T)) + shape.mean(0)
     return fitted
 
 
