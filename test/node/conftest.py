@@ -38,6 +38,19 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 DEADLINE = 60.0
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+ENDINGS: dict[str, list[tuple[int, float]]] = defaultdict(list)
+"""Exit code and seconds from the signal to the end, of every lifter, by when the signal came."""
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Tell how soon lifters have ended: a figure that depends on what else the machine does."""
+    for when, ends in ENDINGS.items():
+        codes, seconds = zip(*ends, strict=True)
+        terminalreporter.write_line(
+            f"signals {when}: {len(ends)}, of which {codes.count(0)} ended the lifter with code 0; "
+            f"median {np.median(seconds):.2f} s, longest {max(seconds):.2f} s"
+        )
+
 
 @pytest.fixture
 def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
@@ -103,11 +116,13 @@ class LifterProcess:
             assert time.monotonic() < deadline, f"no {text!r} in the log: {self.log}"
             time.sleep(0.02)
 
-    def stop(self, number: signal.Signals) -> tuple[int, float]:
-        """Send a signal; return exit code and the seconds it took to end."""
+    def stop(self, number: signal.Signals, when: str) -> int:
+        """Send a signal; return the exit code. `when` is the line of the summary to count it in."""
         before = time.monotonic()
         self.process.send_signal(number)
-        return self.process.wait(DEADLINE), time.monotonic() - before
+        code = self.process.wait(DEADLINE)
+        ENDINGS[when].append((code, time.monotonic() - before))
+        return code
 
 
 @pytest.fixture
@@ -134,7 +149,7 @@ def start_lifter(
     for lifter in started:
         if lifter.process.poll() is None:
             try:
-                assert lifter.stop(signal.SIGINT)[0] == 0, lifter.log
+                assert lifter.stop(signal.SIGINT, "at the end of a test") == 0, lifter.log
             finally:
                 lifter.process.kill()
                 lifter.process.wait()
