@@ -47,6 +47,13 @@ NUMBERS = (0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e-45, 1e9, 3e38, 1e308, -1e
 WORDS = ("", "x", "y", "confidence", "a" * 300, "é\ud800", "../..", "\0", "%s{}", "nan", "1e999")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let the long form take its time."""
+    for item in items:
+        if LONG and "fuzz" in item.fixturenames:  # type: ignore[attr-defined]
+            item.add_marker(pytest.mark.timeout(0))
+
+
 class Spoiler(random.Random):
     """Spoils what is valid, in a way that follows from its seed."""
 
@@ -182,14 +189,17 @@ def fuzz(capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
 
     def run(name: str, one: Callable[[Spoiler], str], touched: bool = True) -> None:
         outcomes, faults, began = Counter[str](), list[str](), time.monotonic()
+        slowest = 0.0
         with _memory() as grown:
             for number in range(FIRST, FIRST + INPUTS):
+                before = time.thread_time()
                 try:
                     outcomes[one(Spoiler(number))] += 1
                 except Exception as problem:
                     faults.append(f"input {number} of {name}: {problem!r}")
                     if len(faults) == MOST_FAULTS or not LONG:
                         raise AssertionError("\n".join(faults)) from problem
+                slowest = max(slowest, time.thread_time() - before)
                 done = number + 1 - FIRST
                 if LONG and (done % SHOWN_EVERY == 0 or done == INPUTS):
                     said = ", ".join(f"{n} {what}" for what, n in outcomes.most_common())
@@ -197,7 +207,8 @@ def fuzz(capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
                         print(
                             f"\n{name}: {done} of {INPUTS} inputs in "
                             f"{time.monotonic() - began:.0f} s: {said}, {len(faults)} raised; "
-                            f"memory grew by {grown()[1]:.0f} MB",
+                            f"slowest {slowest:.2f} s of CPU time; memory grew by "
+                            f"{grown()[1]:.0f} MB",
                             end="",
                             flush=True,
                         )

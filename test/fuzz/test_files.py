@@ -9,7 +9,6 @@ from pathlib import Path
 
 import apsw
 import numpy as np
-import pytest
 
 from deep_nrsfm_ros.nrsfm.model_file import ModelFileError, load_model, save_model
 from deep_nrsfm_ros.nrsfm.object_file import ObjectFileError, read_object
@@ -24,8 +23,6 @@ YAML = (b"*a", b"&a", b"!!int ''", b"<<: ", b"[", b"{", b"? ", b": ", b"\n- ", b
         b"0x", b"2001-01-01", b"!!binary x", b".nan", b"1e999", b"~", b"|", b"\t")  # fmt: skip
 JSON = (b"[", b"{", b"]", b"}", b",", b":", b'"', b"NaN", b"1e999", b"-Infinity", b"null", b"\xff",
         b"[" * 3000, b'{"people": []}', b"9" * 5000)  # fmt: skip
-
-pytestmark = pytest.mark.timeout(0)
 
 
 def views(f: int, p: int) -> np.ndarray:

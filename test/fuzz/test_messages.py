@@ -30,8 +30,6 @@ BY_NAME = FieldMapping(
     names=("l", "r", "u", "f", "t", "e"),
 )
 
-pytestmark = pytest.mark.timeout(0)
-
 
 def points(p: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(50, 600, (p, 2))

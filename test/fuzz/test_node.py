@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 from rclpy.parameter import Parameter
 
 from deep_nrsfm_ros.configuration import options
@@ -30,8 +29,6 @@ from deep_nrsfm_ros.observations.messages import POINT_CLOUD
 
 PATHS = ("thing", "link", "link.safetensors", "/etc/passwd", "~", "~x/y.yaml", "coco17", "model",
          "thing.safetensors", "../" * 9, "numbered", "a.yaml", "x" * 5000)  # fmt: skip
-
-pytestmark = pytest.mark.timeout(0)
 
 
 def test_what_a_training_says_and_leaves_is_understood_or_not(fuzz, tmp_path):
