@@ -118,7 +118,7 @@ def test_bytes_on_the_wire_are_read_or_refused(bench, fuzz):
 
 
 def test_a_camera_info_is_used_or_refused(bench, fuzz):
-    pipeline, quick = bench.pipeline(), bench.pipeline(quick=True)
+    pipeline = bench.pipeline()
     p, f = len(bench.layout), 500.0
     cameras = [
         SimpleNamespace(
@@ -147,7 +147,7 @@ def test_a_camera_info_is_used_or_refused(bench, fuzz):
             assert str(refusal)
             return "refused"
         try:
-            bench.lift(quick, valid, POINT_CLOUD, intrinsics)
+            bench.lift(pipeline, valid, POINT_CLOUD, intrinsics)
             outcome = "lifted"
         except ValueError as refusal:
             assert str(refusal)
