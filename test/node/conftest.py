@@ -53,12 +53,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         )
 
 
-def cpu_seconds(pid: int) -> float:
-    """Return the CPU time of a process itself, which may be a zombie."""
-    words = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
-
-
 @pytest.fixture
 def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Give the test a DDS domain that no other test on this machine has."""
@@ -116,6 +110,12 @@ class LifterProcess:
     def log(self) -> str:
         return self._log.read_text()
 
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU time of the process itself, which may be a zombie."""
+        words = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
     def wait_for_log(self, text: str) -> None:
         deadline = time.monotonic() + DEADLINE
         while text not in self.log:
@@ -126,12 +126,12 @@ class LifterProcess:
     def stop(self, number: signal.Signals, when: str) -> int:
         """Send a signal; return the exit code. `when` is the line of the summary to count it in."""
         pid, before = self.process.pid, time.monotonic()
-        spent = cpu_seconds(pid)
+        spent = self.cpu_seconds
         self.process.send_signal(number)
         while not os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG):
             assert time.monotonic() < before + DEADLINE, f"still there: {self.log}"
             time.sleep(0.002)
-        seconds, work = time.monotonic() - before, cpu_seconds(pid) - spent
+        seconds, work = time.monotonic() - before, self.cpu_seconds - spent
         code = self.process.wait()
         ENDINGS[when].append((code, seconds, work))
         return code
