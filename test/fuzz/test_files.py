@@ -6,6 +6,7 @@ import gzip
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import apsw
 import numpy as np
@@ -81,12 +82,15 @@ def test_an_object_file_is_read_or_refused(fuzz, tmp_path):
 def test_a_mapping_file_is_read_or_refused_and_what_is_read_reads_messages(bench, fuzz, tmp_path):
     texts = [p.read_bytes() for p in (ROOT / "config" / "mappings").glob("*.yaml")]
     texts.append(
-        b"type: a/B\nobjects: height\nkeypoints: fields\nx: name\ny: width\nscore: offset\n"
-        b"keypoint_id: datatype\nfirst_id: 0\nmissing: -1\nunits: normalised\n"
+        b"type: a/B\nobjects: found\nobject_id: number\nkeypoints: joints\nx: place.u\ny: place.v\n"
+        b"score: sure\nkeypoint_id: which\nfirst_id: 0\nmissing: -1\nunits: pixels\n"
     )
     p, file = len(bench.layout), tmp_path / "mapping.yaml"
-    encoded = bags._ENCODERS[POINT_CLOUD](next(frames(views(1, p), np.ones((1, p)))))
-    some = bench.loose(encoded)
+    joints = [
+        SimpleNamespace(which=i, sure=0.9, place=SimpleNamespace(u=u, v=v))
+        for i, (u, v) in enumerate(views(1, p)[0].tolist())
+    ]
+    some = SimpleNamespace(found=[SimpleNamespace(number=7, joints=joints)])
     pipeline = bench.pipeline(quick=True)
 
     def one(spoiler) -> str:
