@@ -35,7 +35,7 @@ from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 
-DEADLINE = 60.0
+DEADLINE = float(os.environ.get("DEADLINE", "60"))  # seconds; a busy machine may want more
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 ENDINGS: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
