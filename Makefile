@@ -76,7 +76,7 @@ $(EXAMPLES_READY): $(READY)
 audit:
 	$(PYTHON3) -m venv build/audit
 	build/audit/bin/pip install --quiet pip-audit
-	build/audit/bin/pip-audit --requirement requirements.lock --no-deps --disable-pip
+	build/audit/bin/pip-audit --strict --requirement requirements.lock --no-deps --disable-pip
 
 # Left out: the CUDA wheels, which torch itself pins, on the machines that want them.
 lock:

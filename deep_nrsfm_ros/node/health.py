@@ -29,9 +29,9 @@ class Health:
 
     ERROR: messages came since the last report and none could be lifted, or there is a publisher
     that cannot be heard and nothing else to lift.
-    WARN: some messages could not be lifted; none has come for 3 s; half of the objects seen
-    since the last report fit the model worse than a reprojection error of 0.3; or half of them
-    have a confidence below 0.3.
+    WARN: some messages could not be lifted; none has come for 3 s; more were missed, having come
+    while others were lifted, than were lifted; half of the objects seen since the last report fit
+    the model worse than a reprojection error of 0.3; or half of them have a confidence below 0.3.
     OK: otherwise.
     """
 
@@ -42,11 +42,12 @@ class Health:
         self._seconds: list[float] = []
         self._errors: list[NDArray[np.float32]] = []
         self._confidences: list[NDArray[np.float32]] = []
-        self._rejected = self._empty = 0
+        self._rejected = self._empty = self._missed = 0
         self._unheard = ""
         self.total_lifted = 0
         self.total_empty = 0
         self.total_rejected = 0
+        self.total_missed = 0
         self.last_problem = ""
 
     @property
@@ -87,6 +88,11 @@ class Health:
         self.total_rejected += 1
         self.last_problem = reason
 
+    def missed(self, count: int) -> None:
+        """Count messages that were sent and never came."""
+        self._missed += count
+        self.total_missed += count
+
     def unheard(self, reason: str) -> None:
         """Remember that there is a publisher whose messages do not arrive, and why."""
         self._unheard = self.last_problem = reason
@@ -107,9 +113,10 @@ class Health:
             "messages lifted": str(self.total_lifted),
             "messages without objects": str(self.total_empty),
             "messages rejected": str(self.total_rejected),
+            "messages missed": str(self.total_missed),
             "last problem": self.last_problem or "none",
         }
-        self._last_report, self._rejected, self._empty = now, 0, 0
+        self._last_report, self._rejected, self._empty, self._missed = now, 0, 0, 0
         self._seconds.clear()
         self._errors.clear()
         self._confidences.clear()
@@ -125,6 +132,11 @@ class Health:
             return ERROR, self._unheard
         if silence > _SILENCE:
             return WARN, f"no keypoints for {silence:.0f} s"
+        if self._missed > (came := len(self._seconds) + self._empty):
+            return WARN, (
+                f"{self._missed} of {self._missed + came} messages missed: they come faster than "
+                "they are lifted; set turns to 1 or refill to 0, or send fewer"
+            )
         if error > _POOR_FIT:
             return WARN, f"poor fit: half of the reprojection errors are above {error:.2f}"
         if confidence < _UNSURE:

@@ -115,7 +115,8 @@ class LifterNode(Node):
             f"lifting with model {self._pipeline.model.name!r} {len(self._pipeline.source)} "
             f"keypoints in the order of {self._pipeline.source.name!r}"
         )
-        self._listener = Listener(self, self._inputs, self._lift, self._health.unheard)
+        health = self._health
+        self._listener = Listener(self, self._inputs, self._lift, health.unheard, health.missed)
 
     def close(self) -> None:
         """End a training that runs."""
@@ -260,7 +261,6 @@ def main() -> None:
     signals: list[int] = []
     for number in _ENDING:
         signal.signal(number, lambda number, _: signals.append(number))
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)  # scripts/lifter has held them back
     rclpy.init()
     try:
         if not signals:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,6 +13,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
+from deep_nrsfm_ros.node.gaps import Gaps
 from deep_nrsfm_ros.node.message_types import message_class
 from deep_nrsfm_ros.node.pipeline import AUTO, InputOptions
 from deep_nrsfm_ros.observations.messages import INPUT_TYPES, InputType, find_input, name_of
@@ -33,6 +34,7 @@ class Source:
     topic: str
     input_type: InputType
     tracker: Tracker
+    gaps: Gaps
 
 
 class Listener:
@@ -44,13 +46,16 @@ class Listener:
         inputs: InputOptions,
         on_message: Callable[[Source, Any], None],
         on_trouble: Callable[[str], None],
+        on_missed: Callable[[int], None],
     ) -> None:
         """Listen to what is known by now; call `look` now and then for the rest.
 
-        on_trouble: is told of publishers that cannot be heard, and of the mend. Raises ValueError
-        if the type of the messages is none, or its package is not here.
+        on_trouble: is told of publishers that cannot be heard, and of the mend. on_missed: is told
+        how many messages have not come since the last `look`. Raises ValueError if the type of
+        the messages is none, or its package is not here.
         """
         self._node, self._on_message, self._on_trouble = node, on_message, on_trouble
+        self._on_missed = on_missed
         self._log = node.get_logger()
         self._type: InputType | None = None
         if inputs.input_type != AUTO:
@@ -75,10 +80,13 @@ class Listener:
         return ", ".join(f"{s.topic} ({name_of(s.input_type)})" for s in sources) or "none yet"
 
     def look(self, *, idle: bool) -> None:
-        """Find topics that have come and gone, and their types. Call it once a second.
+        """Find what was missed, and topics that have come and gone. Call it once a second.
 
         idle: nothing has come lately, so see if there are publishers that cannot be heard.
         """
+        for source, _ in self._heard.values():
+            there = self._node.get_publishers_info_by_topic(source.topic)
+            self._on_missed(source.gaps.missed(bytes(one.endpoint_gid) for one in there))
         for pattern in self.topics:
             if WILDCARD in pattern:
                 for topic in self._matching(pattern):
@@ -136,11 +144,11 @@ class Listener:
         names = [match(pattern, topic) for pattern in self.topics]
         several = len(self.topics) > 1
         name = next(filter(None, names), topic.strip("/") if several else "")
-        source = Source(topic, input_type, Tracker(name))
+        source = Source(topic, input_type, Tracker(name), Gaps())
         subscription = self._node.create_subscription(
             message_class(name_of(input_type)),
             topic,
-            partial(self._on_message, source),
+            partial(self._take, source),
             SENSOR_INPUT,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=partial(self._mend_qos, topic)
@@ -152,6 +160,11 @@ class Listener:
         )
         self._heard[topic] = source, subscription
         self._log.info(f"listening to {topic} ({name_of(input_type)})")
+
+    def _take(self, source: Source, message: Any, info: Mapping[str, Any]) -> None:
+        """Pass a message on."""
+        source.gaps.came(info["publication_sequence_number"])
+        self._on_message(source, message)
 
     def _leave(self, topic: str) -> None:
         """Listen to a topic no longer."""

@@ -21,6 +21,7 @@ ENDED = ("finished", "failed", "cancelled")
 TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
 
 _LAST_WORDS = 10
+_DYING = 0.5  # seconds that a process has to die of SIGKILL
 _NICENESS = 10  # a tenth of the share of others; at 19 it gets nothing on a busy machine
 _LINE_LIMIT = 65536
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -100,12 +101,15 @@ class TrainingJob:
         threading.Thread(target=self._kill_late, daemon=True).start()
 
     def close(self, timeout: float) -> None:
-        """Cancel and return when the process is gone; kill it after `timeout` seconds."""
+        """Cancel and return when the process is gone; kill it after `timeout` seconds.
+
+        One that a disk or a driver holds dies when that lets go of it: nobody waits for it here.
+        """
         self.cancel()
         self._watcher.join(timeout)
         if self.running:
             self._signal(signal.SIGKILL)
-            self._watcher.join()
+            self._watcher.join(_DYING)
 
     def _kill_late(self) -> None:
         """Kill a process that outlives its grace."""

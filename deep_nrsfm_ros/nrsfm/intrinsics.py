@@ -59,9 +59,11 @@ class Intrinsics:
         (..., 2): x right, y down; NaN where no ray in front of the camera leads to the pixel.
         """
         bent = (np.asarray(pixels, np.float64) - self.principal) / self.focal
-        if self.lens == EQUIDISTANT:
-            return self._unbend_fisheye(bent)
-        return self._unbend(bent) if any(self.distortion) else bent
+        if self.lens != EQUIDISTANT and not any(self.distortion):
+            return bent
+        # With coefficients that no lens has the search may go to infinity, and ends in NaN.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (self._unbend_fisheye if self.lens == EQUIDISTANT else self._unbend)(bent)
 
     def pixels(self, rays: NDArray[np.floating]) -> Array:
         """Return the pixels (..., 2) of rays through (x, y, 1): the inverse of `rays`."""

@@ -25,6 +25,7 @@ _FORMAT = "deep_nrsfm_ros model 2"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _MAX_BYTES = 64 * 2**20
 _MAX_HEADER = 2**20
+_LARGEST = 1e9  # no weight of a trained model comes near; products of them stay finite
 
 
 class ModelFileError(ValueError):
@@ -135,12 +136,17 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
     for name, shape in shapes.items():
         found = weights[name]
-        if found.shape != shape or found.dtype != np.float32 or not np.isfinite(found).all():
+        if found.shape != shape or found.dtype != np.float32:
             raise ValueError(
-                f"weight {name} is {found.dtype} {found.shape}; it must be float32 {shape}, finite"
+                f"weight {name} is {found.dtype} {found.shape}; it must be float32 {shape}"
             )
-    frame = np.array(header["object_frame"], np.float32)
-    if frame.shape != (3, 3) or not np.abs(frame @ frame.T - np.eye(3)).max() < 1e-3:
+        if not (np.abs(found) < _LARGEST).all():  # NaN compares false
+            raise ValueError(f"weight {name} has a number that is not below {_LARGEST:g}")
+    frame = np.array(header["object_frame"], np.float64)
+    # NaN and what would overflow compare false.
+    if frame.shape != (3, 3) or not (np.abs(frame) < 2).all():
+        raise ValueError("object_frame is not orthonormal (3, 3)")
+    if not np.abs(frame @ frame.T - np.eye(3)).max() < 1e-3:
         raise ValueError("object_frame is not orthonormal (3, 3)")
     covariance = weights["error_covariance"]
     if not (np.abs(covariance - covariance.T) <= 1e-5 * np.trace(covariance)).all():
@@ -152,7 +158,7 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
         Network.from_named(architecture, weights),
         layout,
         normaliser,
-        frame,
+        frame.astype(np.float32),
         dict(header["provenance"]),
         dict(header["quality"]),
         covariance,

@@ -78,7 +78,8 @@ class FieldMapping:
                 "image_width and image_height"
             )
         if self.units == NORMALISED:
-            values[..., :2] *= np.array(size)
+            with np.errstate(over="ignore"):  # what is farther than any image counts as missing
+                values[..., :2] *= np.array(size)
         return values, tuple(ids)
 
     def count(self, message: Any) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -26,6 +27,8 @@ KINDS = (
     "a bag (folder, .db3 or .mcap), an .npz with `points`, COCO keypoints (.json), a folder of "
     "OpenPose .json files, or OpenPose frames as .jsonl (.jsonl.gz)"
 )
+
+_MOST_EMPTY = 1_000_000  # nine hours at 30 Hz
 
 
 class KeypointFileError(ValueError):
@@ -77,8 +80,10 @@ def read_keypoints(
                 one = [(path.name, path.read_bytes())]
                 return _openpose(one, 1, keypoints, rate, min_confidence, on_progress)
             return _coco(content, keypoints, rate, min_confidence)
-    except (ValueError, EOFError, OSError) as error:
+    except (ValueError, TypeError, ArithmeticError, EOFError, OSError, zlib.error) as error:
         raise KeypointFileError(f"{path}: {error}") from None
+    except (MemoryError, RecursionError) as error:
+        raise KeypointFileError(f"{path} asks for more than there is: {error!r}") from None
     raise KeypointFileError(f"{path} is of no known kind; expected {KINDS}")
 
 
@@ -176,7 +181,9 @@ def _coco(content: Any, keypoints: int, rate: float, min_confidence: float) -> D
                 f"keypoint layout has {keypoints}: name the layout in which they were written"
             )
     images = content.get("images") if isinstance(content, dict) else None
-    names = [image["id"] for image in images] if images else []
+    names = [image.get("id") for image in images or () if isinstance(image, dict)]
+    if not all(isinstance(name, (int, str)) for name in [*names, *(r["image_id"] for r in rows)]):
+        raise KeypointFileError("`id` of an image or `image_id` is neither a number nor a text")
     names = list(dict.fromkeys([*names, *sorted((row["image_id"] for row in rows), key=_natural)]))
     frames = {name: frame for frame, name in enumerate(names)}
     by_frame: list[list[Mapping[str, Any]]] = [[] for _ in names]
@@ -197,8 +204,11 @@ def _people(
 
 def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Detections:
     """Return the objects of arrays: see README, "Files instead of topics"."""
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
+        raise KeypointFileError(f"damaged or no .npz file: {error!r}") from error
     if "points" not in arrays:
         raise KeypointFileError(
             f"no array `points` (objects, {keypoints}, 2); there are: {', '.join(arrays) or 'none'}"
@@ -217,12 +227,19 @@ def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Dete
     count = int(frame.max(initial=-1)) + 1
     if m and int(frame.min()) < 0:
         raise KeypointFileError(f"`frame` has {frame.min()}; frames are counted from 0")
+    if count > m + _MOST_EMPTY:
+        raise KeypointFileError(
+            f"`frame` goes to {count - 1} with {m} objects; at most {_MOST_EMPTY} frames may show "
+            "nobody"
+        )
     if "stamps" in arrays:
         count = max(count, len(arrays["stamps"]))
         stamps = _numbers(arrays, "stamps", np.int64, (count,))
     else:
         stamps = stamps_at(rate, count)
     ids = arrays.get("ids", _places(frame)).astype(str)
+    if ids.shape != (m,):
+        raise KeypointFileError(f"`ids` is {ids.shape}; ({m},) is needed")
     seen = observation(points, min_confidence)
     order = np.argsort(frame, kind="stable")
     return Detections(seen.points[order], seen.confidence[order], frame[order], ids[order], stamps)
@@ -239,6 +256,8 @@ def _numbers(
     if array.dtype.kind not in "fiu" or shape is not None and array.shape != shape:
         wanted = "of numbers" if shape is None else f"of numbers {shape}"
         raise KeypointFileError(f"`{name}` is {array.dtype} {array.shape}; {wanted} is needed")
+    if kind is np.int64 and not (np.abs(array) < 2**63).all():
+        raise KeypointFileError(f"`{name}` has a number that is no whole one of 64 bits")
     return array.astype(kind)
 
 
@@ -255,4 +274,4 @@ def _natural(name: Any) -> list[tuple[int, int, str]]:
     """Return what sorts names as people do: frame_2 before frame_10."""
     text = name.name if isinstance(name, Path) else str(name)
     parts = re.split(r"(\d+)", text)
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts if p]
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p]

@@ -21,7 +21,7 @@ def read_people(text: str | bytes, keypoints: int, min_confidence: float = 0.0) 
     try:
         frame: Mapping[str, Any] = json.loads(text)
         rows = [np.asarray(p["pose_keypoints_2d"], np.float64) for p in frame["people"]]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise ValueError(f"not a frame of OpenPose JSON: {error!r}") from None
     for row in rows:
         if row.shape != (3 * keypoints,):

@@ -116,3 +116,15 @@ def test_idle_tells_whether_anything_came(health):
     assert not health.idle
     health.report()
     assert health.idle
+
+
+def test_more_missed_than_lifted_is_a_warning_with_the_mend(health):
+    health.lifted(0.01, np.array([0.1], np.float32), np.array([0.9], np.float32))
+    health.missed(1)
+    assert health.report().level == OK
+    health.lifted(0.01, np.array([0.1], np.float32), np.array([0.9], np.float32))
+    health.missed(2)
+    level, message, values = health.report()
+    assert level == WARN and message.startswith("2 of 3 messages missed") and "turns" in message
+    assert values["messages missed"] == "3"
+    assert health.report().level == OK

@@ -369,7 +369,5 @@ def test_signals_end_it_cleanly(start_lifter, connect, number):
     client = connect()
     client.exchange(client.publisher(PointCloud2), cloud(pixels(1)))
     lifter.process.send_signal(number)  # a launcher and the terminal both send one
-    code, seconds = lifter.stop(number)
-    assert code == 0, lifter.log
+    assert lifter.stop(number, "twice while lifting") == 0, lifter.log
     assert "Traceback" not in lifter.log
-    assert seconds < 10  # about 0.1 s on an idle machine

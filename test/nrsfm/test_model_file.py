@@ -145,7 +145,7 @@ def test_rewriting_alone_does_no_harm(file: Path) -> None:
 
 
 @pytest.mark.parametrize("weight", ["D.0", "D.1", "b.0", "b_.1", "camera_head", "L"])
-@pytest.mark.parametrize("kind", ["nan", "infinite", "shape", "missing", "float64", "int"])
+@pytest.mark.parametrize("kind", ["nan", "infinite", "huge", "shape", "missing", "float64", "int"])
 def test_weights_are_checked(file: Path, weight: str, kind: str) -> None:
     def change(header: Any, weights: dict[str, np.ndarray], metadata: Any) -> None:
         if kind == "missing":
@@ -155,7 +155,7 @@ def test_weights_are_checked(file: Path, weight: str, kind: str) -> None:
         elif kind in ("float64", "int"):
             weights[weight] = weights[weight].astype(kind)
         else:
-            weights[weight].flat[-1] = {"nan": np.nan, "infinite": -np.inf}[kind]
+            weights[weight].flat[-1] = {"nan": np.nan, "infinite": -np.inf, "huge": 3e38}[kind]
 
     rewrite(file, change)
     assert weight in refused(file)

@@ -18,6 +18,7 @@ from deep_nrsfm_ros.observations.messages import MULTI_ARRAY
 from deep_nrsfm_ros.observations.observation import observation
 
 Q = len(COCO17)
+PERSON = json.dumps({"image_id": 5, "keypoints": [0] * 3 * Q})
 COUNTS = (1, 0, 2, 3, 1)  # objects in each frame
 
 
@@ -153,6 +154,9 @@ def test_low_confidence_is_missing(tmp_path: Path, seen: Detections) -> None:
         ({"points": np.array([None])}, "a.npz: .*pickle"),
         ({"points": np.zeros((4, 17, 2)), "confidence": np.zeros(4)}, r"`confidence` is .*\(4,\)"),
         ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, -1])}, "counted from 0"),
+        ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, 2**60])}, "at most 1000000 frames"),
+        ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, np.nan])}, "no whole one"),
+        ({"points": np.zeros((2, 17, 2)), "ids": np.array(["a"])}, r"`ids` is \(1,\); \(2,\)"),
         ({"points": np.zeros((2, 17, 2)), "stamps": np.zeros(1)}, r"`stamps` is .* \(2,\)"),
     ],
 )
@@ -173,6 +177,11 @@ def test_wrong_arrays_are_named(tmp_path: Path, arrays: dict[str, Any], expected
         ("a.json", '[{"image_id": 5, "keypoints": [1, 2, 3]}]', "image 5 has 1 keypoints.*has 17"),
         ("a.json", '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}', "1 keypoints; expected 17"),
         ("a.jsonl", '{"people": []}\n{"persons": []}', "a.jsonl: line 2: not a frame"),
+        ("a.json", f'{{"images": [{{}}], "annotations": [{PERSON}]}}', "`id` of an image"),
+        ("a.json", f"[{PERSON.replace('5', '[5]')}]", "`image_id` is neither"),
+        ("a.json", f"[{PERSON.replace('[0,', '[{},', 1)}]", "a.json: .*dict"),
+        pytest.param("a.json", "[" * 100_000, "asks for more .* Recursion", id="deep json"),
+        pytest.param("a.jsonl", "[" * 100_000, "line 1: not a frame", id="deep jsonl"),
         ("a.jsonl", "", "is empty"),
         ("a.jsonl.gz", "no gzip", "a.jsonl.gz: "),
         ("a.npz", "no zip", "a.npz: "),

@@ -1,0 +1,102 @@
+"""What others set and say: parameters are accepted or refused, a training is understood or not."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from rclpy.parameter import Parameter
+
+from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.node import parameters as ros_parameters
+from deep_nrsfm_ros.node.fence import Fence
+from deep_nrsfm_ros.node.lifter import LifterNode
+from deep_nrsfm_ros.node.parameters import name_of
+from deep_nrsfm_ros.node.pipeline import InputOptions, Pipeline
+from deep_nrsfm_ros.node.training_job import parse_progress
+from deep_nrsfm_ros.node.training_request import TrainingOptions, fenced
+from deep_nrsfm_ros.node.unfinished import look, record_file
+from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
+from deep_nrsfm_ros.nrsfm.limits import Limits
+from deep_nrsfm_ros.nrsfm.model_file import save_model
+from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
+from deep_nrsfm_ros.observations import bags
+from deep_nrsfm_ros.observations.bags import frames
+from deep_nrsfm_ros.observations.curation import Curation
+from deep_nrsfm_ros.observations.messages import POINT_CLOUD
+
+PATHS = ("thing", "link", "link.safetensors", "/etc/passwd", "~", "~x/y.yaml", "coco17", "model",
+         "thing.safetensors", "../" * 9, "numbered", "a.yaml", "x" * 5000)  # fmt: skip
+
+
+def test_what_a_training_says_and_leaves_is_understood_or_not(fuzz, tmp_path):
+    line = b'{"state": "training", "step": 3, "steps": 9, "loss": 0.5, "seconds_left": 7, "a": [1]}'
+
+    def one(spoiler) -> str:
+        text = spoiler.spoil_bytes(line)
+        text = text if spoiler.random() < 0.9 else b"[" * spoiler.randrange(60000)
+        record_file(tmp_path, "mine").write_bytes(text)
+        progress, found = parse_progress(text.decode(errors="replace")), look(tmp_path, "mine")
+        assert found is None or str(found) and found.advice
+        return "progress" if progress else "words"
+
+    fuzz("training", one)
+
+
+def test_parameters_are_accepted_or_refused_and_leave_no_trace(bench, fuzz, tmp_path):
+    """As the lifter considers them, and as it makes a training request of them."""
+    save_model(tmp_path / "thing.safetensors", bench.model)
+    (tmp_path / "link.safetensors").symlink_to("/etc/passwd")
+    inputs = InputOptions(model="thing", models_dir=str(tmp_path), bags_dir=str(tmp_path))
+    stub = SimpleNamespace(get_parameter_or=lambda name, default: default)
+    stub._fence = Fence(tmp_path, tmp_path, ["thing"])
+    stub._pipeline = Pipeline(bench.model, None, inputs, LiftingOptions(), SteadyingOptions())
+    stub._prepare = lambda changes: LifterNode._prepare(stub, changes)
+    p = len(bench.layout)
+    points = np.random.default_rng(0).uniform(50, 600, (1, p, 2))
+    valid = bags._ENCODERS[POINT_CLOUD](next(frames(points, np.ones((1, p)))))
+    expected = bench.lift(stub._pipeline, valid, POINT_CLOUD)
+    known = [(c, "") for c in (InputOptions, LiftingOptions)]
+    known += [(c, "train.") for c in (TrainingOptions, Recipe, Limits, Curation)]
+    known += [(SteadyingOptions, "steady.")]
+    defaults = [(name_of(f, prefix), f.default) for c, prefix in known for f, _, _ in options(c)]
+
+    def value(spoiler, default: Any) -> Any:
+        if isinstance(default, bool):
+            return spoiler.random() < 0.5
+        if isinstance(default, int):
+            return max(-(2**63), min(spoiler.choice(spoiler.sizes), 2**63 - 1))
+        if isinstance(default, float):  # of dynamic type
+            return spoiler.choice((*spoiler.numbers, 0.5, 3, -1, True, "x", ["x"]))
+        bits = (*spoiler.words, *PATHS)
+        words = [
+            spoiler.choice(("", "/")).join(spoiler.choices(bits, k=spoiler.choice((1, 1, 2, 3))))
+            for _ in range(spoiler.randrange(1, 4))
+        ]
+        return words if isinstance(default, tuple) else words[0]
+
+    def one(spoiler) -> str:
+        chosen = spoiler.choices(defaults, k=spoiler.choice((1, 1, 2, 5)))
+        changes = [Parameter(name, value=value(spoiler, default)) for name, default in chosen]
+        result = LifterNode._consider(stub, changes)
+        assert result.successful != bool(result.reason)
+        assert "internal error" not in result.reason, result.reason
+        given = {change.name: change.value for change in changes}
+        stub.get_parameter_or = lambda name, default: (
+            Parameter(name, value=given[name]) if name in given else default
+        )
+        try:
+            fenced(ros_parameters.read(stub, TrainingOptions, "train."), stub._fence)
+        except (ValueError, OSError) as refusal:
+            assert str(refusal)
+        finally:
+            stub.get_parameter_or = lambda name, default: default
+        if spoiler.random() < 0.02:
+            again = bench.lift(stub._pipeline, valid, POINT_CLOUD)
+            for old, new in zip(expected, again, strict=True):
+                np.testing.assert_array_equal(old, new)
+        return "accepted" if result.successful else "refused"
+
+    fuzz("parameters", one)
