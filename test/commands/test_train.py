@@ -502,6 +502,25 @@ def test_what_the_data_was_spared_is_said_and_an_option_turns_it_off(
     assert load_model(tmp_path / "mine.safetensors").provenance["frames"] == 120
 
 
+def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(train, "stop_with_parent", lambda stopped: stopped)
+    words = (*arguments, "--steps", "3")
+    for told in ("", "no depth in mine"):
+        monkeypatch.setattr(train, "doubt", lambda model, ensemble, told=told: told)
+        assert in_process(*words, "--json-progress") == 0
+        *_, end = map(json.loads, capsys.readouterr().out.splitlines())
+        assert (end["state"], end.get("warning", "")) == ("finished", told)
+        assert ("no depth in mine" in (models / "mine.html").read_text()) == bool(told)
+    assert in_process(*words) == 0
+    assert "warning: no depth in mine" in capsys.readouterr().err
+
+
 def test_a_report_that_cannot_be_written_costs_no_model(
     arguments: list[str],
     models: Path,
