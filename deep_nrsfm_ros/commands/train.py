@@ -253,12 +253,12 @@ def learn(
     """Train on what `run` has read and save the model with its report."""
     ensemble = curated.ensemble
     if ensemble.layout.warning and not start:
-        report.say(ensemble.layout.warning)
+        report.warn(ensemble.layout.warning)
     network = start_from(start, ensemble.layout) if start else None
     seen = ensemble.visible.sum(0)
     unseen = [name for i, name in enumerate(ensemble.layout.keypoints) if not seen[i]]
     if unseen:
-        report.say(f"no frame shows {', '.join(unseen)}: the model will only guess them")
+        report.warn(f"no frame shows {', '.join(unseen)}: the model will only guess them")
     report.say(f"{len(ensemble)} frames of {len(ensemble.layout)} keypoints ({ensemble.source})")
     import torch  # seconds to import: bad arguments should not wait for it
 

@@ -419,6 +419,7 @@ def test_points_that_nobody_described_are_numbered(
     assert not model.layout.edges
     said = capsys.readouterr().err
     assert "'points5' names no handedness: depth may come out mirrored as a whole" in said
+    assert "names no handedness" in (models / "mine.html").read_text()
 
 
 def test_it_goes_on_from_another_model(
