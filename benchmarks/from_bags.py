@@ -254,7 +254,7 @@ def _served(session: Session, title: str, bag: Path, options: Mapping[str, str])
                 while client.training["state"] not in ENDED:
                     client.wait_a_second()
                     if client.training["state"] == "training":
-                        bar.update(int(client.training["step"]) - bar.n)
+                        bar.update(int(client.training.get("step", bar.n)) - bar.n)
             if client.training["state"] != "finished":
                 raise DemoError(client.training["message"])
     return load_model(path)

@@ -56,9 +56,9 @@ def disagreement(S: Floats, layout: KeypointLayout, seen: NDArray[np.bool_] | No
         return ""
     told = ", ".join(f"{front} in {100 * share:.0f} %" for front, share in shares)
     return (
-        "the keypoints disagree on where the front is, so that depth is wrong in part: "
-        f"{told} of the frames is on the right side; record the object from more sides, or start "
-        "from a model that knows it (--from, train.from)"
+        f"the keypoints disagree on where the front is, so that depth is wrong in part ({told} of "
+        "the frames where it belongs); record the object from more sides, or start from a model "
+        "that knows it (--from, train.from)"
     )
 
 

@@ -149,7 +149,7 @@ def test_from_bag_to_model(
     assert states[-1] == "finished" and [*dict.fromkeys(states)] == [
         s for s in order if s in states
     ]
-    progress = [line for line in lines if line["state"] == "training"]
+    progress = [line for line in lines if line["state"] == "training" and "step" in line]
     assert (progress[-1]["step"], progress[-1]["steps"]) == (30, 30)
     for field in ("loss", "cycle_error", "coherence", "seconds_left"):
         assert isinstance(progress[-1][field], float)

@@ -168,7 +168,7 @@ def test_a_part_that_is_on_the_wrong_side_is_named_with_its_share() -> None:
     assert disagreement(few, HUMAN17) == ""
     most = np.concatenate([behind(S[:48], "nose"), S[48:]])
     said = disagreement(most, HUMAN17)
-    assert "depth is wrong in part: nose in 4 %, left_knee in 100 %" in said
+    assert "depth is wrong in part (nose in 4 %, left_knee in 100 %" in said
     assert disagreement(most @ rotations(50, np.random.default_rng(0)), HUMAN17) == said
     assert disagreement(most, KeypointLayout.numbered(len(HUMAN17))) == ""
 
