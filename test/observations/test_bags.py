@@ -90,7 +90,7 @@ def test_progress_counts_to_the_total(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", TOPIC, frames(*detections(600)))
     seen: list[tuple[int, int]] = []
     read_bags([tmp_path / "bag"], "", BODY25, BODY25, on_progress=lambda *p: seen.append(p))
-    assert seen == [(256, 600), (512, 600)]
+    assert seen == [(256, 600), (512, 600), (600, 600)]
 
 
 def test_low_confidence_is_missing(tmp_path: Path) -> None:
