@@ -2,7 +2,7 @@
 
 from glob import glob
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
 
 NAME = "deep_nrsfm_ros"
 SHARE = f"share/{NAME}"
@@ -14,7 +14,19 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]},
+    package_data={
+        NAME: ["py.typed", "nrsfm/*.pyi", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]
+    },
+    # Optional: without a C compiler the lifter does the same in NumPy, some ten times slower.
+    ext_modules=[
+        Extension(
+            f"{NAME}.nrsfm._kernel",
+            glob(f"{NAME}/nrsfm/kernel/*.c"),
+            depends=glob(f"{NAME}/nrsfm/kernel/*.h"),
+            extra_compile_args=["-O3", "-fno-math-errno", "-fno-trapping-math"],
+            optional=True,
+        )
+    ],
     # data_files, because `pip install` ignores setup.cfg's install_scripts and `ros2 run` needs
     # the executables in lib/deep_nrsfm_ros.
     data_files=[

@@ -16,9 +16,10 @@ from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.node.model_folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.confidence import CALIBRATED, NEAR, Calibration, evidence
+from deep_nrsfm_ros.nrsfm.fitting import Constants, Fit, Float32
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 from deep_nrsfm_ros.nrsfm.keypoints import BODY25B, KeypointMap
-from deep_nrsfm_ros.nrsfm.lifting import Float32, Lifter, lift_all
+from deep_nrsfm_ros.nrsfm.lifting import Lifter, lift_all
 from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.observations.pose2sim import JOINTS, read_session
 
@@ -66,12 +67,12 @@ class Rated(NamedTuple):
     evidence: Floats  # (n, k, 5) what the log odds are a sum of, in the order of `Calibration`
 
 
-class Witness(Lifter):
-    """A lifter that keeps the evidence (n, p, 5) of what it has lifted, a part for each call."""
+class Witness(Fit):
+    """Keeps the evidence (n, p, 5) of what it has lifted, a part for each call."""
 
-    def __init__(self, model: Model) -> None:
-        """Take the model as shipped."""
-        super().__init__(model)
+    def __init__(self, known: Constants) -> None:
+        """Take what a lifter knows."""
+        super().__init__(known)
         self.kept: list[Floats] = []
 
     def sure(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
@@ -81,9 +82,18 @@ class Witness(Lifter):
         self.kept.append(np.concatenate([known, ~visible[..., None]], 2))
         return super().sure(confidence, residual, S)
 
+
+class Observed(Lifter):
+    """A lifter as shipped, with a witness."""
+
+    def __init__(self, model: Model) -> None:
+        """Take the model."""
+        super().__init__(model)
+        self.fit = self.witness = Witness(self.constants)
+
     def take(self) -> Floats:
-        """Return what was kept since the last time."""
-        kept, self.kept = np.concatenate(self.kept), []
+        """Return the evidence that was kept since the last time."""
+        kept, self.witness.kept = np.concatenate(self.witness.kept), []
         return kept
 
 
@@ -91,7 +101,7 @@ def benchmark(session: Session) -> Table:
     """Fit the calibration to the first subject and rate it on the others and on real detections."""
     fitted_to, *others = session.subjects
     folders = model_folders(default_models_dir())
-    lifters = [Witness(load_model(find_model(name, folders))) for name in MODELS]
+    lifters = [Observed(load_model(find_model(name, folders))) for name in MODELS]
     fitted = fit([on_mocap(session, lifter, fitted_to, 0) for lifter in lifters])
     table = Table(
         "reliability",
@@ -116,7 +126,7 @@ def benchmark(session: Session) -> Table:
     return table
 
 
-def on_mocap(session: Session, lifter: Witness, subject: str, seed: int) -> Rated:
+def on_mocap(session: Session, lifter: Observed, subject: str, seed: int) -> Rated:
     """Lift a subject's frames, seen and spoiled at random, and compare with the truth."""
     layout, rng = lifter.model.layout, np.random.default_rng(seed)
     stride = session.stride if session.stride > 1 else STRIDE
@@ -141,7 +151,7 @@ def seen(truth: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Float
     return T, W.astype(np.float32), visible.astype(np.float32)
 
 
-def on_detections(lifter: Witness, wheel: Path) -> Rated:
+def on_detections(lifter: Observed, wheel: Path) -> Rated:
     """Lift the real detections of the four pose2sim cameras and compare with the truth."""
     to_model = KeypointMap(BODY25B, lifter.model.layout)
     limbs = np.array([lifter.model.layout.index(joint) for joint in JOINTS])
@@ -154,7 +164,7 @@ def on_detections(lifter: Witness, wheel: Path) -> Rated:
 
 
 def rated(
-    lifter: Witness, points: Floats, confidence: Floats, truth: Floats, which: NDArray[np.int64]
+    lifter: Observed, points: Floats, confidence: Floats, truth: Floats, which: NDArray[np.int64]
 ) -> Rated:
     """Lift points (n, p, 2) and compare k of them with the truth (n, k, 3), in camera axes."""
     lifted = lift_all(lifter, points, confidence)
@@ -222,7 +232,7 @@ def draw(table: Table, figure: Figure) -> None:
     left.legend(fontsize="small")
 
 
-def _add(table: Table, lifter: Witness, on: str, found: Rated) -> None:
+def _add(table: Table, lifter: Observed, on: str, found: Rated) -> None:
     for label, figures in reliability(found.confidence, found.error):
         table.add((lifter.model.name, on, label), figures)
 

@@ -35,12 +35,7 @@ OBJECTS = (1, 5, 20)
 STEPS: dict[str, tuple[tuple[Any, str], ...]] = {
     "read": ((pipeline, "read"),),
     "map": ((KeypointMap, "__call__"),),
-    "normalise, complete": ((lifting, "observe"),),
-    "network": ((lifting, "reconstruct"),),
-    "turn and average": ((lifting.Lifter, "_average"),),
-    "correct": ((lifting, "correct"),),
-    "confidence": ((lifting.Lifter, "sure"),),
-    "scale, place, check": ((lifting.Lifter, "__call__"),),
+    "lift": ((lifting.Lifter, "__call__"),),
     "steady (off)": ((Steadying, "__call__"),),
     "build": ((publishing.PointCloud, "fill"), (publishing, "camera_rotation")),
 }

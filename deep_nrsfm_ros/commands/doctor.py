@@ -113,6 +113,7 @@ def check_model(name: str, models_dir: Path) -> Finding:
     import numpy as np
 
     from deep_nrsfm_ros.node.model_folders import model_folders
+    from deep_nrsfm_ros.nrsfm import compiled
     from deep_nrsfm_ros.nrsfm.lifting import Lifter
     from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
 
@@ -127,7 +128,11 @@ def check_model(name: str, models_dir: Path) -> Finding:
     lifted = Lifter(model)(points, np.ones((1, p), np.float32))
     if not np.isfinite(lifted.shapes).all():
         return Finding(f"{path} lifts to what is no number", mend)
-    return Finding(f"{path} of {p} keypoints lifts")
+    seen = f"{path} of {p} keypoints lifts"
+    if not compiled.AVAILABLE:
+        mend = "install a C compiler (apt-get install gcc python3-dev), then the package anew"
+        return Finding(f"{seen}, but in NumPy: ten times slower", mend, fatal=False)
+    return Finding(f"{seen}, compiled")
 
 
 def check_bags() -> Finding:

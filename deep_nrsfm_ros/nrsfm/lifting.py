@@ -1,4 +1,4 @@
-"""Lifting: 2D keypoints of n objects to 3D shapes and camera rotations, in NumPy alone."""
+"""Lifting: 2D keypoints of n objects to 3D shapes and camera rotations, without torch."""
 
 from __future__ import annotations
 
@@ -10,27 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.nrsfm.confidence import near
-from deep_nrsfm_ros.nrsfm.correction import correct
-from deep_nrsfm_ros.nrsfm.geometry import (
-    centre,
-    on_one_line,
-    polar,
-    reprojection_error,
-    rotation_from_camera,
-    weak_perspective,
-)
+from deep_nrsfm_ros.nrsfm.compiled import Kernel, fits
+from deep_nrsfm_ros.nrsfm.fitting import Constants, Fit, Float32
 from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.nrsfm.network import reconstruct
-from deep_nrsfm_ros.nrsfm.normaliser import observe
 
-Float32 = NDArray[np.float32]
-
-# The mirror image of an object, whose y axis points to its left, and of an image.
-_ACROSS = np.array([1, -1, 1], np.float32)
 _BLOCK = 64  # objects lifted together by `lift_all`
-_NEAREST = np.float32(0.1)  # depth of a point, relative to its object's, that is not undercut
-_RESIDUAL_SPREAD = 0.02  # squared residual by which a turn loses all but 1/e of its weight
 
 
 @dataclass(frozen=True)
@@ -106,19 +90,8 @@ class Lifter:
         """Take the model with `options` (all defaults if None)."""
         self.model = model
         self.options = options or LiftingOptions()
-        pair = model.layout.reference
-        angles = 2 * np.pi * np.arange(self.options.turns) / self.options.turns
-        c, s = np.cos(angles), np.sin(angles)
-        self._turns = np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy()
-        p = len(model.layout)
-        partners = model.layout.partners() if self.options.mirror else None
-        self._partners = None if partners is None else np.array(partners)
-        turn = np.kron(np.eye(p), model.object_frame)
-        learned = self.options.correction == "learned"
-        self._covariance = turn.T @ model.error_covariance @ turn if learned else np.eye(3 * p)
-        self._spread = np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1))
-        self._length = self.options.reference_length or model.layout.reference_length or 1.0
-        self._reference = pair and (model.layout.index(pair[0]), model.layout.index(pair[1]))
+        self.constants = _constants(model, self.options)
+        self.fit = Kernel(self.constants) if fits(model.network) else Fit(self.constants)
 
     def __call__(
         self, points: Float32, confidence: Float32, *, perspective: bool = False
@@ -135,104 +108,36 @@ class Lifter:
                 f"points are {points.shape} and confidence {confidence.shape}; "
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
-        visible = confidence > 0
-        mask = visible[..., None].astype(np.float32)
-        whole = np.ones_like(mask)
-        fitted = self._fit(points, mask, visible, perspective)
-        if not visible.all():
-            for _ in range(self.options.refill):
-                S, _, _, unit, origin = fitted
-                seen = unit * S[..., :2] + origin
-                if perspective:
-                    seen /= np.maximum(1 + unit * S[..., 2:], _NEAREST)
-                filled = np.where(visible[..., None], points, seen)
-                fitted = self._fit(filled, whole, visible, perspective)
-        S, R, residual, _, _ = fitted
-        S = centre(S)
-        sure = self.sure(confidence, residual, S)
-        S *= self._length / self._reference_size(S)
-        scale, translation = weak_perspective(points, S[..., :2], visible)
-        lifted = Lifted(S, R, scale, translation, residual, sure)
-        lost = on_one_line(points, visible)
-        lost |= visible.sum(1) < self.options.min_visible
+        arrays, lost = self.fit(points, confidence, perspective)
+        lifted = Lifted(*arrays)
         return blank(lifted, lost) if lost.any() else lifted
 
-    def sure(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
-        """Return the confidence (n, p) of shapes S (n, p, 3) in the network's unit, centred."""
-        return near(confidence, residual, self.spread(S))
 
-    def spread(self, S: Float32) -> Float32:
-        """Return the standard deviation (n, p) of the model's errors, relative to the RMS radius.
-
-        S: as in `sure`.
-        """
-        radius = np.sqrt((S * S).sum(2).mean(1))
-        spread: Float32 = self._spread / np.maximum(radius, 1e-9)[:, None]
-        return spread
-
-    def _fit(
-        self, points: Float32, mask: Float32, visible: NDArray[np.bool_], perspective: bool
-    ) -> tuple[Float32, Float32, Float32, Float32, Float32]:
-        """Return S in camera axes, R, residual (n,), and what leads to the image: unit, origin.
-
-        The network sees the points (n, p, 2) of mask (n, p, 1); the correction the visible alone.
-        """
-        model = self.model
-        W, gain, unit, origin = observe(model.network, model.normaliser, points, mask)
-        S, M, residual = self._average(gain * W, W, visible, unit if perspective else None)
-        R = rotation_from_camera(M)
-        if self.options.correction != "none":
-            seen = visible[..., None]
-            size = np.sqrt((W * W * seen).sum((1, 2)) / np.maximum(2 * seen.sum((1, 2)), 1))
-            noise = self.options.noise * size
-            cameras = M[:, None] - R[:, None, 2, :, None] * points[:, :, None] if perspective else M
-            S = correct(S @ R, cameras, W, visible, self._covariance, noise) @ R.swapaxes(1, 2)
-        return S, R, residual, unit, origin
-
-    def _average(
-        self, x: Float32, W: Float32, visible: NDArray[np.bool_], unit: Float32 | None
-    ) -> tuple[Float32, Float32, Float32]:
-        """Return S (n, p, 3) in camera axes, M (n, 3, 2) from the object's, residual (n,).
-
-        Means over the turns of the network's input x within the image plane, and over their
-        mirror images, each by the residual that it leaves of W.
-        """
-        turns = self._turns  # (k, 2, 2)
-        n, p, _ = W.shape
-        turned = x @ turns.swapaxes(1, 2)[:, None]  # (k, n, p, 2)
-        if self._partners is not None:
-            turned = np.concatenate((turned, (turned * _ACROSS[1:])[:, :, self._partners]))
-            turns = np.concatenate((turns, turns))
-        k = len(turns)
-        S, M = reconstruct(self.model.network, turned.reshape(k * n, p, 2))
-        A = self.model.object_frame
-        S, M = (S @ A).reshape(k, n, p, 3), (A.T @ M).reshape(k, n, 3, 2)
-        if self._partners is not None:
-            half = k // 2
-            S[half:] = S[half:, :, self._partners] * _ACROSS
-            M[half:] *= _ACROSS[:, None] * _ACROSS[1:]
-        M = M @ turns[:, None]
-        S = S @ rotation_from_camera(M).swapaxes(-1, -2)
-        P = S[..., :2] if unit is None else S[..., :2] / np.maximum(1 + unit * S[..., 2:], _NEAREST)
-        residual = reprojection_error(W, P, visible)
-        trust = np.exp((residual.min(0) ** 2 - residual**2) / _RESIDUAL_SPREAD)
-        trust /= trust.sum(0)
-        M = (trust[..., None, None] * M).sum(0)
-        return (
-            (trust[..., None, None] * S).sum(0),
-            polar(M.swapaxes(1, 2)).swapaxes(1, 2),
-            (trust * residual).sum(0),
-        )
-
-    def _reference_size(self, S: Float32) -> Float32:
-        """Return the size (n, 1, 1) of each shape that the reference length stands for."""
-        if self._reference is None:
-            size = np.sqrt((S * S).sum(2).mean(1))
-        else:
-            a, b = self._reference
-            size = np.linalg.norm(S[:, a] - S[:, b], axis=1)
-        held: Float32 = np.maximum(size, np.float32(1e-9))
-        return held[:, None, None]
+def _constants(model: Model, options: LiftingOptions) -> Constants:
+    p = len(model.layout)
+    angles = 2 * np.pi * np.arange(options.turns) / options.turns
+    c, s = np.cos(angles), np.sin(angles)
+    covariance = None
+    if options.correction == "learned":
+        turn = np.kron(np.eye(p), model.object_frame)
+        covariance = turn.T @ model.error_covariance @ turn
+    elif options.correction == "back_projection":
+        covariance = np.eye(3 * p)
+    pair = model.layout.reference
+    return Constants(
+        model.network,
+        model.normaliser,
+        model.object_frame,
+        np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy(),
+        model.layout.partners() if options.mirror else None,
+        covariance,
+        np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1)),
+        options.noise,
+        options.refill,
+        options.reference_length or model.layout.reference_length or 1.0,
+        pair and (model.layout.index(pair[0]), model.layout.index(pair[1])),
+        options.min_visible,
+    )
 
 
 def lift_all(

@@ -186,14 +186,18 @@ def complete(net: Network, points: Array, mask: Array) -> tuple[Array, Array]:
     """
     if not net.architecture.whitening or mask.all():
         return points, mask
+    rows = mask * (net.L @ net.L_inverse) + (1 - mask) * filling(net)
+    return _solve(rows, mask * points), mask * 0 + 1
+
+
+def filling(net: Network) -> Array:
+    """Return P (p, p), of which the rows of missing points, times all points, are to be zero."""
     P = net.L @ net.L
     sums = P.sum(-1)
     # Least over the translation as well, which takes one direction out of P.
     P = P - sums[:, None] * sums / sums.sum()
-    one = net.L @ net.L_inverse
-    P = P + 1e-6 * P.trace() * one  # so that a frame without a visible point has an answer too
-    rows = mask * one + (1 - mask) * P
-    return _solve(rows, mask * points), mask * 0 + 1
+    # So that a frame without a visible point has an answer too.
+    return P + 1e-6 * P.trace() * (net.L @ net.L_inverse)
 
 
 def _solve(A: Array, B: Array) -> Array:

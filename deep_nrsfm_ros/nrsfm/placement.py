@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.fitting import Float32
 from deep_nrsfm_ros.nrsfm.geometry import Floats, weak_perspective
 from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
-from deep_nrsfm_ros.nrsfm.lifting import Float32, Lifted, Lifter, blank
+from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, blank
 
 _NEAREST = 0.1  # cosine of the widest angle between a point and its object's ray
 

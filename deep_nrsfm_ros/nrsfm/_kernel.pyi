@@ -1,0 +1,6 @@
+from typing import Any
+
+def plan(header: Any, floats: Any, doubles: Any, /) -> object: ...
+def lift(
+    plan: object, points: Any, confidence: Any, perspective: bool, /, *arrays: Any
+) -> None: ...

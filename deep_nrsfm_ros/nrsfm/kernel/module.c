@@ -1,0 +1,83 @@
+/* The module `_kernel`: Python's arrays to C and back. */
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <string.h>
+
+#include "fitting.h"
+
+static const char NAME[] = "deep_nrsfm_ros.nrsfm._kernel.plan";
+
+static void forget(PyObject *capsule) {
+    Plan *k = PyCapsule_GetPointer(capsule, NAME);
+    if (k) PyMem_Free(k->memory), PyMem_Free(k);
+}
+
+/* plan(header int32, floats float32, doubles float64) -> capsule; `compiled.plan` says what is in them. */
+static PyObject *plan(PyObject *module, PyObject *args) {
+    Py_buffer parts[3];
+    if (!PyArg_ParseTuple(args, "y*y*y*", &parts[0], &parts[1], &parts[2])) return NULL;
+    size_t aligned[4] = {0};
+    for (int i = 0; i < 3; i++) aligned[i + 1] = aligned[i] + (parts[i].len + 63) / 64 * 64;
+    const int *header = parts[0].buf;
+    Py_ssize_t lengths[3] = {parts[0].len / 4, parts[1].len / 4, parts[2].len / 8};
+    int sound = lengths[0] > 12 && header[0] > 0 && header[1] > 0 && header[1] <= MOST_LAYERS;
+    sound = sound && lengths[0] == 11 + header[0] + header[1];
+    Plan *k = sound ? PyMem_Calloc(1, sizeof(Plan)) : NULL;
+    char *memory = NULL;
+    if (k && lay_out(k, header, parts[1].buf, parts[2].buf, lengths)) {
+        size_t needed = scratch(k, NULL);
+        memory = k->memory = PyMem_Calloc(1, aligned[3] + needed);
+        for (int i = 0; memory && i < 3; i++) memcpy(memory + aligned[i], parts[i].buf, parts[i].len);
+        if (memory) {
+            lay_out(k, (int *)memory, (float *)(memory + aligned[1]), (double *)(memory + aligned[2]),
+                    lengths);
+            scratch(k, memory + aligned[3]);
+        }
+    }
+    for (int i = 0; i < 3; i++) PyBuffer_Release(&parts[i]);
+    if (!memory) {
+        PyMem_Free(k);
+        PyErr_SetString(PyExc_ValueError, "the arrays are not those of a plan, or too large");
+        return NULL;
+    }
+    return PyCapsule_New(k, NAME, forget);
+}
+
+/* lift(plan, points, confidence, perspective, shapes, rotations, scale, translation, residual, sure, lost):
+   fill the last seven, arrays as in `lifting.Lifted`, and lost (n,) of bytes. */
+static PyObject *lift_objects(PyObject *module, PyObject *args) {
+    PyObject *capsule;
+    Py_buffer b[9];
+    int perspective;
+    if (!PyArg_ParseTuple(args, "Oy*y*pw*w*w*w*w*w*w*", &capsule, &b[0], &b[1], &perspective, &b[2],
+                          &b[3], &b[4], &b[5], &b[6], &b[7], &b[8]))
+        return NULL;
+    Plan *k = PyCapsule_GetPointer(capsule, NAME);
+    int sound = k != NULL;
+    if (k) {
+        Py_ssize_t n = b[8].len, p = k->p;
+        const Py_ssize_t each[8] = {2 * p, p, 3 * p, 9, 1, 2, 1, p};
+        for (int i = 0; i < 8; i++) sound = sound && b[i].len == 4 * n * each[i];
+        float *a[8];
+        for (int i = 0; i < 8; i++) a[i] = b[i].buf;
+        for (Py_ssize_t i = 0; sound && i < n; i++) {
+            ((char *)b[8].buf)[i] = (char)lift(k, a[0], a[1], perspective, a[2], a[3], a[4], a[5],
+                                               a[6], a[7]);
+            for (int j = 0; j < 8; j++) a[j] += each[j];
+        }
+        if (!sound) PyErr_SetString(PyExc_ValueError, "the arrays do not fit the plan and each other");
+    }
+    for (int i = 0; i < 9; i++) PyBuffer_Release(&b[i]);
+    if (!sound) return NULL;
+    Py_RETURN_NONE;
+}
+
+static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
+                                {"lift", lift_objects, METH_VARARGS, NULL},
+                                {NULL, NULL, 0, NULL}};
+static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", NULL, -1, methods, NULL, NULL, NULL, NULL};
+
+PyMODINIT_FUNC PyInit__kernel(void) {
+    choose_instructions();
+    return PyModule_Create(&module);
+}
