@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
+
 Floats = NDArray[Any]
 
 RATE = 10.0
 """Frames a second."""
-FOCAL, CENTRE, DISTANCE = 1000.0, (640.0, 360.0), 25.0
-"""The camera: pixels, pixels, metres to the middle of the machine."""
+CAMERA, DISTANCE = Intrinsics((1000.0, 1000.0), (640.0, 360.0)), 25.0
+"""Pixels, and metres to the middle of the machine."""
 NOISE = 1.0
 """Standard deviation of the keypoints in pixels."""
 _TRACKS = ((1.8, 1.2, 0.5), (1.8, -1.2, 0.5), (-1.8, 1.2, 0.5), (-1.8, -1.2, 0.5))
@@ -43,7 +45,8 @@ def record(frames: int, seed: int) -> Recording:
     turn = Rotation.from_euler("x", above, degrees=True).as_matrix() @ ahead
     turn = turn @ Rotation.from_euler("z", around, degrees=True).as_matrix()
     truth = (machine - machine.mean((0, 1))) @ turn.swapaxes(1, 2)
-    points = FOCAL * truth[..., :2] / (truth[..., 2:] + DISTANCE) + CENTRE
+    rays = truth[..., :2] / (truth[..., 2:] + DISTANCE)
+    points = np.array(CAMERA.focal) * rays + CAMERA.principal
     return Recording(points + NOISE * rng.standard_normal(points.shape), truth)
 
 

@@ -40,6 +40,8 @@ class Reporter:
             raise CancelledError
         if done == total or time.monotonic() - self._last > 0.2:
             self._show("reading", done, total, {})
+        if done == total:
+            self._close_bar()
 
     def training(self, progress: Any) -> None:
         """Report a `nrsfm.progress.Progress`, and keep it for the curves."""
@@ -63,8 +65,7 @@ class Reporter:
 
     def end(self, state: str, message: str, **values: Any) -> None:
         """Report how it ended."""
-        if self._bar is not None:
-            self._bar.close()
+        self._close_bar()
         if self.as_json:
             self._print({"state": state, "message": message, **values})
         else:
@@ -77,14 +78,19 @@ class Reporter:
             self._print({"state": state, "step": done, "steps": total, **values})
             return
         if self._bar is None or self._state != state:
-            if self._bar is not None:
-                self._bar.close()
+            self._close_bar()
             self._bar = tqdm(total=total, desc=state, dynamic_ncols=True)
         self._state = state
         self._bar.total = total
         shown = {k: f"{v:.3f}" for k, v in values.items() if k not in ("seconds_left", "seed")}
         self._bar.set_postfix(shown, refresh=False)
         self._bar.update(done - self._bar.n)
+
+    def _close_bar(self) -> None:
+        """Leave the bar as it is; the time it shows no longer runs."""
+        if self._bar is not None:
+            self._bar.close()
+        self._bar = None
 
     @staticmethod
     def _print(values: dict[str, Any]) -> None:

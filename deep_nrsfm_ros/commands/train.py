@@ -49,6 +49,7 @@ from deep_nrsfm_ros.observations.field_mapping import FieldMapping
 from deep_nrsfm_ros.observations.mapping_file import read_mapping
 from deep_nrsfm_ros.observations.variation import Variation
 from deep_nrsfm_ros.reporting.page import Training, write_report
+from deep_nrsfm_ros.reporting.shapes import doubt
 
 NOT_ASKED = ("name", "output", "resume", "json_progress")
 """Arguments that say which training is meant and how to show it, not what is asked of it."""
@@ -252,12 +253,12 @@ def learn(
     """Train on what `run` has read and save the model with its report."""
     ensemble = curated.ensemble
     if ensemble.layout.warning and not start:
-        report.say(ensemble.layout.warning)
+        report.warn(ensemble.layout.warning)
     network = start_from(start, ensemble.layout) if start else None
     seen = ensemble.visible.sum(0)
     unseen = [name for i, name in enumerate(ensemble.layout.keypoints) if not seen[i]]
     if unseen:
-        report.say(f"no frame shows {', '.join(unseen)}: the model will only guess them")
+        report.warn(f"no frame shows {', '.join(unseen)}: the model will only guess them")
     report.say(f"{len(ensemble)} frames of {len(ensemble.layout)} keypoints ({ensemble.source})")
     import torch  # seconds to import: bad arguments should not wait for it
 
@@ -289,6 +290,9 @@ def learn(
     if start:
         model = inherit(model, start)
     save_model(model_path, model)
+    depth = doubt(model, ensemble)
+    if depth:
+        report.warn(depth)
     whole = Training(
         *(model, model_path, ensemble, curated, variation, report.curves, report.warnings)
     )
@@ -303,7 +307,8 @@ def learn(
     else:
         checkpoint.unlink(missing_ok=True)
     message += f"; report {html}" if html else ""
-    report.end(state, message, model=str(model_path), report=html, **model.quality)
+    found = model.quality | ({"warning": depth} if depth else {})
+    report.end(state, message, model=str(model_path), report=html, **found)
 
 
 @program

@@ -119,14 +119,14 @@ class TrainingService:
                 return
             if progress.ended:
                 self._job = None
-            if progress.state == "failed":
+            if progress.state in ("failed", "cancelled"):
                 progress = self._with_advice(progress)
             if progress.state == "finished" and self._wanted.activate:
                 progress = self._switch(progress)
             self._tell(progress)
 
     def _with_advice(self, progress: Progress) -> Progress:
-        """Add to a failure how to go on, if there is something to go on from."""
+        """Add to an untimely end how to go on, if there is something to go on from."""
         found = look(self._folder, self._wanted.name)
         if not found:
             return progress

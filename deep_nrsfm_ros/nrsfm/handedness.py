@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.geometry import centre
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, Tetrahedron
 
 Floats = NDArray[Any]
 
@@ -41,15 +41,25 @@ def mirrored(S: Floats, layout: KeypointLayout, seen: NDArray[np.bool_] | None =
     to its plane and one that is as often behind it as before it say little. Where `seen` (f, p)
     tells, only shapes of which all four were seen count: what no detector shows may lie anywhere.
     """
-    found = votes(S, layout)
-    counts = np.full(found.shape, True)
-    if seen is not None:
-        all_four = np.asarray(seen[:, _places(layout)].all(2), bool)
-        enough = np.flatnonzero(all_four.mean(0) >= SEEN_ENOUGH)
-        if len(enough):
-            found, counts = found[:, enough], all_four[:, enough]
-    columns = zip(found.T, counts.T, strict=True)
-    return bool(sum(np.median(vote[of]) for vote, of in columns) < 0)
+    return bool(sum(np.median(vote) for _, vote in _heard(S, layout, seen)) < 0)
+
+
+def disagreement(S: Floats, layout: KeypointLayout, seen: NDArray[np.bool_] | None = None) -> str:
+    """Return what somebody who uses a model that lifts shapes (f, p, 3) should know, or "".
+
+    On a sound one no vote is against most of the shapes. Where one is, depth is wrong in part, and
+    no mirroring of the whole mends it. `seen` as in `mirrored`.
+    """
+    heard = _heard(S, layout, seen) if layout.handedness else []
+    shares = [(front, (vote > 0).mean()) for (*_, front), vote in heard]
+    if all(share >= 0.5 for _, share in shares):
+        return ""
+    told = ", ".join(f"{front} in {100 * share:.0f} %" for front, share in shares)
+    return (
+        f"the keypoints disagree on where the front is, so that depth is wrong in part ({told} of "
+        "the frames where it belongs); record the object from more sides, or start from a model "
+        "that knows it (--from, train.from)"
+    )
 
 
 def object_frame(
@@ -72,6 +82,21 @@ def object_frame(
     z -= (z @ y) * y
     axes = np.stack((np.cross(y, z / _norm(z)), y, z / _norm(z)), 1)
     return np.asarray(A @ axes, np.float32)
+
+
+def _heard(
+    S: Floats, layout: KeypointLayout, seen: NDArray[np.bool_] | None
+) -> list[tuple[Tetrahedron, Floats]]:
+    """Return the votes that count, each of the shapes that it counts for."""
+    found = votes(S, layout)
+    counts = np.full(found.shape, True)
+    chosen = list(range(len(layout.handedness)))
+    if seen is not None:
+        all_four = np.asarray(seen[:, _places(layout)].all(2), bool)
+        enough = np.flatnonzero(all_four.mean(0) >= SEEN_ENOUGH).tolist()
+        if enough:
+            counts, chosen = all_four, enough
+    return [(layout.handedness[i], found[counts[:, i], i]) for i in chosen]
 
 
 def _places(layout: KeypointLayout) -> NDArray[np.int_]:

@@ -106,6 +106,8 @@ def read_bags(
     names = ", ".join(path.name for path in map(Path, paths))
     if messages == unreadable:
         raise BagError(f"no readable message in {names} ({messages} found); {reason or 'empty'}")
+    if on_progress:
+        on_progress(messages, messages)
     ensemble = frames.ensemble(f"bags {names}")
     return BagReading(ensemble, messages, unreadable, reason, tuple(warnings))
 

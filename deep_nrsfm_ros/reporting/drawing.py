@@ -17,6 +17,7 @@ Line = Sequence[tuple[float, float]]
 
 COLOURS = {"left": "#1f77b4", "right": "#d62728"}
 MIDDLE = "#666666"
+GUESSED = "#d4d4d4"
 _LINES = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f")
 _ACCENT = "#d01c8b"
 
@@ -104,17 +105,24 @@ def skeleton(
 
 
 def scene(
-    shape: Points, layout: KeypointLayout, mode: Points | None = None, turn: float = 0.0
+    shape: Points,
+    layout: KeypointLayout,
+    visible: Points,
+    mode: Points | None = None,
+    turn: float = 0.0,
 ) -> dict[str, Any]:
     """Return a shape (p, 3) in screen axes, and a mode (p, 3) to swing by, for the viewer.
 
-    turn: degrees about the vertical by which it is turned at first.
+    visible: (p,), what was seen; edges to the rest are pale. turn: degrees about the vertical by
+    which it is turned at first.
     """
+    edges = layout.edge_indices()
+    colours = zip(edges, edge_colours(layout), strict=True)
     return {
         "points": np.round(shape, 4).tolist(),
         "mode": None if mode is None else np.round(mode, 4).tolist(),
-        "edges": layout.edge_indices(),
-        "colours": edge_colours(layout),
+        "edges": edges,
+        "colours": [c if visible[i] and visible[j] else GUESSED for (i, j), c in colours],
         "names": list(layout.keypoints),
         "turn": turn,
     }

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.observations.curation import Curated, apart
@@ -76,7 +77,7 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
     model, ensemble, variation = training.model, training.ensemble, training.variation
     found = lift_sample(model, ensemble)
     scenes: list[dict[str, Any]] = []
-    shapes = _shapes(model, found, scenes)
+    shapes = _shapes(model, found, ensemble.visible.sum(0) > 0, scenes)
     order = np.argsort(found.lifted.residual, kind="stable")
     gap = _APART * len(ensemble)
     frames = {
@@ -144,14 +145,16 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
     return rows
 
 
-def _shapes(model: Model, found: LiftedFrames, scenes: list[dict[str, Any]]) -> list[Any]:
+def _shapes(
+    model: Model, found: LiftedFrames, visible: NDArray[np.bool_], scenes: list[dict[str, Any]]
+) -> list[Any]:
     """Return (caption, index of the scene) of the mean shape and of each mode."""
     space = shape_space(model, found.lifted)
     shown: list[Any] = [("mean shape", len(scenes))]
-    scenes.append(scene(space.mean, model.layout, turn=30))
+    scenes.append(scene(space.mean, model.layout, visible, turn=30))
     for k, (mode, share) in enumerate(zip(space.modes, space.shares, strict=True), 1):
         shown.append((f"mode {k}: {100 * share:.0f} %", len(scenes)))
-        scenes.append(scene(space.mean, model.layout, mode, turn=30))
+        scenes.append(scene(space.mean, model.layout, visible, mode, turn=30))
     return shown
 
 
@@ -163,10 +166,12 @@ def _frames(
     ensemble, layout = training.ensemble, training.model.layout
     for k in chosen:
         frame = int(found.frames[k])
-        drawing = skeleton(ensemble.points[frame], ensemble.visible[frame], layout)
+        visible = ensemble.visible[frame]
+        drawing = skeleton(ensemble.points[frame], visible, layout)
         place = int(training.curated.frames[frame])
         shown.append((place, float(found.lifted.residual[k]), drawing, len(scenes)))
-        scenes.append(scene(found.lifted.shapes[k] * _CAMERA_TO_SCREEN, layout, turn=60))
+        lifted = found.lifted.shapes[k] * _CAMERA_TO_SCREEN
+        scenes.append(scene(lifted, layout, visible, turn=60))
     return shown
 
 

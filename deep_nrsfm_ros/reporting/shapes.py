@@ -13,6 +13,7 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     random_cameras,
     rotation_from_camera,
 )
+from deep_nrsfm_ros.nrsfm.handedness import disagreement
 from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import forward
@@ -65,6 +66,18 @@ def lift_sample(model: Model, ensemble: Ensemble, most: int = _SAMPLE) -> Lifted
     if not sound.any():
         raise ValueError(f"model {model.name!r} lifts none of the {len(frames)} frames looked at")
     return LiftedFrames(frames[sound], Lifted(*(array[sound] for array in lifted)))
+
+
+def doubt(model: Model, ensemble: Ensemble) -> str:
+    """Return what the lifted frames say against the model's depth, "" if nothing.
+
+    See `handedness.disagreement`; only keypoints that were seen count.
+    """
+    try:
+        frames, lifted = lift_sample(model, ensemble)
+    except ValueError:
+        return ""  # no frame is lifted: there is no depth to doubt
+    return disagreement(lifted.shapes, model.layout, ensemble.visible[frames])
 
 
 def shape_space(model: Model, lifted: Lifted, modes: int = 4) -> ShapeSpace:

@@ -26,8 +26,8 @@ def test_it_works_smoothly_and_its_camera_sees_it() -> None:
     assert steps.max() < 1.5  # metres in a tenth of a second, of the bucket's tip
     assert truth.std(0).mean() > 0.3
     assert (points > 0).all() and (points < [1280, 720]).all()
-    without_noise = excavator.FOCAL * truth[..., :2] / (truth[..., 2:] + excavator.DISTANCE)
-    noise = points - without_noise - excavator.CENTRE
+    without_noise = truth[..., :2] / (truth[..., 2:] + excavator.DISTANCE)
+    noise = 1000 * (excavator.CAMERA.rays(points) - without_noise)
     assert abs(noise.std() - excavator.NOISE) < 0.1
 
 

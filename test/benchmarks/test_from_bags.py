@@ -59,7 +59,7 @@ def test_the_machine_from_bag_to_table(
     words = ["machine", "--data", "unused", "--output", str(tmp_path), "--steps", "30"]
     from_bags.main(words)
     table = rows(tmp_path / "from_excavator.csv")
-    assert [row["frames"] for row in table] == ["200", "200", "50", "50"]
+    assert [row["frames"] for row in table] == ["200"] * 3 + ["50"] * 3
     assert all(0 < float(row["proper %"]) < 150 for row in table)
     assert 0 < float(table[0]["metres"]) < 10
     capfd.readouterr()

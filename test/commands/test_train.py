@@ -149,7 +149,7 @@ def test_from_bag_to_model(
     assert states[-1] == "finished" and [*dict.fromkeys(states)] == [
         s for s in order if s in states
     ]
-    progress = [line for line in lines if line["state"] == "training"]
+    progress = [line for line in lines if line["state"] == "training" and "step" in line]
     assert (progress[-1]["step"], progress[-1]["steps"]) == (30, 30)
     for field in ("loss", "cycle_error", "coherence", "seconds_left"):
         assert isinstance(progress[-1][field], float)
@@ -200,7 +200,7 @@ def test_resume_goes_on_where_it_was_cancelled(
     assert in_process(*words) == 0
     whole = dict(load_model(models / "mine.safetensors").network.named())
     with monkeypatch.context() as cancelled:
-        cancelled.setattr(train, "stop_on_signals", stop_after(5))
+        cancelled.setattr(train, "stop_on_signals", stop_after(1 + 5))  # once after reading
         assert in_process(*words) == 0
     assert load_model(models / "mine.safetensors").provenance["step"] == 5
     taken: list[int] = []
@@ -419,6 +419,7 @@ def test_points_that_nobody_described_are_numbered(
     assert not model.layout.edges
     said = capsys.readouterr().err
     assert "'points5' names no handedness: depth may come out mirrored as a whole" in said
+    assert "names no handedness" in (models / "mine.html").read_text()
 
 
 def test_it_goes_on_from_another_model(
@@ -500,6 +501,25 @@ def test_what_the_data_was_spared_is_said_and_an_option_turns_it_off(
     assert load_model(tmp_path / "mine.safetensors").provenance["frames"] == 60
     assert in_process(*words, "--steps", "2", "--thin", "0") == 0
     assert load_model(tmp_path / "mine.safetensors").provenance["frames"] == 120
+
+
+def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(train, "stop_with_parent", lambda stopped: stopped)
+    words = (*arguments, "--steps", "3")
+    for told in ("", "no depth in mine"):
+        monkeypatch.setattr(train, "doubt", lambda model, ensemble, told=told: told)
+        assert in_process(*words, "--json-progress") == 0
+        *_, end = map(json.loads, capsys.readouterr().out.splitlines())
+        assert (end["state"], end.get("warning", "")) == ("finished", told)
+        assert ("no depth in mine" in (models / "mine.html").read_text()) == bool(told)
+    assert in_process(*words) == 0
+    assert "warning: no depth in mine" in capsys.readouterr().err
 
 
 def test_a_report_that_cannot_be_written_costs_no_model(

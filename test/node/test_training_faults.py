@@ -259,7 +259,8 @@ def test_a_training_can_be_cancelled_in_any_state(start_lifter, connect, models,
     if state == "training":
         assert float(values(client.wait_for_training("training"))["combined"]) > 0
     assert client.call("/lifter/cancel_training").success
-    client.wait_for_training("cancelled")
+    ended = client.wait_for_training("cancelled")
+    assert ("train.resume to true" in ended.message) == (state == "training")
     assert (models / "fresh.safetensors").exists() == (state == "training")
     assert record_file(models, "fresh").exists() == (state == "training")
 

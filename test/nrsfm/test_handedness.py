@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
-from deep_nrsfm_ros.nrsfm.handedness import mirrored, object_frame, votes
+from deep_nrsfm_ros.nrsfm.handedness import disagreement, mirrored, object_frame, votes
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
 
 some = settings(max_examples=25, deadline=None)
@@ -159,3 +159,25 @@ def test_the_first_of_several_gives_the_axes() -> None:
     S = walkers()
     first = KeypointLayout("person", HUMAN17.keypoints, handedness=HUMAN17.handedness[:1])
     np.testing.assert_array_equal(object_frame(S, HUMAN17), object_frame(S, first))
+
+
+def test_a_part_that_is_on_the_wrong_side_is_named_with_its_share() -> None:
+    S = walkers(f=50)
+    assert disagreement(S, HUMAN17) == ""
+    few = np.concatenate([behind(S[:20], "nose"), S[20:]])
+    assert disagreement(few, HUMAN17) == ""
+    most = np.concatenate([behind(S[:48], "nose"), S[48:]])
+    said = disagreement(most, HUMAN17)
+    assert "depth is wrong in part (nose in 4 %, left_knee in 100 %" in said
+    assert disagreement(most @ rotations(50, np.random.default_rng(0)), HUMAN17) == said
+    assert disagreement(most, KeypointLayout.numbered(len(HUMAN17))) == ""
+
+
+def test_a_part_that_nobody_saw_is_not_named() -> None:
+    S = behind(walkers(), "nose")
+    seen = np.ones(S.shape[:2], bool)
+    assert disagreement(S, HUMAN17, seen)
+    seen[:, HUMAN17.index("nose")] = False
+    assert disagreement(S, HUMAN17, seen) == ""
+    seen[0] = True  # one frame of thirty
+    assert disagreement(S, HUMAN17, seen) == ""

@@ -5,7 +5,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import Reader, Writer
+import yaml
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.nrsfm.keypoints import BODY25, COCO17, HUMAN17, KeypointLayout, KeypointMap
@@ -89,7 +90,7 @@ def test_progress_counts_to_the_total(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", TOPIC, frames(*detections(600)))
     seen: list[tuple[int, int]] = []
     read_bags([tmp_path / "bag"], "", BODY25, BODY25, on_progress=lambda *p: seen.append(p))
-    assert seen == [(256, 600), (512, 600)]
+    assert seen == [(256, 600), (512, 600), (600, 600)]
 
 
 def test_low_confidence_is_missing(tmp_path: Path) -> None:
@@ -159,6 +160,40 @@ def test_missing_and_foreign_bags_are_named(tmp_path: Path) -> None:
             read_bags([tmp_path / name], TOPIC, BODY25, BODY25)
     with pytest.raises(BagError, match="at least one"):
         read_bags([], TOPIC, BODY25, BODY25)
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_a_compressed_bag_is_read_as_any_other(tmp_path: Path, mode: CompressionMode) -> None:
+    points, confidence = detections(50)
+    write_bag(tmp_path / "plain", TOPIC, frames(points, confidence))
+    writer = Writer(tmp_path / "bag", version=9)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with Reader(tmp_path / "plain") as plain, writer:
+        (topic,) = plain.connections
+        copy = writer.add_connection(topic.topic, topic.msgtype, typestore=STORE)
+        for _, time, raw in plain.messages():
+            writer.write(copy, time, raw)
+    reading = read_bags([tmp_path / "bag"], "", BODY25, BODY25)
+    np.testing.assert_array_equal(reading.ensemble.points, points)
+    assert reading[1:] == (len(points), 0, "", ())
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_split_bag_is_read_from_its_first_file_to_its_last(tmp_path: Path, storage: str) -> None:
+    points, confidence = detections(50)
+    bag, rest = tmp_path / "bag", tmp_path / "rest"
+    write_bag(bag, TOPIC, frames(points[:30], confidence[:30]), storage)
+    write_bag(rest, TOPIC, frames(points[30:], confidence[30:]), storage)
+    (file,) = (f for f in rest.iterdir() if f.suffix != ".yaml")
+    file.rename(bag / file.name)
+    described = yaml.safe_load((bag / "metadata.yaml").read_text())
+    about = described["rosbag2_bagfile_information"]
+    about["relative_file_paths"].append(file.name)
+    about["message_count"] = about["topics_with_message_count"][0]["message_count"] = 50
+    (bag / "metadata.yaml").write_text(yaml.safe_dump(described))
+    reading = read_bags([bag], TOPIC, BODY25, BODY25)
+    np.testing.assert_array_equal(reading.ensemble.points, points)
+    assert reading[1:] == (len(points), 0, "", ())
 
 
 @pytest.mark.parametrize("metadata", [True, False], ids=["metadata", "no metadata"])

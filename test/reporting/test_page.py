@@ -21,6 +21,7 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.observations.curation import Curation, curate
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 from deep_nrsfm_ros.observations.variation import examine
+from deep_nrsfm_ros.reporting.drawing import GUESSED
 from deep_nrsfm_ros.reporting.page import Training, page, write_report
 
 EVIL = '</script><img src=x onerror="alert(1)">&'
@@ -122,6 +123,22 @@ def test_every_canvas_has_its_scene(text: str) -> None:
     for scene in scenes:
         assert np.shape(scene["points"]) == (17, 3) and np.isfinite(scene["points"]).all()
         assert len(scene["edges"]) == len(scene["colours"]) == len(HUMAN17.edges)
+
+
+def test_what_no_frame_shows_is_drawn_pale() -> None:
+    kept = training_of().ensemble
+    toe = HUMAN17.index("left_big_toe")
+    visible = kept.visible.copy()
+    visible[:, toe] = False
+    blind = Ensemble(kept.points, visible, HUMAN17, kept.source)
+    for scene in scenes_of(page(training_of(ensemble=blind))):
+        pale = {
+            toe in edge: c == GUESSED
+            for edge, c in zip(scene["edges"], scene["colours"], strict=True)
+        }
+        assert pale[True]
+    mean, *_ = scenes_of(page(training_of()))
+    assert GUESSED not in mean["colours"]
 
 
 def test_it_tells_what_was_left_out_and_hidden(text: str) -> None:

@@ -12,7 +12,7 @@ from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.observations.ensemble import Ensemble
-from deep_nrsfm_ros.reporting.shapes import cycle_error, fit, lift_sample, shape_space
+from deep_nrsfm_ros.reporting.shapes import cycle_error, doubt, fit, lift_sample, shape_space
 
 P = 10
 
@@ -96,3 +96,23 @@ def test_figures_do_not_depend_on_chance_or_unit() -> None:
     larger = Ensemble(10 * seen.points, seen.visible, seen.layout, "made up")
     np.testing.assert_allclose(fit(mine, larger), first, rtol=1e-2)
     assert cycle_error(mine, seen) == pytest.approx(first.cycle, rel=1e-5)
+
+
+def test_depth_is_doubted_where_keypoints_contradict_each_other() -> None:
+    seen = frames(40, P)
+    names = seen.layout.keypoints
+    four, inside_out = (names[0], names[1], names[2], names[3]), (names[1], *names[0:4:2], names[3])
+    told = [
+        doubt(model(KeypointLayout("thing", names, handedness=handedness)), seen)
+        for handedness in ((four,), (inside_out,), (four, inside_out), ())
+    ]
+    # One of two that are each other's mirror image is wrong, and both of both.
+    assert sorted(map(bool, told[:2])) == [False, True]
+    assert told[2].count(names[3]) == 2 and "disagree" in told[2]
+    assert told[3] == ""
+
+
+def test_what_no_model_lifts_is_not_doubted() -> None:
+    nothing = frames(5, P)
+    blind = Ensemble(nothing.points, np.zeros((5, P), bool), nothing.layout, "made up")
+    assert doubt(model(nothing.layout), blind) == ""
