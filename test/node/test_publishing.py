@@ -12,6 +12,7 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from std_msgs.msg import Header
 
 from deep_nrsfm_ros.node import lifter, publishing
+from deep_nrsfm_ros.node.gaps import Gaps
 from deep_nrsfm_ros.node.listening import Source
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
@@ -98,7 +99,7 @@ def test_markers_are_not_made_when_nobody_listens(
         heard: list[PointCloud2] = []
         monkeypatch.setattr(node._points, "publish", heard.append)
         node._lift(
-            Source("/keypoints", POINT_CLOUD, Tracker()),
+            Source("/keypoints", POINT_CLOUD, Tracker(), Gaps()),
             publishing.PointCloud().fill(Header(), lifted(1, len(HUMAN17))),
         )
         assert heard and not made
