@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.confidence import CALIBRATED
 from deep_nrsfm_ros.nrsfm.fitting import Constants
-from deep_nrsfm_ros.nrsfm.network import Architecture, Network, filling
+from deep_nrsfm_ros.nrsfm.network import Network, filling
 
 try:
     from deep_nrsfm_ros.nrsfm import _kernel
@@ -26,8 +26,7 @@ _LANES = 16  # of the kernel: rows are padded to a multiple of it
 
 def fits(network: Network) -> bool:
     """Tell whether there is a kernel, and it knows the network's options."""
-    options = network.architecture
-    return AVAILABLE and (options.threshold, options.recovery, options.camera) == _KNOWN
+    return AVAILABLE and network.architecture.usual
 
 
 class Kernel:
@@ -77,9 +76,6 @@ class Kernel:
             lost,
         )
         return lifted, lost
-
-
-_KNOWN = (Architecture().threshold, Architecture().recovery, Architecture().camera)
 
 
 def _padded(A: NDArray[np.float32]) -> NDArray[np.float32]:

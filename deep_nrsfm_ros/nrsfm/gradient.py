@@ -12,7 +12,6 @@ from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective
 from deep_nrsfm_ros.nrsfm.network import (
-    Architecture,
     Network,
     decode,
     encode,
@@ -33,8 +32,7 @@ def descend(
 
     The gradients are by what the network has learned, in the order of `Network.learned`.
     """
-    options = net.architecture
-    if (options.threshold, options.recovery, options.camera) != _WRITTEN_OUT:
+    if not net.architecture.usual:
         return _by_torch(objective, net, frames, known, generator)
     with torch.inference_mode():
         task = objective.task(net, frames, known, generator)
@@ -47,9 +45,6 @@ def descend(
         heads_bar, Psi_bar = _through_recovery(net, Psi[-1], M, psi_bar, M_bar)
         b_bar = _through_encoder(net, task.x, Psi, Psi_bar, D_bar)
         return objective.losses(net, S, M, left), [*D_bar, *b_bar, *b__bar, *heads_bar]
-
-
-_WRITTEN_OUT = (Architecture().threshold, Architecture().recovery, Architecture().camera)
 
 
 def _by_torch(

@@ -62,6 +62,13 @@ class Architecture:
         if not self.widths:
             raise ValueError("widths is empty; give the width of at least one dictionary")
 
+    @property
+    def usual(self) -> bool:
+        """Tell whether it is of the kind that is written out by hand: its gradient, the kernel."""
+        usual = type(self)
+        ours = self.threshold, self.recovery, self.camera
+        return ours == (usual.threshold, usual.recovery, usual.camera)
+
 
 @dataclass(frozen=True)
 class Network:
