@@ -197,7 +197,9 @@ def main() -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        executor.spin_until_future_complete(node.finished)
+        # Not for ever: now and then rclpy wakes for a signal before it has shut down, and waits on.
+        while rclpy.ok() and not node.finished.done():
+            executor.spin_once(timeout_sec=0.5)
         if rclpy.ok():
             node.close()
     except ExternalShutdownException:
