@@ -86,7 +86,7 @@ class Kernel:
 
 
 def _padded(A: NDArray[Any], multiple: int | None = None) -> NDArray[Any]:
-    """Return A (..., n) filled up with zeros to n a multiple, by default of what the kernel takes."""
+    """Return A (..., n) filled up with zeros to n a multiple, by default of FLOATS."""
     more = -A.shape[-1] % (multiple or _kernel.FLOATS)
     return np.pad(A, ((0, 0),) * (A.ndim - 1) + ((0, more),))
 

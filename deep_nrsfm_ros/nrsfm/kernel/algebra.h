@@ -10,27 +10,27 @@
 #define FLOATS_OF(n) (((n) + FLOATS - 1) / FLOATS * FLOATS)
 #define DOUBLES_OF(n) (((n) + DOUBLES - 1) / DOUBLES * DOUBLES)
 
-#define INLINE static inline __attribute__((always_inline))
-typedef float float8 __attribute__((vector_size(4 * FLOATS / 2), aligned(4), may_alias));
-typedef double double4 __attribute__((vector_size(8 * DOUBLES), aligned(8), may_alias));
-
-/* Define `name` by `name_inline`, compiled twice where processors may have AVX2 or not. */
+/* Of the function `name`, the one for this processor. */
 #ifdef __x86_64__
-#define FAST(scope, name, parameters, arguments)                                       \
-    __attribute__((target("avx2,fma"))) static void name##_avx2 parameters {           \
-        name##_inline arguments;                                                       \
-    }                                                                                  \
-    static void name##_anywhere parameters { name##_inline arguments; }                \
-    scope void name parameters {                                                       \
-        if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))           \
-            name##_avx2 arguments;                                                     \
-        else                                                                           \
-            name##_anywhere arguments;                                                 \
-    }
+#define AVX2 __attribute__((target("avx2,fma")))
+#define CHOSEN(name) \
+    (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") ? name##_avx2 : name##_anywhere)
 #else
-#define FAST(scope, name, parameters, arguments) \
-    scope void name parameters { name##_inline arguments; }
+#define CHOSEN(name) name##_anywhere
 #endif
+
+/* Define `name`, whose plain loops are `name_inline`, for any processor and for those with AVX2. */
+#define FAST(name, parameters, arguments)                               \
+    static void name##_anywhere parameters { name##_inline arguments; } \
+    FAST_WITH_AVX2(name, parameters, arguments)                         \
+    static void name parameters { CHOSEN(name) arguments; }
+#ifdef __x86_64__
+#define FAST_WITH_AVX2(name, parameters, arguments) \
+    AVX2 static void name##_avx2 parameters { name##_inline arguments; }
+#else
+#define FAST_WITH_AVX2(name, parameters, arguments)
+#endif
+#define INLINE static inline __attribute__((always_inline))
 
 /* A (k, n) with n a multiple of FLOATS, in panels of FLOATS columns: (n / FLOATS, k, FLOATS). */
 typedef struct {

@@ -62,7 +62,7 @@ size_t scratch(Plan *k, char *at) {
     ROOM(k->M, double, 6 * (size_t)n * all)
     ROOM(k->residual, double, all)
     ROOM(k->cameras, double, 6 * even)
-    ROOM(k->HC, double, 3 * even)
+    ROOM(k->HC, double, 6 * even)
     ROOM(k->A, double, 2 * (size_t)even * (2 * even + DOUBLES))
     ROOM(k->missing, int, p)
     ROOM(k->some, Object *, n)

@@ -1,45 +1,41 @@
 /* correction.py, for one object. */
 #include "plan.h"
 
-/* Set the rows of A = H Sigma H^T (2, p) x (2, p) for point i; p in DOUBLES.
+/* Set the rows of A = H Sigma H^T (2, p) x (2, p) for point i; p in DOUBLES. Only the upper half is read.
 
-   Sigma: (3, 3, p), its three rows for that point. `cameras` (3, 2, p). HC: (3, p) of room. */
-INLINE void project_inline(int p, int i, const double *restrict Sigma, const double *restrict cameras,
-                         double *restrict HC, double *restrict A, int wide) {
+   Sigma: (3, 3, p), its three rows for that point. `cameras` (3, 2, p). HC: (2, 3, p) of room. */
+INLINE void project_inline(int p, int i, const double *restrict Sigma,
+                           const double *restrict cameras, double *restrict HC,
+                           double *restrict A, int wide) {
     const double *C = Sigma, *m = cameras;
-    for (int a = 0; a < 2; a++) {
-        double x = m[a * p + i], y = m[(2 + a) * p + i], z = m[(4 + a) * p + i];
-        for (int j = 0; j < 3 * p; j++) HC[j] = x * C[j] + y * C[3 * p + j] + z * C[6 * p + j];
-        /* Only the upper half of A is read. */
-        for (int c = a; c < 2; c++)
+    for (int j = 0; j < 3 * p; j++)
+        for (int a = 0; a < 2; a++)
+            HC[3 * a * p + j] = m[a * p + i] * C[j] + m[(2 + a) * p + i] * C[3 * p + j] +
+                                m[(4 + a) * p + i] * C[6 * p + j];
+    for (int a = 0; a < 2; a++)
+        for (int c = a; c < 2; c++) {
+            const double *x = HC + 3 * a * p, *n = m + c * p;
+            double *row = A + (size_t)(a * p + i) * wide + c * p;
             for (int j = a == c ? i / DOUBLES * DOUBLES : 0; j < p; j++)
-                A[(size_t)(a * p + i) * wide + c * p + j] = HC[j] * m[c * p + j] +
-                                                            HC[p + j] * m[(2 + c) * p + j] +
-                                                            HC[2 * p + j] * m[(4 + c) * p + j];
-    }
+                row[j] = x[j] * n[j] + x[p + j] * n[2 * p + j] + x[2 * p + j] * n[4 * p + j];
+        }
 }
-FAST(static, project,
+FAST(project,
             (int p, int i, const double *Sigma, const double *cameras, double *HC, double *A, int wide),
             (p, i, Sigma, cameras, HC, A, wide))
 
-/* E (3) = Sigma v: of three rows (3, 3, p) and v (3, p). */
-INLINE void multiply_inline(int p, const double *Sigma, const double *v, double *E) {
-    double4 sums[3][3] = {{{0}}};
-    for (int j = 0; j < p; j += DOUBLES)
-        for (int r = 0; r < 3; r++)
-            for (int q = 0; q < 3; q++)
-                sums[r][q] += *(const double4 *)(Sigma + (3 * r + q) * p + j) *
-                              *(const double4 *)(v + q * p + j);
-    for (int r = 0; r < 3; r++) {
-        double4 sum = sums[r][0] + sums[r][1] + sums[r][2];
-        E[r] = sum[0] + sum[1] + sum[2] + sum[3];
-    }
+/* E (3, p) += what v (3) of point i says by `Sigma` (3, 3, p), which is symmetric. */
+INLINE void spread_inline(int p, const double *restrict Sigma, double x, double y, double z,
+                          double *restrict E) {
+    for (int j = 0; j < 3 * p; j++)
+        E[j] += x * Sigma[j] + y * Sigma[3 * p + j] + z * Sigma[6 * p + j];
 }
-FAST(static, multiply, (int p, const double *Sigma, const double *v, double *E), (p, Sigma, v, E))
+FAST(spread, (int p, const double *Sigma, double x, double y, double z, double *E),
+     (p, Sigma, x, y, z, E))
 
 void correct(Plan *k, Object *o, double noise) {
     int p = DOUBLES_OF(k->p), n = 2 * p, wide = n + DOUBLES;
-    double *A = k->A, *m = k->cameras, *v = k->HC, E[3];
+    double *A = k->A, *m = k->cameras, *E = k->HC, unknown = k->unknown;
     for (int i = 0; i < p; i++) {
         const double *Sigma = k->covariance + (size_t)9 * p * i;
         if (i < k->p) project(p, i, Sigma, m, k->HC, A, wide);
@@ -51,20 +47,20 @@ void correct(Plan *k, Object *o, double noise) {
                 row[i] = 1;
                 continue;
             }
-            for (int j = i; j < k->p; j++) row[j] += k->unknown;
-            row[i] += o->visible[i] ? noise * noise + 1e-12 * k->unknown : k->unknown;
+            for (int j = i; j < k->p; j++) row[j] += unknown;
+            row[i] += o->visible[i] ? noise * noise + 1e-12 * unknown : unknown;
             double left = o->W[2 * i + a];
             for (int r = 0; r < 3; r++) left -= o->S[r * k->wide + i] * m[(2 * r + a) * p + i];
             b[0] = o->visible[i] ? left : 0;
         }
     }
     solve(n, A);
-    for (int i = 0; i < p; i++)
-        for (int r = 0; r < 3; r++)
-            v[r * p + i] = m[2 * r * p + i] * A[(size_t)i * wide + n] +
-                           m[(2 * r + 1) * p + i] * A[(size_t)(p + i) * wide + n];
+    for (int j = 0; j < 3 * p; j++) E[j] = 0;
     for (int i = 0; i < k->p; i++) {
-        multiply(p, k->covariance + (size_t)9 * p * i, v, E);
-        for (int r = 0; r < 3; r++) o->S[r * k->wide + i] += (float)E[r];
+        double x = A[(size_t)i * wide + n], y = A[(size_t)(p + i) * wide + n], v[3];
+        for (int r = 0; r < 3; r++) v[r] = m[2 * r * p + i] * x + m[(2 * r + 1) * p + i] * y;
+        spread(p, k->covariance + (size_t)9 * p * i, v[0], v[1], v[2], E);
     }
+    for (int r = 0; r < 3; r++)
+        for (int i = 0; i < k->p; i++) o->S[r * k->wide + i] += (float)E[r * p + i];
 }

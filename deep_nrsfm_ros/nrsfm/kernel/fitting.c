@@ -131,7 +131,7 @@ static void near(Plan *k, const Object *o, double radius, float *sure) {
 }
 
 /* Write a fitted object as the i-th of the arrays; return whether there is nothing to lift. */
-static int write(Plan *k, Object *o, ptrdiff_t i, float *const lifted[6]) {
+static int write_lifted(Plan *k, Object *o, ptrdiff_t i, float *const lifted[6]) {
     int p = k->p, wide = k->wide;
     const int *pair = k->reference;
     double radius = 0, size = 0;
@@ -181,6 +181,6 @@ void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, in
             fit(k, gaps, k->some, perspective);
         }
         for (int i = 0; i < block; i++)
-            lost[start + i] = (char)write(k, k->objects + i, start + i, lifted);
+            lost[start + i] = (char)write_lifted(k, k->objects + i, start + i, lifted);
     }
 }

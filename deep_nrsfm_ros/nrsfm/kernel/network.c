@@ -40,7 +40,7 @@ INLINE void turn_inline(int n, float c, float s, const float *restrict V, const 
             Psi[r * n + j] = v > 0 ? v : 0;
         }
 }
-FAST(static, turn, (int n, float c, float s, const float *V, const float *b, float *Psi),
+FAST(turn, (int n, float c, float s, const float *V, const float *b, float *Psi),
             (n, c, s, V, b, Psi))
 
 /* Set the first block codes of n objects, (n, turns, 2, 3, k_1).
