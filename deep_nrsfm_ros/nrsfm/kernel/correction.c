@@ -21,16 +21,16 @@ INLINE void project_inline(int p, int i, const double *restrict Sigma,
         }
 }
 FAST(project,
-            (int p, int i, const double *Sigma, const double *cameras, double *HC, double *A, int wide),
-            (p, i, Sigma, cameras, HC, A, wide))
+     (int p, int i, const double *Sigma, const double *cameras, double *HC, double *A, int wide),
+     (p, i, Sigma, cameras, HC, A, wide))
 
 /* E (3, p) += what v (3) of point i says by `Sigma` (3, 3, p), which is symmetric. */
-INLINE void spread_inline(int p, const double *restrict Sigma, double x, double y, double z,
-                          double *restrict E) {
+INLINE void combine_inline(int p, const double *restrict Sigma, double x, double y, double z,
+                           double *restrict E) {
     for (int j = 0; j < 3 * p; j++)
         E[j] += x * Sigma[j] + y * Sigma[3 * p + j] + z * Sigma[6 * p + j];
 }
-FAST(spread, (int p, const double *Sigma, double x, double y, double z, double *E),
+FAST(combine, (int p, const double *Sigma, double x, double y, double z, double *E),
      (p, Sigma, x, y, z, E))
 
 void correct(Plan *k, Object *o, double noise) {
@@ -59,7 +59,7 @@ void correct(Plan *k, Object *o, double noise) {
     for (int i = 0; i < k->p; i++) {
         double x = A[(size_t)i * wide + n], y = A[(size_t)(p + i) * wide + n], v[3];
         for (int r = 0; r < 3; r++) v[r] = m[2 * r * p + i] * x + m[(2 * r + 1) * p + i] * y;
-        spread(p, k->covariance + (size_t)9 * p * i, v[0], v[1], v[2], E);
+        combine(p, k->covariance + (size_t)9 * p * i, v[0], v[1], v[2], E);
     }
     for (int r = 0; r < 3; r++)
         for (int i = 0; i < k->p; i++) o->S[r * k->wide + i] += (float)E[r * p + i];

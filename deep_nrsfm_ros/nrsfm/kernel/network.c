@@ -41,7 +41,7 @@ INLINE void turn_inline(int n, float c, float s, const float *restrict V, const 
         }
 }
 FAST(turn, (int n, float c, float s, const float *V, const float *b, float *Psi),
-            (n, c, s, V, b, Psi))
+     (n, c, s, V, b, Psi))
 
 /* Set the first block codes of n objects, (n, turns, 2, 3, k_1).
 
