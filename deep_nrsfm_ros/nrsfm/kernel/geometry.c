@@ -1,7 +1,6 @@
-/* geometry.py, for one object. */
-#include <math.h>
+#include "geometry.h"
 
-#include "algebra.h"
+#include <math.h>
 
 #define TINY 1e-12
 

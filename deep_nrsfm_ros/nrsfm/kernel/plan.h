@@ -1,12 +1,15 @@
 /* What a lifter knows before it sees any keypoints, and where it computes; `compiled.py` fills it.
 
    Shapes are stored with the points last, S (3, p), so that every layer is one `product`. Rows of S
-   are `wide` apart; `wide`, `points` and other symbols as in the package's legend.
+   are `wide` apart, p filled up to FLOATS. Symbols as in the package's legend.
 */
 #ifndef PLAN_H
 #define PLAN_H
 
+#include <stddef.h>
+
 #include "algebra.h"
+#include "geometry.h"
 
 #define MOST_LAYERS 64
 
@@ -36,7 +39,7 @@ typedef struct {
     double *M, *cameras, *HC, *A, *residual;
 } Plan;
 
-/* compiled.py: point `k` at its parts of three arrays; return whether these have the `lengths` of a plan. */
+/* compiled.py: point `k` at its parts of three arrays; return whether they have a plan's `lengths`. */
 int lay_out(Plan *k, const int *header, const float *floats, const double *doubles,
             const ptrdiff_t lengths[3]);
 
