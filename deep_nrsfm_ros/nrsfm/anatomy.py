@@ -1,8 +1,8 @@
 """What a layout knows of an object, as a loss: bones keep their lengths, the front is in front.
 
 Not of the paper, and no 3D label: edges and handedness are what an object file says in words. Views
-from one side only tell too little about depth for more than its amount; which way each limb goes is
-then a matter of chance, unless this is asked for (`recipe.Anatomy`).
+from one side only tell too little about depth: which way each limb goes, and how far what hardly
+moves, is then a matter of chance, unless this is asked for (`recipe.Anatomy`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _ALIKE = 4.0
 
 
 class AnatomyLoss:
-    """The weighted sum of both terms, of shapes in the network's axes, and its gradient.
+    """The weighted sum of the terms, of shapes in the network's axes, and its gradient.
 
     One weight at least is not zero.
     """
@@ -42,20 +42,22 @@ class AnatomyLoss:
         fours = [[layout.index(name) for name in four] for four in layout.handedness]
         self._votes = [list(corner) for corner in zip(*fours, strict=True)]
 
-    def __call__(self, S: Tensor) -> Tensor:
-        """Return the loss of a batch of shapes S (b, p, 3)."""
+    def __call__(self, S: Tensor, M: Tensor) -> Tensor:
+        """Return the loss of a batch of shapes S (b, p, 3) before cameras M (b, 3, 2)."""
         loss = S.new_zeros(())
         if self.weights.bones:
             loss = loss + self.weights.bones * self._bones(S)
         if self.weights.front:
             loss = loss + self.weights.front * self._front(S)
+        if self.weights.flat:
+            loss = loss + self.weights.flat * self._depth(S, M.detach())
         return loss
 
-    def gradient(self, S: Tensor) -> Tensor:
-        """Return the gradient (b, p, 3) by S; also within torch.inference_mode."""
+    def gradient(self, S: Tensor, M: Tensor) -> Tensor:
+        """Return the gradient (b, p, 3) by S; also within torch.inference_mode. M has none."""
         with torch.inference_mode(False), torch.enable_grad():
             X = S.clone().requires_grad_()
-            (S_bar,) = torch.autograd.grad(self(X), X)
+            (S_bar,) = torch.autograd.grad(self(X, M.clone()), X)
             return S_bar
 
     def _bones(self, S: Tensor) -> Tensor:
@@ -80,3 +82,11 @@ class AnatomyLoss:
         X = S - S.mean(1, keepdim=True)
         radius = (X * X).sum(-1).mean(1, keepdim=True).add(1e-12).sqrt()
         return torch.relu(_FRONT_MARGIN - heights / radius).mean()
+
+    @staticmethod
+    def _depth(S: Tensor, M: Tensor) -> Tensor:
+        """Return the extent in depth over that in the image, squares."""
+        X = S - S.mean(1, keepdim=True)
+        seen = X @ M
+        depth = X - seen @ M.mT
+        return ((depth * depth).sum((1, 2)) / (seen * seen).sum((1, 2)).clamp(min=1e-9)).mean()

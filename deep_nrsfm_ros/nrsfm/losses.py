@@ -152,7 +152,7 @@ class Objective:
             cycle = left.cycle.mean()
             total = total + self.recipe.cycle * cycle
         if self.anatomy:
-            total = total + self.anatomy(S[: len(M)])
+            total = total + self.anatomy(S[: len(M)], M)
         with torch.no_grad():
             shapes = S[: len(M)] + left.residual @ M.mT
             # Contiguous, as a checkpoint keeps it: the layout decides the last bit of a product.
@@ -170,7 +170,7 @@ class Objective:
         torch.matmul(P_bar, M[:b].mT, out=S_bar[:b])
         torch.matmul(S[:b].mT, P_bar, out=M_bar[:b])
         if self.anatomy:
-            S_bar[:b] += self.anatomy.gradient(S[:b])
+            S_bar[:b] += self.anatomy.gradient(S[:b], M[:b])
         if left.cycle is not None:
             again_bar = self._weighed(net, self.recipe.cycle * left.cycle.gradient())
             torch.sub(again_bar, again_bar.mean(-2, keepdim=True), out=S_bar[b:])

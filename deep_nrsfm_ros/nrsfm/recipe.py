@@ -47,7 +47,7 @@ class Recipe:
 class Anatomy:
     """What the layout knows of the object.
 
-    Both are off by default, as in the paper, which knows nothing of bones and fronts.
+    All is off by default, as in the paper, which knows nothing of bones and fronts.
     """
 
     bones: float = option(
@@ -61,6 +61,13 @@ class Anatomy:
         0.0,
         "weight of the handedness while training: the keypoints that the layout says are in front "
         "should be; for the same objects, 1 is much; 0: none",
+        low=0.0,
+        high=1000.0,
+    )
+    flat: float = option(
+        0.0,
+        "weight of depth, so that there is no more of it than the rest asks for, bones that keep "
+        "their lengths above all; for the same objects, 0.3 is much; 0: none",
         low=0.0,
         high=1000.0,
     )

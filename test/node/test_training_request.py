@@ -49,7 +49,7 @@ def test_the_training_command_understands_every_word(tmp_path):
     curation = Curation(min_visible=7, thin=0.25, outliers=3.5)
     wanted = request(recipe, bags=(str(tmp_path), "second bag"), name="mine", threads=3)
     limits = Limits(minutes=2.5, patience=0.25, keep_best=False)
-    anatomy = Anatomy(bones=1.5, front=0.5)
+    anatomy = Anatomy(bones=1.5, front=0.5, flat=0.25)
     wanted = dataclasses.replace(wanted, curation=curation, limits=limits, anatomy=anatomy)
     given = arguments().parse_args(wanted.arguments())
     assert given.bag == [tmp_path, Path("second bag")]

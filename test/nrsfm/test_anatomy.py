@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -37,6 +38,10 @@ some = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
+def cameras(seed: int, f: int = 7) -> torch.Tensor:
+    return torch.from_numpy(random_cameras(f, np.random.default_rng(seed))).double()
+
+
 def shapes(seed: int, f: int = 7) -> torch.Tensor:
     rng = np.random.default_rng(seed)
     return torch.from_numpy(STANDING + 0.3 * rng.standard_normal((f, 6, 3)))
@@ -58,7 +63,7 @@ def test_bones_by_the_book(seed: int) -> None:
             for e, (mean, other) in enumerate(zip(means, partners, strict=True))
         ]
     )
-    found = AnatomyLoss(Anatomy(bones=2.0), ANIMAL)(torch.from_numpy(S))
+    found = AnatomyLoss(Anatomy(bones=2.0), ANIMAL)(torch.from_numpy(S), cameras(seed))
     np.testing.assert_allclose(found, 2 * expected, rtol=1e-6)
 
 
@@ -67,38 +72,56 @@ def test_bones_by_the_book(seed: int) -> None:
 def test_the_front_is_what_the_handedness_votes_on(seed: int) -> None:
     S = shapes(seed)
     missed = np.maximum(0.1 - votes(S.numpy(), ANIMAL), 0).mean()
-    found = AnatomyLoss(Anatomy(front=3.0), ANIMAL)(S)
+    found = AnatomyLoss(Anatomy(front=3.0), ANIMAL)(S, cameras(seed))
     np.testing.assert_allclose(found, 3 * missed, rtol=1e-6, atol=1e-9)
+
+
+@some
+@given(seeds)
+def test_depth_is_what_the_image_does_not_show(seed: int) -> None:
+    S, M = centre(shapes(seed).numpy()), cameras(seed).numpy()
+    third = np.cross(M[:, :, 0], M[:, :, 1])
+    depths = np.einsum("fpr,fr->fp", S, third)
+    expected = ((depths**2).sum(1) / ((S @ M) ** 2).sum((1, 2))).mean()
+    found = AnatomyLoss(Anatomy(flat=2.0), ANIMAL)(torch.from_numpy(S) + 5, cameras(seed))
+    np.testing.assert_allclose(found, 2 * expected, rtol=1e-6)
 
 
 @some
 @given(seeds, st.floats(0.1, 10))
 def test_neither_place_nor_turn_nor_size_matters(seed: int, size: float) -> None:
-    S, loss = shapes(seed), AnatomyLoss(Anatomy(bones=1.0, front=1.0), ANIMAL)
+    S, M, loss = shapes(seed), cameras(seed), AnatomyLoss(Anatomy(1.0, 1.0, 1.0), ANIMAL)
     Q, _ = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
     Q *= np.sign(np.linalg.det(Q))
-    moved = size * S @ torch.from_numpy(Q) + torch.arange(3)
-    torch.testing.assert_close(loss(moved), loss(S), rtol=1e-5, atol=1e-7)
+    turn = torch.from_numpy(Q)
+    moved = size * S @ turn + torch.arange(3)
+    torch.testing.assert_close(loss(moved, turn.mT @ M), loss(S, M), rtol=1e-5, atol=1e-7)
+
+
+def judge(name: str) -> Callable[[torch.Tensor], float]:
+    """Return the loss by one weight alone, of shapes seen along z."""
+    loss = AnatomyLoss(Anatomy(**{name: 1.0}), ANIMAL)
+    return lambda S: float(loss(S, torch.eye(3, dtype=S.dtype)[:, :2].expand(len(S), 3, 2)))
 
 
 def test_a_sound_body_costs_nothing_and_its_mirror_image_does() -> None:
     S = torch.from_numpy(np.repeat(STANDING[None], 4, 0))
-    bones, front = (AnatomyLoss(Anatomy(**{name: 1.0}), ANIMAL) for name in ("bones", "front"))
-    assert float(bones(S)) < 1e-12 and float(front(S)) == 0
+    bones, front = (judge(name) for name in ("bones", "front"))
+    assert bones(S) < 1e-12 and front(S) == 0
     mirrored = S * torch.tensor([1, 1, -1])
-    assert float(bones(mirrored)) < 1e-12 and float(front(mirrored)) > 0.1
+    assert bones(mirrored) < 1e-12 and front(mirrored) > 0.1
     one_leg_long = S.clone()
     one_leg_long[:, 4, 1] = 2
-    assert float(bones(one_leg_long)) > 0.01 and float(front(one_leg_long)) == 0
+    assert bones(one_leg_long) > 0.01 and front(one_leg_long) == 0
 
 
 def test_the_gradient_is_that_of_small_changes_also_without_autograd() -> None:
-    S, loss = shapes(0), AnatomyLoss(Anatomy(bones=3.0, front=1.0), ANIMAL)
+    S, M, loss = shapes(0), cameras(0), AnatomyLoss(Anatomy(3.0, 1.0, 0.5), ANIMAL)
     change = torch.from_numpy(np.random.default_rng(1).standard_normal(S.shape))
     h = 1e-6
-    expected = (loss(S + h * change) - loss(S - h * change)) / (2 * h)
+    expected = (loss(S + h * change, M) - loss(S - h * change, M)) / (2 * h)
     with torch.inference_mode():
-        found = (loss.gradient(S) * change).sum()
+        found = (loss.gradient(S, M) * change).sum()
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-9)
 
 
@@ -110,7 +133,7 @@ def test_a_layout_must_have_what_is_asked_for() -> None:
         Anatomy(front=1.0).check(bare)
     Anatomy().check(bare)
     for layout in (HUMAN17, CMU31):
-        AnatomyLoss(Anatomy(1.0, 1.0), layout)
+        AnatomyLoss(Anatomy(1.0, 1.0, 1.0), layout)
 
 
 def test_a_training_heeds_it() -> None:
@@ -128,8 +151,7 @@ def test_a_training_heeds_it() -> None:
         trainer = train(seen, np.ones((300, 6), bool), preset, anatomy=loss)
         net = trainer.net.map(lambda w: w.numpy())
         S, _ = reconstruct(net, preset.normaliser.encode(seen, np.ones((300, 6, 1))).W)
-        judged = (AnatomyLoss(Anatomy(**{name: 1.0}), ANIMAL) for name in ("bones", "front"))
-        found.append([float(one(torch.from_numpy(S))) for one in judged])
+        found.append([judge(name)(torch.from_numpy(S)) for name in ("bones", "front")])
     without, heeded = found
     assert heeded[0] < 0.5 * without[0] and heeded[1] < 0.5 * without[1] + 1e-3
     assert all(a != b for a, b in pairwise(found))

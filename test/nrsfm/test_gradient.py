@@ -69,7 +69,7 @@ def test_it_is_the_gradient_that_torch_finds(
         edges=(("a", "b"), ("b", "c")),
         handedness=(("a", "b", "c", "d"),),
     )
-    anatomy = AnatomyLoss(Anatomy(bones=1.0, front=1.0), layout) if known_object else None
+    anatomy = AnatomyLoss(Anatomy(1.0, 1.0, 1.0), layout) if known_object else None
     objective = Objective(Normaliser(), Recipe(cycle=cycle), whitened=whitened, anatomy=anatomy)
     frames, known = task(p, seed)
     # The random numbers of both are the same, but torch draws them as it draws float32.
