@@ -39,19 +39,22 @@ def observation(
 
     Values without a confidence are certain; a confidence above 1 counts as 1.
     """
-    with np.errstate(over="ignore"):
-        values = values.astype(np.float32)
-    x, y = values[..., 0], values[..., 1]
+    if values.dtype != np.float32:
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = values.astype(np.float32)
+    planes = values.transpose(2, 0, 1)
+    x, y = planes[0], planes[1]
     # NaN compares false, so the first test drops it together with infinity.
-    seen = (np.abs(values).max(-1) < _FARTHEST) & ((x != 0) | (y != 0))
-    if values.shape[-1] == 3:
-        confidence = np.minimum(values[..., 2], np.float32(1))
+    seen = np.logical_and.reduce(np.abs(planes) < _FARTHEST)
+    seen &= np.logical_or(x, y)
+    confidence = np.ones_like(x)
+    if len(planes) == 3:
+        confidence = np.minimum(planes[2], confidence)
         seen &= confidence >= max(np.float32(min_confidence), _LEAST)
-    else:
-        confidence = np.ones_like(x)
-    points = values[..., :2]
-    points[~seen] = confidence[~seen] = 0
-    return Observation(points, confidence, ids)
+    points = np.zeros((*seen.shape, 2), np.float32)
+    np.copyto(points[..., 0], x, where=seen)
+    np.copyto(points[..., 1], y, where=seen)
+    return Observation(points, np.where(seen, confidence, np.float32(0)), ids)
 
 
 def check_keypoints(count: int, keypoints: int, where: str) -> None:
