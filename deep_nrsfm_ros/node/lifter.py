@@ -151,8 +151,7 @@ class LifterNode(Node):
         if self._markers.get_subscription_count():
             edges = self._pipeline.edges
             self._markers.publish(publishing.markers(header, lifted, edges, placed=placed))
-        fit = lifted.residual, lifted.object_confidence
-        self._health.lifted(time.perf_counter() - started, *fit)
+        self._health.lifted(time.perf_counter() - started, lifted.residual, lifted.confidence)
 
     def _reject(self, source: Source, problem: Exception) -> None:
         """Count a message that could not be lifted; say why, but not too often."""
