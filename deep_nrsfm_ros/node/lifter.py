@@ -16,13 +16,13 @@ It never imports torch: lifting is NumPy, and training is a process of its own.
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
@@ -142,7 +142,7 @@ class LifterNode(Node):
             return
         placed = self._camera.wanted
         self._points.publish(publishing.point_cloud(header, lifted))
-        if not np.isnan(lifted.residual[0]):
+        if not math.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
         if told:
             self._objects.publish(publishing.objects(header, lifted, names, placed=placed))

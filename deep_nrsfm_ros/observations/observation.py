@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 # No image is this large, and sums of squares stay far below the largest float32.
 _FARTHEST = 1e9
+_CERTAIN, _MISSING = np.float32(1), np.float32(0)
 _LEAST = np.nextafter(np.float32(0), np.float32(1))
 
 Ids = tuple[str | None, ...]
@@ -43,18 +44,17 @@ def observation(
         with np.errstate(over="ignore", invalid="ignore"):
             values = values.astype(np.float32)
     planes = values.transpose(2, 0, 1)
-    x, y = planes[0], planes[1]
     # NaN compares false, so the first test drops it together with infinity.
     seen = np.logical_and.reduce(np.abs(planes) < _FARTHEST)
-    seen &= np.logical_or(x, y)
-    confidence = np.ones_like(x)
+    seen &= np.logical_or(planes[0], planes[1])
     if len(planes) == 3:
-        confidence = np.minimum(planes[2], confidence)
-        seen &= confidence >= max(np.float32(min_confidence), _LEAST)
+        seen &= planes[2] >= max(np.float32(min_confidence), _LEAST)
+        confidence = np.where(seen, np.minimum(planes[2], _CERTAIN), _MISSING)
+    else:
+        confidence = np.where(seen, _CERTAIN, _MISSING)
     points = np.zeros((*seen.shape, 2), np.float32)
-    np.copyto(points[..., 0], x, where=seen)
-    np.copyto(points[..., 1], y, where=seen)
-    return Observation(points, np.where(seen, confidence, np.float32(0)), ids)
+    np.copyto(points, values[..., :2], where=seen[..., None])
+    return Observation(points, confidence, ids)
 
 
 def check_keypoints(count: int, keypoints: int, where: str) -> None:

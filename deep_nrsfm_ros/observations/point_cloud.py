@@ -35,16 +35,15 @@ class CloudMake(NamedTuple):
 
         data: holds theirs, the first from the byte `start` on, each next one `apart` bytes later.
         """
-        n, q = messages * self.height, self.width
-        values = np.empty((len(self.formats), n, q), np.float32)
-        if not n:
-            return values.transpose(1, 2, 0)
-        shape, steps = (messages, self.height, q), (apart, self.row_step, self.point_step)
-        with np.errstate(over="ignore", invalid="ignore"):  # any bytes may come
-            for plane, form, offset in zip(values, self.formats, self.offsets, strict=True):
-                found: NDArray[Any] = np.ndarray(shape, form, data, start + offset, steps)
-                plane.reshape(shape)[...] = found
-        return values.transpose(1, 2, 0)
+        shape = (messages, self.height, self.width)
+        steps = (apart, self.row_step, self.point_step)
+        values = np.empty((len(self.formats), *shape), np.float32)
+        if self.height:
+            with np.errstate(over="ignore", invalid="ignore"):  # any bytes may come
+                for i, form in enumerate(self.formats):
+                    values[i] = np.ndarray(shape, form, data, start + self.offsets[i], steps)
+        together = (len(values), messages * self.height, self.width)
+        return values.reshape(together).transpose(1, 2, 0)
 
 
 def make_of(message: Any, keypoints: int) -> CloudMake:
