@@ -130,6 +130,19 @@ def plain(n: int = 1, frame_id: str = "camera") -> bytes:
     return bytes(serialize_message(renewed(message, 1, n * Q * 8)))
 
 
+@BOTH
+def test_no_byte_is_overlooked(origin: str) -> None:
+    raw = plain(2)
+    reader = Reader(POINT_CLOUD, DECODERS[origin])
+    for at in range(len(raw)):
+        for bit in (1, 2, 128):
+            reader(raw, Q)
+            spoilt = raw[:at] + bytes([raw[at] ^ bit]) + raw[at + 1 :]
+            assert outcome(lambda: reader(spoilt, Q)) == outcome(  # noqa: B023
+                lambda: long_way(spoilt, origin, Q)  # noqa: B023
+            )
+
+
 def test_bytes_between_numbers_do_not_matter() -> None:
     raw = bytearray(plain(frame_id="a"))  # after it two bytes that senders leave to chance
     reader = Reader(POINT_CLOUD, DECODERS["live"])
