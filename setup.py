@@ -23,7 +23,7 @@ setup(
             f"{NAME}.nrsfm._kernel",
             glob(f"{NAME}/nrsfm/kernel/*.c"),
             depends=glob(f"{NAME}/nrsfm/kernel/*.h"),
-            extra_compile_args=["-O3", "-fno-math-errno", "-fno-trapping-math"],
+            extra_compile_args="-O3 -fno-math-errno -fno-trapping-math -fvisibility=hidden".split(),
             optional=True,
         )
     ],

@@ -57,6 +57,7 @@ QUALITY = {
     "cycle": "label-free: error of reconstructing its own shapes seen from elsewhere",
 }
 _SHOWN = {name: CONVENTIONS[name] for name in ("shape %", "proper %", "mirrored %")}
+_ANATOMY = ("--bones", "3", "--front", "1")
 _DRAWN = 8
 _AT_ONCE = 256
 UNTOUCHED = {
@@ -113,9 +114,13 @@ def video(session: Session) -> Table:
     """Train on the detections of a real video, with and without the shipped model's knowledge."""
     bag = session.bag("video_bag", partial(_people, session.data / VIDEO))
     words = ("--bag", str(bag), "--keypoint-layout", BODY25.name)
+    alone = (*words, "--object", HUMAN17.name)
     shipped = load_model(find_model("human", model_folders(session.models)))
     models = {
-        "this video alone": session.trained("video", "video", *words, "--object", HUMAN17.name),
+        "this video alone": session.trained("video", "video", *alone),
+        "this video, and what its layout knows": session.trained(
+            "video_anatomy", "video", *alone, *_ANATOMY
+        ),
         "human, tuned to it": session.trained("tuned", "tuned", *words, "--from", "human"),
         "human": shipped,
     }
@@ -132,6 +137,8 @@ def video(session: Session) -> Table:
         "mirrored to human %": "objects that are more like the mirror image of what the model "
         "human makes of them, which is no truth either",
         "human, flat": "the same without its depth, for comparison",
+        "what its layout knows": f"`{' '.join(_ANATOMY)}`: its training was told what faces, "
+        "knees, toes and bones measure, so that these say little of it",
     }
     chosen = np.linspace(0, len(there) - 1, _DRAWN).astype(int).tolist()
     table = Table(

@@ -27,7 +27,7 @@ import rclpy
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -45,6 +45,7 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "smooth": (True, "let MediaPipe smooth the landmarks over time, which makes them late"),
 }
 LANDMARKS = 33
+ENDING = (signal.SIGINT, signal.SIGTERM)
 # Bytes of a pixel, and the places of red, green and blue in it.
 ENCODINGS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "mono8": (1, [0, 0, 0])}
 
@@ -183,18 +184,32 @@ class DetectorNode(Node):
 
 def main() -> None:
     """Run the node until its files end or it is told to stop; exit code 1 for a bad source."""
+    # rclpy's handlers come on top of these and shut the context down, which ends `spin`; Python's
+    # own would raise KeyboardInterrupt wherever it is, in the middle of rclpy or of MediaPipe.
+    for number in ENDING:
+        signal.signal(number, lambda *_: None)
     rclpy.init()
     try:
         node = DetectorNode()
-        rclpy.spin_until_future_complete(node, node.finished)
-        node.close()
     except ValueError as error:
+        rclpy.shutdown()
         sys.exit(f"detector: {error}")
-    except (KeyboardInterrupt, ExternalShutdownException):
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        # Not for ever: now and then rclpy wakes for a signal before it has shut down, and waits on.
+        while rclpy.ok() and not node.finished.done():
+            executor.spin_once(timeout_sec=0.5)
+        if rclpy.ok():
+            node.close()
+    except ExternalShutdownException:
         pass
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a launcher sends it twice
+        executor.shutdown()
+        node.destroy_node()
         rclpy.try_shutdown()
+        for number in ENDING:  # launchers and terminals send the signal twice
+            signal.signal(number, signal.SIG_IGN)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from deep_nrsfm_ros.node.training_request import TrainingOptions
 from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointLayout
 from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.limits import Limits
-from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.recipe import Anatomy, Recipe
 from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations.curation import Curation
 
@@ -44,6 +44,7 @@ def parameter_rows(cls: type, prefix: str) -> list[str]:
         (SteadyingOptions, "steady."),
         (TrainingOptions, "train."),
         (Recipe, "train."),
+        (Anatomy, "train."),
         (Limits, "train."),
         (Curation, "train."),
     ],

@@ -41,7 +41,7 @@ from deep_nrsfm_ros.nrsfm.model_file import (
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
-from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Anatomy, Preset, Recipe
 from deep_nrsfm_ros.observations.bags import most_keypoints, read_bags
 from deep_nrsfm_ros.observations.curation import Curated, Curation
 from deep_nrsfm_ros.observations.ensemble import Ensemble
@@ -110,7 +110,7 @@ def arguments() -> argparse.ArgumentParser:
         "data and options",
     )
     run.add_argument("--json-progress", action="store_true", help="one JSON object a line")
-    for config in (Recipe, Limits, Architecture, Normaliser, Curation):
+    for config in (Recipe, Anatomy, Limits, Architecture, Normaliser, Curation):
         add_arguments(parser, config)
     return parser
 
@@ -230,7 +230,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         raise ValueError("training needs torch, which is not installed: pip install torch")
     curated, variation = prepare(given, read_data(given, report), report.say)
     asked = {name: value for name, value in vars(given).items() if name not in NOT_ASKED}
-    for options in (*preset, limits, chosen_curation(given)):
+    for options in (*preset, override(Anatomy(), given), limits, chosen_curation(given)):
         asked |= dataclasses.asdict(options)
     # Of several processes the first keeps the record; the others only know where it is.
     others = nullcontext(checkpoint_file(given.output, given.name))
@@ -255,6 +255,8 @@ def learn(
     if ensemble.layout.warning and not start:
         report.warn(ensemble.layout.warning)
     network = start_from(start, ensemble.layout) if start else None
+    weights = override(Anatomy(), given)
+    weights.check(ensemble.layout)
     seen = ensemble.visible.sum(0)
     unseen = [name for i, name in enumerate(ensemble.layout.keypoints) if not seen[i]]
     if unseen:
@@ -262,6 +264,7 @@ def learn(
     report.say(f"{len(ensemble)} frames of {len(ensemble.layout)} keypoints ({ensemble.source})")
     import torch  # seconds to import: bad arguments should not wait for it
 
+    from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
     from deep_nrsfm_ros.nrsfm.training import finish, train
 
     if given.threads:
@@ -278,6 +281,7 @@ def learn(
         checkpoint=checkpoint,
         start=network,
         team=team,
+        anatomy=AnatomyLoss(weights, ensemble.layout) if weights != Anatomy() else None,
     )
     team.leave()
     if team.rank:

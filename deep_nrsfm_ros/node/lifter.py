@@ -56,7 +56,7 @@ from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
 from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.object_file import find_layout
-from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.recipe import Anatomy, Recipe
 from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations.curation import Curation
 from deep_nrsfm_ros.observations.serialised import Header
@@ -83,6 +83,7 @@ class LifterNode(Node):
         parameters.declare(self, SteadyingOptions, _STEADY)
         training = parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
+        parameters.declare(self, Anatomy, _TRAIN)
         parameters.declare(self, Limits, _TRAIN)
         parameters.declare(self, Curation, _TRAIN)
         self._fence = Fence(
@@ -184,7 +185,7 @@ class LifterNode(Node):
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
         steadying = parameters.read(self, SteadyingOptions, _STEADY, changes)
-        for checked in (TrainingOptions, Recipe, Limits, Curation):
+        for checked in (TrainingOptions, Recipe, Anatomy, Limits, Curation):
             parameters.read(self, checked, _TRAIN, changes)
         # Files are read again only when they are named again: they may be gone by now.
         changed = {change.name for change in changes} or {"model", "keypoint_layout"}
@@ -237,6 +238,7 @@ class LifterNode(Node):
             min_confidence=inputs.min_confidence,
             output=self._fence.models_dir,
             curation=parameters.read(self, Curation, _TRAIN),
+            anatomy=parameters.read(self, Anatomy, _TRAIN),
             limits=limited(parameters.read(self, Limits, _TRAIN), wanted.max_minutes),
         )
 

@@ -24,7 +24,7 @@ from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, check_name, load_model
 from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
-from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.recipe import Anatomy, Recipe
 from deep_nrsfm_ros.observations.curation import Curation
 from deep_nrsfm_ros.observations.mapping_file import MAPPING_SUFFIXES
 
@@ -133,6 +133,7 @@ class TrainingRequest:
     output: Path
     curation: Curation = Curation()
     limits: Limits = Limits()
+    anatomy: Anatomy = Anatomy()
     input_type: str = ""
     image_width: int = 0
     image_height: int = 0
@@ -151,6 +152,7 @@ class TrainingRequest:
             if not Path(bag).expanduser().exists():
                 raise ValueError(f"train.bags names {bag}, which does not exist")
         if self.target_layout == NUMBERED:
+            self.anatomy.check(KeypointLayout(NUMBERED, ()))
             if self.source_layout:
                 raise ValueError(
                     f"train.object is {NUMBERED!r}: its points come as they are in the bags; "
@@ -160,6 +162,7 @@ class TrainingRequest:
         source = find_layout("train.keypoint_layout", self.source_layout)
         target = find_layout("train.object", self.target_layout)
         KeypointMap(source, target)
+        self.anatomy.check(target)
         if self.start:
             start_from(load_model(Path(self.start)), target)
         return target.warning
@@ -185,7 +188,7 @@ class TrainingRequest:
         words += [f"{name}={value}" for name, value in named.items()]  # even one that begins with -
         for bag in self.options.bags:
             words += [f"--bag={Path(bag).expanduser()}"]
-        for config in (self.recipe, self.limits, self.curation):
+        for config in (self.recipe, self.anatomy, self.limits, self.curation):
             words += to_arguments(config)
         return words
 
@@ -221,6 +224,7 @@ class TrainingRequest:
             "image_width": self.image_width,
             "image_height": self.image_height,
             **dataclasses.asdict(self.recipe),
+            **dataclasses.asdict(self.anatomy),
             **dataclasses.asdict(self.limits),
             **dataclasses.asdict(self.curation),
         }

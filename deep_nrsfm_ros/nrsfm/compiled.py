@@ -7,12 +7,14 @@ same some ten times slower.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.nrsfm.confidence import CALIBRATED
-from deep_nrsfm_ros.nrsfm.fitting import Constants
+from deep_nrsfm_ros.nrsfm.confidence import CALIBRATED, LEAST_RESIDUAL
+from deep_nrsfm_ros.nrsfm.correction import UNKNOWN
+from deep_nrsfm_ros.nrsfm.fitting import NEAREST, RESIDUAL_SPREAD, Constants
 from deep_nrsfm_ros.nrsfm.network import Network, filling
 
 try:
@@ -21,7 +23,6 @@ except ImportError:  # no compiler at installation
     _kernel = None  # type: ignore[assignment]
 
 AVAILABLE = _kernel is not None
-_LANES = 16  # of the kernel: rows are padded to a multiple of it
 
 
 def fits(network: Network) -> bool:
@@ -42,15 +43,21 @@ class Kernel:
         header += [constants.covariance is not None]
         header += [constants.refill, *(constants.reference or (-1, -1)), constants.min_visible]
         header += [*options.widths, *(constants.partners or range(p))]
-        floats = [_padded(net.L), _padded(net.L_inverse)]
+        floats = [_panels(net.L), _panels(net.L_inverse)]
         for i, (D, b, b_) in enumerate(zip(net.D, net.b, net.b_, strict=True)):
-            encoder = D if i else D.reshape(p, -1)
-            # The shape's coordinates come out one after the other, (3, p).
-            decoder = D.T if i else D.transpose(2, 1, 0).reshape(-1, 3 * p)
-            floats += [_padded(encoder), b, _padded(decoder), b_ if i else b_.T]
-        floats += [_padded(net.code_head), net.camera_head, constants.spread]
-        doubles = [filling(net), constants.turns, constants.frame, covariance, CALIBRATED]
-        doubles += [constants.noise, constants.length, np.trace(covariance) / (3 * p)]
+            # Of shapes, the coordinates stand one after the other, (3, p).
+            encoder = D if i else _padded(D).reshape(p, -1)
+            decoder = D.T if i else _padded(D.transpose(2, 1, 0)).reshape(D.shape[2], -1)
+            floats += [_panels(encoder), _padded(b), _panels(decoder), _padded(b_ if i else b_.T)]
+        last = options.widths[-1]
+        code_head = _padded(net.code_head.reshape(6, last, last).swapaxes(1, 2)).swapaxes(1, 2)
+        floats += [_panels(code_head.reshape(-1, last)), net.camera_head, constants.spread]
+        # Three rows for each point: (p, 3, 3, p).
+        rows = covariance.reshape(p, 3, p, 3).swapaxes(2, 3)
+        doubles = [_padded(rows, _kernel.DOUBLES), filling(net), constants.turns, constants.frame]
+        doubles += [CALIBRATED, constants.noise, constants.length]
+        doubles += [UNKNOWN * np.trace(covariance) / (3 * p), NEAREST, RESIDUAL_SPREAD]
+        doubles += [LEAST_RESIDUAL]
         self._plan = _kernel.plan(
             np.array(header, np.int32), _joined(floats, np.float32), _joined(doubles, np.float64)
         )
@@ -78,8 +85,15 @@ class Kernel:
         return lifted, lost
 
 
-def _padded(A: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.pad(A, ((0, 0), (0, -A.shape[1] % _LANES)))
+def _padded(A: NDArray[Any], multiple: int | None = None) -> NDArray[Any]:
+    """Return A (..., n) filled up with zeros to n a multiple, by default of FLOATS."""
+    more = -A.shape[-1] % (multiple or _kernel.FLOATS)
+    return np.pad(A, ((0, 0),) * (A.ndim - 1) + ((0, more),))
+
+
+def _panels(A: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return A (k, n) in panels of some columns, (panels, k, columns), as the kernel reads it."""
+    return _padded(A).reshape(len(A), -1, _kernel.FLOATS).swapaxes(0, 1)
 
 
 def _joined(parts: Sequence[object], kind: type) -> NDArray[np.float32]:

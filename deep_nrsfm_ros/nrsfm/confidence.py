@@ -22,7 +22,7 @@ Floats = NDArray[Any]
 
 NEAR = 0.1
 """Distance, in sizes of the object, within which a point is near its true place."""
-_LEAST_RESIDUAL = 0.02  # what a residual is never better than
+LEAST_RESIDUAL = 0.02  # what a residual is never better than
 
 
 class Calibration(NamedTuple):
@@ -47,7 +47,7 @@ def evidence(visible: NDArray[np.bool_], residual: Floats, spread: Floats) -> Fl
     n, p = visible.shape
     values = np.ones((n, p, 4), np.float32)
     values[..., 1] = np.log(spread)
-    values[..., 2] = np.log(residual + _LEAST_RESIDUAL)[:, None]
+    values[..., 2] = np.log(residual + LEAST_RESIDUAL)[:, None]
     values[..., 3] = np.log(np.maximum(visible.sum(1), 1) / p)[:, None]
     return values
 

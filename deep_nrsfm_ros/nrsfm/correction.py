@@ -26,7 +26,7 @@ from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, random_cameras, rotati
 _ROUNDS = 2
 _FLOOR = 1e-4  # variance of every direction, relative to the mean: any keypoints can be met
 _BLOCK = 64  # frames at a time: more do not fit the cache, and take five times as long
-_UNKNOWN = 1e4  # variance of what is not known at all, relative to that of the errors
+UNKNOWN = 1e4  # variance of what is not known at all, relative to that of the errors
 
 
 def correct(
@@ -54,7 +54,7 @@ def correct(
     CH = covariance.reshape(3 * p, p, 3).swapaxes(0, 1) @ M  # (n, p, 3p, 2)
     CH = CH.swapaxes(1, 2).reshape(n, p, 3, 2 * p)
     A = M.swapaxes(-1, -2) @ CH  # H Sigma H^T
-    unknown = _UNKNOWN * np.trace(covariance) / (3 * p)
+    unknown = UNKNOWN * np.trace(covariance) / (3 * p)
     # Not quite zero, so that there is an answer even where M is no camera.
     spread = np.where(visible, np.square(noise)[:, None] + 1e-12 * unknown, unknown)  # (n, p)
     A = A.reshape(n, p, 2, p, 2)

@@ -28,8 +28,8 @@ Float32 = NDArray[np.float32]
 
 # The mirror image of an object, whose y axis points to its left, and of an image.
 _ACROSS = np.array([1, -1, 1], np.float32)
-_NEAREST = np.float32(0.1)  # depth of a point, relative to its object's, that is not undercut
-_RESIDUAL_SPREAD = 0.02  # squared residual by which a turn loses all but 1/e of its weight
+NEAREST = np.float32(0.1)  # depth of a point, relative to its object's, that is not undercut
+RESIDUAL_SPREAD = 0.02  # squared residual by which a turn loses all but 1/e of its weight
 
 
 class Constants(NamedTuple):
@@ -73,7 +73,7 @@ class Fit:
                 S, _, _, unit, origin = fitted
                 seen = unit * S[..., :2] + origin
                 if perspective:
-                    seen /= np.maximum(1 + unit * S[..., 2:], _NEAREST)
+                    seen /= np.maximum(1 + unit * S[..., 2:], NEAREST)
                 filled = np.where(visible[..., None], points, seen)
                 fitted = self._fit(filled, whole, visible, perspective)
         S, R, residual, _, _ = fitted
@@ -141,9 +141,9 @@ class Fit:
             M[half:] *= _ACROSS[:, None] * _ACROSS[1:]
         M = M @ turns[:, None]
         S = S @ rotation_from_camera(M).swapaxes(-1, -2)
-        P = S[..., :2] if unit is None else S[..., :2] / np.maximum(1 + unit * S[..., 2:], _NEAREST)
+        P = S[..., :2] if unit is None else S[..., :2] / np.maximum(1 + unit * S[..., 2:], NEAREST)
         residual = reprojection_error(W, P, visible)
-        trust = np.exp((residual.min(0) ** 2 - residual**2) / _RESIDUAL_SPREAD)
+        trust = np.exp((residual.min(0) ** 2 - residual**2) / RESIDUAL_SPREAD)
         trust /= trust.sum(0)
         M = (trust[..., None, None] * M).sum(0)
         return (

@@ -57,8 +57,8 @@ def disagreement(S: Floats, layout: KeypointLayout, seen: NDArray[np.bool_] | No
     told = ", ".join(f"{front} in {100 * share:.0f} %" for front, share in shares)
     return (
         f"the keypoints disagree on where the front is, so that depth is wrong in part ({told} of "
-        "the frames where it belongs); record the object from more sides, or start from a model "
-        "that knows it (--from, train.from)"
+        "the frames where it belongs); record the object from more sides, start from a model that "
+        "knows it (--from, train.from), or let the layout help (bones, front)"
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 
@@ -40,6 +41,39 @@ class Recipe:
         1000, "steps after which they are compared, at most a tenth of all", low=1
     )
     seed: int = option(0, "seed of everything random", low=0, high=2**31)
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """What the layout knows of the object.
+
+    Both are off by default, as in the paper, which knows nothing of bones and fronts.
+    """
+
+    bones: float = option(
+        0.0,
+        "weight of bones that keep their lengths, left ones as long as right ones, for an object "
+        "whose edges are rigid that was seen from one side only; 3 is much; 0: none",
+        low=0.0,
+        high=1000.0,
+    )
+    front: float = option(
+        0.0,
+        "weight of the handedness while training: the keypoints that the layout says are in front "
+        "should be; for the same objects, 1 is much; 0: none",
+        low=0.0,
+        high=1000.0,
+    )
+
+    def check(self, layout: KeypointLayout) -> None:
+        """Raise ValueError if the layout has nothing of what is asked for."""
+        for weight, field in (("bones", "edges"), ("front", "handedness")):
+            asked = getattr(self, weight)
+            if asked and not getattr(layout, field):
+                raise ValueError(
+                    f"{weight} is {asked:g}, but layout {layout.name!r} has no {field}; give it "
+                    "some in an object file, or ask for 0"
+                )
 
 
 class Preset(NamedTuple):

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
 from deep_nrsfm_ros.nrsfm.distributed import ALONE, Team
 from deep_nrsfm_ros.nrsfm.gradient import descend
 from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
@@ -34,6 +35,7 @@ class Trainer:
         seed: int,
         start: Network | None = None,
         team: Team = ALONE,
+        anatomy: AnatomyLoss | None = None,
     ) -> None:
         """Initialise the network from `seed`, or take that of `start`.
 
@@ -67,7 +69,7 @@ class Trainer:
         self.weights = torch.cat([w.flatten() for _, w in self.initial.learned()])
         self.net = self._views()
         self.optimiser = torch.optim.Adam([self.weights], lr=recipe.learning_rate, fused=True)
-        self.objective = Objective(normaliser, recipe)
+        self.objective = Objective(normaliser, recipe, anatomy=anatomy)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)

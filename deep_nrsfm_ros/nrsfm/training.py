@@ -15,6 +15,7 @@ from torch import Tensor
 
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
 from deep_nrsfm_ros.nrsfm.best import Best
 from deep_nrsfm_ros.nrsfm.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.nrsfm.correction import error_covariance
@@ -47,6 +48,7 @@ def train(
     checkpoint_seconds: float = 30.0,
     start: Network | None = None,
     team: Team = ALONE,
+    anatomy: AnatomyLoss | None = None,
 ) -> Trainer:
     """Train on keypoints (f, p, 2) with visibility (f, p), any unit, x right and y down.
 
@@ -60,7 +62,8 @@ def train(
     seeds to choose from then. `on_step` sees the trainer when its seed is chosen and after each
     step from then on; `on_progress` hears of all steps now and then. Every process of a `team`
     calls this with the same arguments, all frames included, and keeps its shard; the first alone
-    calls `on_progress` and uses the checkpoint. Raises ValueError for data that cannot be trained
+    calls `on_progress` and uses the checkpoint. `anatomy` is what the layout knows of the object, a
+    loss besides the preset's. Raises ValueError for data that cannot be trained
     on or a checkpoint that does not fit.
     """
     for config in (*preset, limits):
@@ -73,7 +76,7 @@ def train(
             f"{preset.recipe.batch} can be shared out to"
         )
     frames = Frames(*(team.shard(tensor).to(device) for tensor in usable))
-    run = _Run(frames, preset, limits, start, team)
+    run = _Run(frames, preset, limits, start, team, anatomy)
     run.on_progress, run.should_stop = on_progress, should_stop
     run.checkpoint, run.checkpoint_seconds = checkpoint, checkpoint_seconds
     if team.rank:
@@ -98,13 +101,19 @@ class _Run:
     checkpoint_seconds: float
 
     def __init__(
-        self, frames: Frames, preset: Preset, limits: Limits, start: Network | None, team: Team
+        self,
+        frames: Frames,
+        preset: Preset,
+        limits: Limits,
+        start: Network | None,
+        team: Team,
+        anatomy: AnatomyLoss | None,
     ) -> None:
         recipe = preset.recipe
-        self.frames, self.preset, self.team = frames, preset, team
+        self.frames, self.preset, self.team, self.anatomy = frames, preset, team, anatomy
         self.screening = recipe.seeds > 1 and start is None
         self.first_seed = recipe.seed * (recipe.seeds if self.screening else 1)
-        self.trainer = Trainer(frames, preset, self.first_seed, start, team)
+        self.trainer = Trainer(frames, preset, self.first_seed, start, team, anatomy)
         self.leader: Trainer | None = None
         self.leader_error = math.inf
         self.best = Best(limits, recipe)
@@ -153,7 +162,7 @@ class _Run:
         self.trainer, self.leader, self.screening = self.leader, None, False
 
     def _fresh(self, seed: int) -> Trainer:
-        return Trainer(self.frames, self.preset, seed, team=self.team)
+        return Trainer(self.frames, self.preset, seed, None, self.team, self.anatomy)
 
     def _take(
         self,
@@ -240,6 +249,7 @@ def _usable(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> Frames:
 def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> Model:
     """Return the trained model with its object frame, provenance and label-free quality."""
     loss, cycle = trainer.measure()
+    anatomy = trainer.objective.anatomy
     net = trainer.net.map(lambda w: w.cpu().numpy())
     normaliser = trainer.preset.normaliser
 
@@ -263,6 +273,7 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
             "data": source,
             "frames": trainer.frames_in_all,
             "recipe": dataclasses.asdict(trainer.preset.recipe),
+            **({} if anatomy is None else {"anatomy": dataclasses.asdict(anatomy.weights)}),
             "seed": trainer.seed,
             "step": trainer.step,
             **({} if trainer.kept is None else {"kept_step": trainer.kept}),

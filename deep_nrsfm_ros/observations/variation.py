@@ -165,8 +165,9 @@ def _doubts(frames: int, span: float, deformation: float) -> tuple[str, ...]:
     if span < _NARROW:
         found.append(
             f"the views span only {span:.0f} degrees around their mean, so that depth rests on "
-            "deformation alone and may come out mirrored; record the object from more sides, or "
-            "start from a model that knows it (--from, train.from)"
+            "deformation alone and may come out mirrored; record the object from more sides, "
+            "start from a model that knows it (--from, train.from), or let the layout help (bones, "
+            "front)"
         )
     if deformation < _STIFF:
         found.append(

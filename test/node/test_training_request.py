@@ -17,7 +17,7 @@ from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.recipe import Anatomy, Recipe
 from deep_nrsfm_ros.observations.curation import Curation
 
 
@@ -49,7 +49,8 @@ def test_the_training_command_understands_every_word(tmp_path):
     curation = Curation(min_visible=7, thin=0.25, outliers=3.5)
     wanted = request(recipe, bags=(str(tmp_path), "second bag"), name="mine", threads=3)
     limits = Limits(minutes=2.5, patience=0.25, keep_best=False)
-    wanted = dataclasses.replace(wanted, curation=curation, limits=limits)
+    anatomy = Anatomy(bones=1.5, front=0.5)
+    wanted = dataclasses.replace(wanted, curation=curation, limits=limits, anatomy=anatomy)
     given = arguments().parse_args(wanted.arguments())
     assert given.bag == [tmp_path, Path("second bag")]
     assert (given.topic, given.keypoint_layout) == ("/camera/keypoints", "coco17")
@@ -61,6 +62,7 @@ def test_the_training_command_understands_every_word(tmp_path):
     assert override(Recipe(), given) == recipe
     assert override(Curation(), given) == curation
     assert override(Limits(), given) == limits
+    assert override(Anatomy(), given) == anatomy
 
 
 def test_what_the_lifter_knows_of_the_messages_goes_along():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm import _kernel
 from deep_nrsfm_ros.nrsfm.compiled import AVAILABLE, Kernel
@@ -23,6 +24,7 @@ pytestmark = pytest.mark.skipif(
     not AVAILABLE and not shutil.which("cc") and not shutil.which("gcc"), reason="no C compiler"
 )
 NUMBERED = KeypointLayout("five", tuple("abcde"))
+MORE_THAN_A_BLOCK = 7  # objects, of those that the kernel takes together, at four or five turns
 ONE_LINE = np.outer(np.arange(17), [3, 4]).astype(np.float32)
 
 
@@ -39,6 +41,16 @@ def model(
     B = rng.standard_normal((3 * p, 3 * p))
     covariance = (0.01 * np.eye(3 * p) + 0.003 * B @ B.T / p).astype(np.float32)
     return Model("random", network, layout, Normaliser(scale), frame, error_covariance=covariance)
+
+
+def objects(
+    rng: np.random.Generator, n: int, p: int, missing: float, perspective: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return points (n, p, 2) and confidence (n, p) of random objects with a share of gaps."""
+    points = rng.standard_normal((n, p, 2)).astype(np.float32) * (0.2 if perspective else 1)
+    confidence = rng.uniform(0.2, 1.2, (n, p)).astype(np.float32)
+    confidence[rng.random((n, p)) < missing] = 0
+    return points, confidence
 
 
 @settings(max_examples=60, deadline=None)
@@ -73,9 +85,7 @@ def test_lifts_as_numpy_does(
 ) -> None:
     lifter = Lifter(model(seed, layout, widths, whitening, scale), options)
     rng, p = np.random.default_rng(seed), len(layout)
-    points = rng.standard_normal((4, p, 2)).astype(np.float32) * (0.2 if perspective else 1)
-    confidence = rng.uniform(0.2, 1.2, (4, p)).astype(np.float32)
-    confidence[rng.random((4, p)) < missing] = 0
+    points, confidence = objects(rng, MORE_THAN_A_BLOCK, p, missing, perspective)
     assert isinstance(lifter.fit, Kernel)
     arrays, lost = lifter.fit(points, confidence, perspective)
     by_numpy = Fit(lifter.constants)
@@ -89,6 +99,40 @@ def test_lifts_as_numpy_does(
             unsure = 10 * np.abs(numpy - near).max()
             size = np.abs(numpy).max()
             np.testing.assert_allclose(ours, numpy, rtol=0, atol=1e-4 * size + unsure + 1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    layout=st.sampled_from([HUMAN17, NUMBERED]),
+    n=st.integers(2, 30),
+    first=st.sampled_from([0.0, np.nan, np.inf]),
+    options=st.builds(
+        LiftingOptions,
+        refill=st.integers(0, 2),
+        turns=st.integers(1, 5),
+        mirror=st.booleans(),
+    ),
+    perspective=st.booleans(),
+)
+def test_an_object_comes_out_the_same_in_any_company(
+    seed: int,
+    layout: KeypointLayout,
+    n: int,
+    first: float,
+    options: LiftingOptions,
+    perspective: bool,
+) -> None:
+    lifter = Lifter(model(seed, layout, (30, 20, 12), 1.0, "rms"), options)
+    rng = np.random.default_rng(seed)
+    points, confidence = objects(rng, n, len(layout), 0.2, perspective)
+    confidence[rng.random(n) < 0.5] = 1  # some without gaps
+    points[0, 0] = first
+    together = lifter(points, confidence, perspective=perspective)
+    for i in range(n):
+        alone = lifter(points[i : i + 1], confidence[i : i + 1], perspective=perspective)
+        for ours, theirs in zip(alone, together, strict=True):
+            np.testing.assert_array_equal(ours[0], theirs[i])
 
 
 @pytest.mark.parametrize("shown", [0, 1, 2])

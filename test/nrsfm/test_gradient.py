@@ -7,12 +7,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
 from deep_nrsfm_ros.nrsfm.geometry import polar
 from deep_nrsfm_ros.nrsfm.gradient import _by_torch, descend, polar_gradient
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, encode, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.nrsfm.recipe import Anatomy, Recipe
 
 some = settings(max_examples=25, deadline=None)
 widths = st.lists(st.integers(1, 6), min_size=1, max_size=4).map(tuple)
@@ -44,17 +46,31 @@ def task(p: int, seed: int) -> tuple[Frames, torch.Tensor]:
 @some
 @given(
     widths,
-    st.integers(3, 7),
+    st.integers(4, 7),
     st.integers(0, 2**32 - 1),
     st.sampled_from([0.0, 0.5]),
     st.sampled_from([0.0, 2.0]),
     st.booleans(),
+    st.booleans(),
 )
 def test_it_is_the_gradient_that_torch_finds(
-    widths: tuple[int, ...], p: int, seed: int, whitening: float, cycle: float, whitened: bool
+    widths: tuple[int, ...],
+    p: int,
+    seed: int,
+    whitening: float,
+    cycle: float,
+    whitened: bool,
+    known_object: bool,
 ) -> None:
     net = tensors(Architecture(widths, whitening=whitening), p, seed)
-    objective = Objective(Normaliser(), Recipe(cycle=cycle), whitened=whitened)
+    layout = KeypointLayout(
+        "thing",
+        tuple("abcdefg"[:p]),
+        edges=(("a", "b"), ("b", "c")),
+        handedness=(("a", "b", "c", "d"),),
+    )
+    anatomy = AnatomyLoss(Anatomy(bones=1.0, front=1.0), layout) if known_object else None
+    objective = Objective(Normaliser(), Recipe(cycle=cycle), whitened=whitened, anatomy=anatomy)
     frames, known = task(p, seed)
     # The random numbers of both are the same, but torch draws them as it draws float32.
     torch.set_default_dtype(torch.float64)

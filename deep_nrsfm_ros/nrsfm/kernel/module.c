@@ -1,9 +1,12 @@
 /* The module `_kernel`: Python's arrays to C and back. */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
+#include <stdint.h>
 #include <string.h>
 
-#include "fitting.h"
+#include "plan.h"
+
+#define LINE 64 /* bytes of the cache, at whose borders all parts begin */
 
 static const char NAME[] = "deep_nrsfm_ros.nrsfm._kernel.plan";
 
@@ -13,11 +16,11 @@ static void forget(PyObject *capsule) {
 }
 
 /* plan(header int32, floats float32, doubles float64) -> capsule; `compiled.plan` says what is in them. */
-static PyObject *plan(PyObject *module, PyObject *args) {
+static PyObject *plan(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_buffer parts[3];
     if (!PyArg_ParseTuple(args, "y*y*y*", &parts[0], &parts[1], &parts[2])) return NULL;
     size_t aligned[4] = {0};
-    for (int i = 0; i < 3; i++) aligned[i + 1] = aligned[i] + (parts[i].len + 63) / 64 * 64;
+    for (int i = 0; i < 3; i++) aligned[i + 1] = aligned[i] + (parts[i].len + LINE - 1) / LINE * LINE;
     const int *header = parts[0].buf;
     Py_ssize_t lengths[3] = {parts[0].len / 4, parts[1].len / 4, parts[2].len / 8};
     int sound = lengths[0] > 12 && header[0] > 0 && header[1] > 0 && header[1] <= MOST_LAYERS;
@@ -26,7 +29,8 @@ static PyObject *plan(PyObject *module, PyObject *args) {
     char *memory = NULL;
     if (k && lay_out(k, header, parts[1].buf, parts[2].buf, lengths)) {
         size_t needed = scratch(k, NULL);
-        memory = k->memory = PyMem_Calloc(1, aligned[3] + needed);
+        memory = k->memory = PyMem_Calloc(1, aligned[3] + needed + LINE);
+        if (memory) memory += LINE - (uintptr_t)memory % LINE;
         for (int i = 0; memory && i < 3; i++) memcpy(memory + aligned[i], parts[i].buf, parts[i].len);
         if (memory) {
             lay_out(k, (int *)memory, (float *)(memory + aligned[1]), (double *)(memory + aligned[2]),
@@ -45,7 +49,7 @@ static PyObject *plan(PyObject *module, PyObject *args) {
 
 /* lift(plan, points, confidence, perspective, shapes, rotations, scale, translation, residual, sure, lost):
    fill the last seven, arrays as in `lifting.Lifted`, and lost (n,) of bytes. */
-static PyObject *lift_objects(PyObject *module, PyObject *args) {
+static PyObject *lift_objects(PyObject *Py_UNUSED(module), PyObject *args) {
     PyObject *capsule;
     Py_buffer b[9];
     int perspective;
@@ -57,15 +61,13 @@ static PyObject *lift_objects(PyObject *module, PyObject *args) {
     if (k) {
         Py_ssize_t n = b[8].len, p = k->p;
         const Py_ssize_t each[8] = {2 * p, p, 3 * p, 9, 1, 2, 1, p};
+        float *lifted[6];
         for (int i = 0; i < 8; i++) sound = sound && b[i].len == 4 * n * each[i];
-        float *a[8];
-        for (int i = 0; i < 8; i++) a[i] = b[i].buf;
-        for (Py_ssize_t i = 0; sound && i < n; i++) {
-            ((char *)b[8].buf)[i] = (char)lift(k, a[0], a[1], perspective, a[2], a[3], a[4], a[5],
-                                               a[6], a[7]);
-            for (int j = 0; j < 8; j++) a[j] += each[j];
-        }
-        if (!sound) PyErr_SetString(PyExc_ValueError, "the arrays do not fit the plan and each other");
+        for (int i = 0; i < 6; i++) lifted[i] = b[2 + i].buf;
+        if (sound)
+            lift(k, n, b[0].buf, b[1].buf, perspective, lifted, b[8].buf);
+        else
+            PyErr_SetString(PyExc_ValueError, "the arrays do not fit the plan and each other");
     }
     for (int i = 0; i < 9; i++) PyBuffer_Release(&b[i]);
     if (!sound) return NULL;
@@ -78,6 +80,8 @@ static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
 static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", NULL, -1, methods, NULL, NULL, NULL, NULL};
 
 PyMODINIT_FUNC PyInit__kernel(void) {
-    choose_instructions();
-    return PyModule_Create(&module);
+    PyObject *made = PyModule_Create(&module);
+    if (made && (PyModule_AddIntMacro(made, FLOATS) || PyModule_AddIntMacro(made, DOUBLES)))
+        Py_CLEAR(made);
+    return made;
 }

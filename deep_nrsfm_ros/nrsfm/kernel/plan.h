@@ -1,0 +1,68 @@
+/* What a lifter knows before it sees any keypoints, and where it computes; `compiled.py` fills it.
+
+   Shapes are stored with the points last, S (3, p), so that every layer is one `product`. Rows of S
+   are `wide` apart, p filled up to FLOATS. Symbols as in the package's legend.
+*/
+#ifndef PLAN_H
+#define PLAN_H
+
+#include <stddef.h>
+
+#include "algebra.h"
+#include "geometry.h"
+
+#define MOST_LAYERS 64
+
+/* An object that is being lifted. */
+typedef struct {
+    const float *given, *confidence; /* (p, 2), (p) */
+    float *points, *mask;            /* what the network sees, (p, 2) of (p) */
+    float *visible;                  /* (p), 1 or 0 */
+    float *W, *S;                    /* (p, 2), (3, wide) in camera axes */
+    double gain, unit, origin[2], seen, residual;
+    camera M;
+    rotation R;
+} Object;
+
+typedef struct {
+    int p, wide, layers, turns, mirrored, whitened, rms, corrected, refill, reference[2], min_visible;
+    const int *widths, *partners;
+    Matrix L, L_inverse, encoder[MOST_LAYERS], decoder[MOST_LAYERS], code_head;
+    const float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head, *spread;
+    const double *covariance, *filling, *turn, *frame, *calibration;
+    double noise, length, unknown, nearest, residual_spread, least_residual;
+    void *memory;
+    /* Scratch, for `block` objects at a time. */
+    int block, *missing;
+    Object *objects, **some;
+    float *x, *V, *Psi[2], *psi[2], *shapes;
+    double *M, *cameras, *HC, *A, *residual;
+} Plan;
+
+/* compiled.py: point `k` at its parts of three arrays; return whether they have a plan's `lengths`. */
+int lay_out(Plan *k, const int *header, const float *floats, const double *doubles,
+            const ptrdiff_t lengths[3]);
+
+/* Point `k` at its scratch memory, which begins at `at`; return how many bytes it takes. */
+size_t scratch(Plan *k, char *at);
+
+/* network.py: set `filled` to the points, the missing filled in. */
+void complete(Plan *k, const Object *o, float *filled);
+
+/* normaliser.py: set W and what leads back to the image. */
+void observe(Plan *k, Object *o);
+
+/* network.py: set `shapes` (n, turns, 3, wide) and the cameras M (n, turns) of n objects by turns of
+   their input; `across`: of its mirror image. */
+void forward(Plan *k, int n, Object *const *objects, int across, float *shapes, camera *M);
+
+/* correction.py: move S, in the axes of the object, towards the visible of W. `cameras` (3, 2, p), p in
+   DOUBLES: those of each point. */
+void correct(Plan *k, Object *o, double noise);
+
+/* fitting.py, Fit.__call__: lift n objects into the arrays of `lifting.Lifted`; set `lost` (n) where there
+   is nothing to lift. */
+void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
+          float *const lifted[6], char *lost);
+
+#endif

@@ -1,0 +1,136 @@
+/* `product` and `solve` for processors with vectors of BYTES; `algebra.c` includes it once for each.
+
+   FOR(name) is what `name` is called there, TARGET what the compiler needs to know.
+*/
+#define HERE TARGET static inline __attribute__((always_inline))
+#define A_PANEL (4 * FLOATS / BYTES) /* vectors of a panel's row */
+#define LANES (BYTES / 8)            /* doubles of a vector */
+
+typedef float FOR(singles) __attribute__((vector_size(BYTES), aligned(4), may_alias));
+typedef int FOR(bits) __attribute__((vector_size(BYTES)));
+typedef double FOR(doubles) __attribute__((vector_size(BYTES), aligned(8), may_alias));
+
+/* The part of out = X A - b that is `rows` by `panels`; both are constants where it is called. */
+HERE void FOR(tile)(const int rows, const int panels, const float *X, int stride, Matrix A,
+                    int column, const float *b, int relu, float *out) {
+    typedef FOR(singles) vector;
+    vector sums[6][2 * A_PANEL];
+    for (int h = 0; h < A_PANEL * panels; h++) {
+        vector from = {0};
+        if (b) from -= ((const vector *)(b + column))[h];
+        for (int r = 0; r < rows; r++) sums[r][h] = from;
+    }
+    const float *panel = A.panels + (size_t)column * A.k;
+    for (int i = 0; i < A.k; i++) {
+        vector a[2 * A_PANEL];
+        for (int h = 0; h < A_PANEL * panels; h++) {
+            const float *row = panel + ((size_t)(h / A_PANEL) * A.k + i) * FLOATS;
+            a[h] = ((const vector *)row)[h % A_PANEL];
+        }
+        for (int r = 0; r < rows; r++)
+            for (int h = 0; h < A_PANEL * panels; h++) sums[r][h] += X[r * stride + i] * a[h];
+    }
+    for (int r = 0; r < rows; r++)
+        for (int h = 0; h < A_PANEL * panels; h++) {
+            vector sum = sums[r][h];
+            if (relu) sum = (vector)((FOR(bits))sum & (sum > 0));
+            ((vector *)(out + (size_t)r * A.n + column))[h] = sum;
+        }
+}
+
+/* The products stand panel by panel, so that one stays in the cache for all rows. Few rows take two
+   panels at a time: a sum waits for the one before, and the processor has eight in hand. */
+TARGET static void FOR(product)(int rows, const float *X, int stride, Matrix A, const float *b,
+                                int relu, float *out) {
+    int sixes = rows / 6 * 6;
+    for (int j = 0; j < A.n; j += FLOATS)
+        for (int r = 0; r < sixes; r += 6)
+            FOR(tile)(6, 1, X + r * stride, stride, A, j, b, relu, out + (size_t)r * A.n);
+    X += sixes * stride, out += (size_t)sixes * A.n, rows -= sixes;
+    for (int done; rows > 0; rows -= done, X += done * stride, out += (size_t)done * A.n) {
+        int j = 0;
+        done = rows < 3 ? rows : rows == 4 ? 2 : 3;
+        for (; j + 2 * FLOATS <= A.n; j += 2 * FLOATS)
+            if (done == 3)
+                FOR(tile)(3, 2, X, stride, A, j, b, relu, out);
+            else if (done == 2)
+                FOR(tile)(2, 2, X, stride, A, j, b, relu, out);
+            else
+                FOR(tile)(1, 2, X, stride, A, j, b, relu, out);
+        for (int r = 0; r < done && j < A.n; r++)
+            FOR(tile)(1, 1, X + r * stride, stride, A, j, b, relu, out + (size_t)r * A.n);
+    }
+}
+
+/* Columns j ... of rows k ... k + 3, less what the rows above have in them. */
+HERE void FOR(subtract)(const int vectors, int k, int wide, const double *A, int j,
+                        FOR(doubles) left[4][2]) {
+    typedef FOR(doubles) vector;
+    for (int r = 0; r < 4; r++)
+        for (int v = 0; v < vectors; v++)
+            left[r][v] = ((const vector *)(A + (size_t)(k + r) * wide + j))[v];
+    for (int i = 0; i < k; i++) {
+        const double *above = A + (size_t)i * wide;
+        for (int r = 0; r < 4; r++)
+            for (int v = 0; v < vectors; v++)
+                left[r][v] -= above[k + r] * ((const vector *)(above + j))[v];
+    }
+}
+
+/* Columns j ... of rows k ... k + 3 of U, whose columns k ... k + 3 are there. */
+HERE void FOR(eliminate)(const int vectors, int k, int wide, double *A, int j,
+                         const double *scale) {
+    typedef FOR(doubles) vector;
+    vector left[4][2];
+    FOR(subtract)(vectors, k, wide, A, j, left);
+    for (int r = 0; r < 4; r++)
+        for (int v = 0; v < vectors; v++) {
+            for (int q = 0; q < r; q++)
+                left[r][v] -= A[(size_t)(k + q) * wide + k + r] * left[q][v];
+            left[r][v] *= scale[r];
+            ((vector *)(A + (size_t)(k + r) * wide + j))[v] = left[r][v];
+        }
+}
+
+/* By Cholesky's U^T U = A, four rows at a time; y of U^T y = b comes out beside U. */
+TARGET static void FOR(solve)(int n, double *A) {
+    typedef FOR(doubles) vector;
+    int wide = n + DOUBLES;
+    for (int k = 0; k < n; k += 4) {
+        vector corner[4][2];
+        double U[4][4], scale[4];
+        FOR(subtract)(4 / LANES, k, wide, A, k, corner);
+        for (int r = 0; r < 4; r++)
+            for (int c = 0; c < 4; c++) U[r][c] = corner[r][c / LANES][c % LANES];
+        for (int r = 0; r < 4; r++) {
+            scale[r] = 1 / sqrt(fmax(U[r][r], 1e-300));
+            for (int c = r; c < 4; c++) A[(size_t)(k + r) * wide + k + c] = U[r][c] *= scale[r];
+            for (int q = r + 1; q < 4; q++)
+                for (int c = q; c < 4; c++) U[q][c] -= U[r][q] * U[r][c];
+        }
+        int j = k + 4;
+        for (; j + 2 * LANES <= wide; j += 2 * LANES) FOR(eliminate)(2, k, wide, A, j, scale);
+        for (; j < wide; j += LANES) FOR(eliminate)(1, k, wide, A, j, scale);
+    }
+    for (int k = n - 4; k >= 0; k -= 4)
+        for (int c = n; c < wide; c += LANES) {
+            vector x[4];
+            for (int r = 0; r < 4; r++) x[r] = *(const vector *)(A + (size_t)(k + r) * wide + c);
+            for (int j = k + 4; j < n; j++)
+                for (int r = 0; r < 4; r++)
+                    x[r] -= A[(size_t)(k + r) * wide + j] *
+                            *(const vector *)(A + (size_t)j * wide + c);
+            for (int r = 3; r >= 0; r--) {
+                double *row = A + (size_t)(k + r) * wide;
+                for (int q = r + 1; q < 4; q++) x[r] -= row[k + q] * x[q];
+                *(vector *)(row + c) = x[r] /= row[k + r];
+            }
+        }
+}
+
+#undef HERE
+#undef A_PANEL
+#undef LANES
+#undef BYTES
+#undef FOR
+#undef TARGET
