@@ -20,16 +20,15 @@ from geometry_msgs.msg import QuaternionStamped
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
 
 from benchmarks.speed import fresh_domain
 from deep_nrsfm_ros.commands.demo.client import node
-from deep_nrsfm_ros.node.publishing import PointCloud
+from deep_nrsfm_ros.node.publishing import point_cloud
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
+from deep_nrsfm_ros.observations.serialised import Header
 
 DEADLINE = 60.0  # seconds until a node must have answered
 KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
@@ -60,8 +59,7 @@ def keypoints(objects: int, p: int) -> bytes:
     points[..., :2] = 100 * (shapes @ random_cameras(objects, rng)) + [320, 240]
     zeros = np.zeros(objects, np.float32)
     seen = Lifted(points, zeros, zeros, zeros, zeros, np.ones((objects, p), np.float32))
-    raw: bytes = serialize_message(PointCloud().fill(Header(frame_id="camera"), seen))
-    return raw
+    return point_cloud(Header(frame_id="camera"), seen)
 
 
 class Client:

@@ -20,15 +20,16 @@ from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from deep_nrsfm_ros.commands.demo.client import lifter
-from deep_nrsfm_ros.node.publishing import PointCloud
+from deep_nrsfm_ros.node.publishing import point_cloud
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.observations.bags import frames, write_bag
+from deep_nrsfm_ros.observations.serialised import Header
 
 P = 17
 WINDOW = 10.0
@@ -163,7 +164,7 @@ def _message(view: NDArray[np.floating]) -> PointCloud2:
     zeros = np.zeros(1, np.float32)
     points = np.concatenate([view, np.zeros((P, 1))], -1)[None].astype(np.float32)
     seen = Lifted(points, zeros, zeros, zeros, zeros, confidence=np.ones((1, P), np.float32))
-    return PointCloud().fill(Header(), seen)
+    return deserialize_message(point_cloud(Header(), seen), PointCloud2)
 
 
 def soak(given: argparse.Namespace, folder: Path) -> bool:

@@ -19,29 +19,27 @@ from unittest import mock
 
 import numpy as np
 import rclpy
-from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import PointCloud2
 
 from benchmarks.round_trip import keypoints
 from benchmarks.speed import arguments, fresh_domain, on_one_thread, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.client import node
-from deep_nrsfm_ros.node import lifter, pipeline, publishing
+from deep_nrsfm_ros.node import lifter, publishing
 from deep_nrsfm_ros.nrsfm import lifting
 from deep_nrsfm_ros.nrsfm.keypoints import CMU31, KeypointMap
 from deep_nrsfm_ros.nrsfm.steadying import Steadying
+from deep_nrsfm_ros.observations.serialised import Reader
 
 OBJECTS = (1, 5, 20)
 STEPS: dict[str, tuple[tuple[Any, str], ...]] = {
-    "read": ((pipeline, "read"),),
+    "read": ((Reader, "__call__"),),
     "map": ((KeypointMap, "__call__"),),
     "lift": ((lifting.Lifter, "__call__"),),
     "steady (off)": ((Steadying, "__call__"),),
-    "build": ((publishing.PointCloud, "fill"), (publishing, "camera_rotation")),
+    "build": ((publishing, "point_cloud"), (publishing, "camera_rotation")),
 }
 """Each step and the functions that are it, less what they call of other steps."""
-DESERIALISE, PUBLISH, REST = "deserialise", "serialise, publish", "the rest of the node"
-SERIALISE = "of it: serialise"
+PUBLISH, REST = "publish", "the rest of the node"
 SUM, WHOLE, SHARE = "sum", "whole, nothing else timed", "sum / whole"
 
 
@@ -92,14 +90,12 @@ class Lifter:
 
     def run(self, raw: bytes) -> None:
         """Lift a message, as the executor would have the node do it."""
-        self._node._lift(self._source, deserialize_message(raw, PointCloud2))
+        self._node._lift(self._source, raw)
 
     def run_watched(self, raw: bytes, watch: Stopwatch) -> None:
-        """Lift a message and deserialise it, both timed."""
+        """Lift a message, timed."""
         with watch.timed(REST):
-            with watch.timed(DESERIALISE):
-                message = deserialize_message(raw, PointCloud2)
-            self._node._lift(self._source, message)
+            self.run(raw)
 
     def meet(self) -> None:
         """Wait until someone listens to the points."""
@@ -132,20 +128,11 @@ def measure(subject: Lifter, raw: bytes, rounds: int, calls: int) -> dict[str, f
                 watch.watch(stack, PUBLISH, publisher, "publish")
             for _ in range(calls):
                 subject.run_watched(raw, watch)
-        order = (DESERIALISE, *STEPS, PUBLISH, REST)
+        order = (*STEPS, PUBLISH, REST)
         row = {step: 1e6 * watch.seconds[step] / calls for step in order}
         row |= {SUM: sum(row.values()), WHOLE: 1e6 * whole / calls}
-        rows.append(row | {SERIALISE: 1e6 * serialising(raw, calls) / calls})
+        rows.append(row)
     return {step: float(np.median([row[step] for row in rows])) for step in rows[0]}
-
-
-def serialising(raw: bytes, calls: int) -> float:
-    """Return the seconds that serialising an answer as large as the message so often takes."""
-    message = deserialize_message(raw, PointCloud2)
-    began = time.perf_counter()
-    for _ in range(calls):
-        serialize_message(message)
-    return time.perf_counter() - began
 
 
 def tabulate(found: dict[int, dict[str, float]]) -> Table:
@@ -159,7 +146,8 @@ def tabulate(found: dict[int, dict[str, float]]) -> Table:
         {
             "columns": "us, and their share of the sum, by the number of objects in a message",
             "steps": "without what they call of other steps; mean of a run, median of the runs",
-            SERIALISE: "the points alone, without the rotation",
+            "read": "from serialised bytes, a message like the one before it",
+            "build": "serialised",
             SHARE: "above 1: what the timing itself costs",
         },
         bars(*names),

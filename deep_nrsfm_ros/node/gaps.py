@@ -8,9 +8,9 @@ from collections.abc import Iterable
 class Gaps:
     """Counts the gaps in the numbers of the messages on a topic.
 
-    What a full queue or the network drops, and bytes that are no message, DDS drops in silence. But
-    every publisher numbers its messages from 1. They do not tell which publisher they are of, so
-    gaps count only while there has been one.
+    What a full queue or the network drops, DDS drops in silence. But every publisher numbers its
+    messages from 1. They do not tell which publisher they are of, so gaps count only while there
+    has been one.
     """
 
     def __init__(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -64,13 +65,12 @@ class Health:
         """Count a message that took `seconds`.
 
         reprojection_error: (n) of its objects, NaN of those that could not be lifted.
-        confidence: (n) of its objects.
+        confidence: (n, p) of their keypoints. Both are kept until the report, which sums them up.
         """
         self._last_input = self._clock()
         self._seconds.append(seconds)
-        known = ~np.isnan(reprojection_error)
-        self._errors.append(reprojection_error[known])
-        self._confidences.append(confidence[known])
+        self._errors.append(reprojection_error)
+        self._confidences.append(confidence)
         self._unheard = ""
         self.total_lifted += 1
 
@@ -101,7 +101,7 @@ class Health:
         """Return how the time since the last report went, and begin anew."""
         now = self._clock()
         seconds = np.array(self._seconds or [np.nan])
-        error, confidence = _median(self._errors), _median(self._confidences)
+        error, confidence = self._medians()
         rate = len(self._seconds) / max(now - self._last_report, 1e-9)
         level, message = self._judge(now - self._last_input, error, confidence)
         values = {
@@ -121,6 +121,18 @@ class Health:
         self._errors.clear()
         self._confidences.clear()
         return Report(level, message, values)
+
+    def _medians(self) -> tuple[float, float]:
+        """Return the reprojection error and confidence of half of the objects, NaN if none."""
+        if not self._errors:
+            return np.nan, np.nan
+        error = np.concatenate(self._errors)
+        models = groupby(self._confidences, lambda one: one.shape[1])  # of as many keypoints each
+        confidence = np.concatenate([np.concatenate(list(of)).mean(1) for _, of in models])
+        known = ~np.isnan(error)
+        if not known.any():
+            return np.nan, np.nan
+        return float(np.median(error[known])), float(np.median(confidence[known]))
 
     def _judge(self, silence: float, error: float, confidence: float) -> tuple[int, str]:
         """Return level and message by the rules of the class."""
@@ -144,9 +156,3 @@ class Health:
         if self._empty and not self._seconds:
             return OK, "the detector sees no object"
         return OK, "lifting" if self._seconds else "waiting for keypoints"
-
-
-def _median(values: list[NDArray[np.float32]]) -> float:
-    """Return the median of all that is in the arrays, NaN if nothing is."""
-    together = np.concatenate([np.empty(0), *values])
-    return float(np.median(together)) if len(together) else np.nan

@@ -16,14 +16,13 @@ It never imports torch: lifting is NumPy, and training is a process of its own.
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
@@ -34,7 +33,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2
-from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.node import parameters, publishing
@@ -61,6 +59,7 @@ from deep_nrsfm_ros.nrsfm.object_file import find_layout
 from deep_nrsfm_ros.nrsfm.recipe import Anatomy, Recipe
 from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations.curation import Curation
+from deep_nrsfm_ros.observations.serialised import Header
 
 _STEADY = "steady."
 _TRAIN = "train."
@@ -97,7 +96,6 @@ class LifterNode(Node):
         self._camera = CameraListener(self, camera)
         self._tf = Broadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._health = Health()
-        self._cloud = publishing.PointCloud()
         self._points = self.create_publisher(PointCloud2, "~/points", 10)
         self._rotation = self.create_publisher(QuaternionStamped, "~/camera_rotation", 10)
         self._objects = self.create_publisher(MultiDOFJointState, "~/objects", 10)
@@ -123,19 +121,20 @@ class LifterNode(Node):
         """End a training that runs."""
         self._training.close(_END_OF_TRAINING)
 
-    def _lift(self, source: Source, message: Any) -> None:
-        """Lift one message and publish the result: the hot path."""
+    def _lift(self, source: Source, raw: bytes) -> None:
+        """Lift one serialised message and publish the result: the hot path."""
         started = time.perf_counter()
         try:
             intrinsics = self._camera.known()
-            seen = self._pipeline.observe(message, source.input_type, self._camera.size)
+            header, seen = self._pipeline.observe(raw, source.reader, self._camera.size)
             told = self._objects.get_subscription_count()
             wanted = told or self._tf or self._pipeline.steadies
             names = source.tracker(seen, started) if wanted else ("",) * len(seen.confidence)
-            header = getattr(message, "header", None) or self._header()
-            header.frame_id = header.frame_id or self._camera.frame
-            stamp = publishing.seconds(header.stamp) or publishing.seconds(self._header().stamp)
-            lifted, names = self._pipeline.lift(seen, intrinsics, names, source.topic, stamp)
+            header = header or self._now()
+            if not header.frame_id:
+                header = header._replace(frame_id=self._camera.frame)
+            seconds = 1e-9 * (header.stamp or self._now().stamp)
+            lifted, names = self._pipeline.lift(seen, intrinsics, names, source.topic, seconds)
         except Exception as problem:  # whatever it is, the next message may be fine
             self._reject(source, problem)
             return
@@ -143,8 +142,8 @@ class LifterNode(Node):
             self._health.saw_nothing()
             return
         placed = self._camera.wanted
-        self._points.publish(self._cloud.fill(header, lifted))
-        if not np.isnan(lifted.residual[0]):
+        self._points.publish(publishing.point_cloud(header, lifted))
+        if not math.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
         if told:
             self._objects.publish(publishing.objects(header, lifted, names, placed=placed))
@@ -153,8 +152,7 @@ class LifterNode(Node):
         if self._markers.get_subscription_count():
             edges = self._pipeline.edges
             self._markers.publish(publishing.markers(header, lifted, edges, placed=placed))
-        fit = lifted.residual, lifted.object_confidence
-        self._health.lifted(time.perf_counter() - started, *fit)
+        self._health.lifted(time.perf_counter() - started, lifted.residual, lifted.confidence)
 
     def _reject(self, source: Source, problem: Exception) -> None:
         """Count a message that could not be lifted; say why, but not too often."""
@@ -164,9 +162,9 @@ class LifterNode(Node):
             f"message on {source.topic} dropped: {reason}", throttle_duration_sec=LOG_PERIOD
         )
 
-    def _header(self) -> Header:
+    def _now(self) -> Header:
         """Return a header for input that has none: now, and no frame."""
-        return Header(stamp=self.get_clock().now().to_msg())
+        return Header(*self.get_clock().now().seconds_nanoseconds())
 
     def _report(self) -> None:
         """Publish diagnostics."""
@@ -177,7 +175,9 @@ class LifterNode(Node):
         values |= {"heard": self._listener.heard, "camera": self._camera.status}
         lifting = publishing.status(f"{self.get_name()}: lifting", level, message, values)
         self._diagnostics.publish(
-            DiagnosticArray(header=self._header(), status=[lifting, self._training.status])
+            DiagnosticArray(
+                header=publishing.to_header(self._now()), status=[lifting, self._training.status]
+            )
         )
 
     def _prepare(self, changes: Sequence[Parameter]) -> Pipeline:

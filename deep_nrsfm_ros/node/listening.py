@@ -14,9 +14,10 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from deep_nrsfm_ros.node.gaps import Gaps
-from deep_nrsfm_ros.node.message_types import message_class
+from deep_nrsfm_ros.node.message_types import decoder, message_class
 from deep_nrsfm_ros.node.pipeline import AUTO, InputOptions
 from deep_nrsfm_ros.observations.messages import INPUT_TYPES, InputType, find_input, name_of
+from deep_nrsfm_ros.observations.serialised import Reader
 from deep_nrsfm_ros.observations.topics import WILDCARD, match
 from deep_nrsfm_ros.observations.tracker import Tracker
 
@@ -32,7 +33,7 @@ class Source:
     """A topic that is heard: how its messages are read, and who is who in them."""
 
     topic: str
-    input_type: InputType
+    reader: Reader
     tracker: Tracker
     gaps: Gaps
 
@@ -44,7 +45,7 @@ class Listener:
         self,
         node: Node,
         inputs: InputOptions,
-        on_message: Callable[[Source, Any], None],
+        on_message: Callable[[Source, bytes], None],
         on_trouble: Callable[[str], None],
         on_missed: Callable[[int], None],
     ) -> None:
@@ -77,7 +78,9 @@ class Listener:
     def heard(self) -> str:
         """Return the topics that are heard, with their types, in words."""
         sources = (source for source, _ in self._heard.values())
-        return ", ".join(f"{s.topic} ({name_of(s.input_type)})" for s in sources) or "none yet"
+        return (
+            ", ".join(f"{s.topic} ({name_of(s.reader.input_type)})" for s in sources) or "none yet"
+        )
 
     def look(self, *, idle: bool) -> None:
         """Find what was missed, and topics that have come and gone. Call it once a second.
@@ -129,14 +132,13 @@ class Listener:
 
         DDS keeps such publishers apart and reports nothing.
         """
-        types = self._types(source.topic)
-        if not self._type and types and name_of(source.input_type) not in types:
+        types, expected = self._types(source.topic), name_of(source.reader.input_type)
+        if not self._type and types and expected not in types:
             self._leave(source.topic)  # another detector: its type is read at the next look
-        elif others := [kind for kind in types if kind != name_of(source.input_type)]:
+        elif others := [kind for kind in types if kind != expected]:
             self._complain(
-                f"{source.topic} carries {', '.join(others)}; expected "
-                f"{name_of(source.input_type)}: change the publisher, or start the lifter with "
-                "another input_type"
+                f"{source.topic} carries {', '.join(others)}; expected {expected}: change the "
+                "publisher, or start the lifter with another input_type"
             )
 
     def _listen(self, topic: str, input_type: InputType) -> None:
@@ -144,12 +146,14 @@ class Listener:
         names = [match(pattern, topic) for pattern in self.topics]
         several = len(self.topics) > 1
         name = next(filter(None, names), topic.strip("/") if several else "")
-        source = Source(topic, input_type, Tracker(name), Gaps())
+        kind = name_of(input_type)
+        source = Source(topic, Reader(input_type, decoder(kind)), Tracker(name), Gaps())
         subscription = self._node.create_subscription(
-            message_class(name_of(input_type)),
+            message_class(kind),
             topic,
             partial(self._take, source),
             SENSOR_INPUT,
+            raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=partial(self._mend_qos, topic)
             ),
@@ -159,12 +163,12 @@ class Listener:
             else None,
         )
         self._heard[topic] = source, subscription
-        self._log.info(f"listening to {topic} ({name_of(input_type)})")
+        self._log.info(f"listening to {topic} ({kind})")
 
-    def _take(self, source: Source, message: Any, info: Mapping[str, Any]) -> None:
-        """Pass a message on."""
+    def _take(self, source: Source, raw: bytes, info: Mapping[str, Any]) -> None:
+        """Pass a message on, serialised as it came."""
         source.gaps.came(info["publication_sequence_number"])
-        self._on_message(source, message)
+        self._on_message(source, raw)
 
     def _leave(self, topic: str) -> None:
         """Listen to a topic no longer."""

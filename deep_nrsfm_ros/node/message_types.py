@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
+
+from rclpy.serialization import deserialize_message
+
+from deep_nrsfm_ros.observations.observation import MessageError
 
 
 def message_class(name: str) -> Any:
@@ -23,3 +28,19 @@ def message_class(name: str) -> Any:
     if found is None:
         raise ValueError(f"package {package} has no message {kind}")
     return found
+
+
+def decoder(name: str) -> Callable[[bytes], Any]:
+    """Return what makes messages of type "package/Type" of bytes, or raises MessageError.
+
+    Raises ValueError as `message_class` does.
+    """
+    found = message_class(name)
+
+    def decode(raw: bytes) -> Any:
+        try:
+            return deserialize_message(raw, found)
+        except Exception as error:  # of the middleware, of several kinds
+            raise MessageError(f"{len(raw)} bytes that are no {name}: {error}") from None
+
+    return decode

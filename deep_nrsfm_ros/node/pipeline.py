@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -16,8 +15,9 @@ from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.placement import lift_at_place
 from deep_nrsfm_ros.nrsfm.steadying import Steadying, SteadyingOptions
 from deep_nrsfm_ros.observations.field_mapping import Size
-from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD, InputType, read
+from deep_nrsfm_ros.observations.messages import INPUT_TYPES, POINT_CLOUD
 from deep_nrsfm_ros.observations.observation import MessageError, Observation
+from deep_nrsfm_ros.observations.serialised import Header, Reader
 
 MODEL_ORDER = "model"
 AUTO = "auto"
@@ -102,19 +102,22 @@ class Pipeline:
         self._steadying = steadying
         self._steady: dict[str, Steadying] = {}
 
-    def observe(self, message: Any, input_type: InputType, size: Size | None = None) -> Observation:
-        """Return the objects in `message`, their keypoints as the model orders them.
+    def observe(
+        self, raw: bytes, reader: Reader, size: Size | None = None
+    ) -> tuple[Header | None, Observation]:
+        """Return the header of a serialised message, None if its type has none, and its objects.
 
-        size: that of the image, instead of the one that the options tell. Raises MessageError.
+        The keypoints are as the model orders them. size: that of the image, instead of the one that
+        the options tell. Raises MessageError.
         """
         q = len(self.source)
-        seen = read(message, input_type, q, self._min_confidence, size or self._size)
+        header, seen = reader(raw, q, self._min_confidence, size or self._size)
         if len(seen.confidence) > self._max_objects:
             raise MessageError(
                 f"message has {len(seen.confidence)} objects; expected at most "
                 f"{self._max_objects} (max_objects)"
             )
-        return Observation(*self._map(seen.points, seen.confidence), seen.ids)
+        return header, Observation(*self._map(seen.points, seen.confidence), seen.ids)
 
     @property
     def steadies(self) -> bool:

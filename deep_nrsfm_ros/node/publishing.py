@@ -1,76 +1,95 @@
-"""Messages of the lifter from arrays. Reused messages spare the hot path their construction."""
+"""Messages of the lifter from arrays.
+
+Those of the hot path come serialised: all but stamp and numbers is the same in each, so one that
+ROS has serialised serves for the next.
+"""
 
 from __future__ import annotations
 
+import struct
 from array import array
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Transform, Vector3
 from numpy.typing import NDArray
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
-from std_msgs.msg import ColorRGBA, Header
+from std_msgs import msg as std_msgs
 from visualization_msgs.msg import Marker, MarkerArray
 
 from deep_nrsfm_ros.nrsfm.geometry import centre, quaternion
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP
+from deep_nrsfm_ros.observations.serialised import Header
+
+_MAKES = 16  # of each kind of message that are kept: cameras, and numbers of objects
+_STAMP, _STAMP_AT = struct.Struct("<iI"), 4  # in all that begins with a header
 
 _LIFETIME = Duration(nanosec=300_000_000)
-_BONES = ColorRGBA(r=0.2, g=0.6, b=1.0, a=1.0)
-_JOINTS = ColorRGBA(r=1.0, g=0.7, b=0.1, a=1.0)
+_BONES = std_msgs.ColorRGBA(r=0.2, g=0.6, b=1.0, a=1.0)
+_JOINTS = std_msgs.ColorRGBA(r=1.0, g=0.7, b=0.1, a=1.0)
 _JOINT_SIZE = 0.08  # of the shape's RMS radius
 _BONE_SIZE = 0.03
 
 
-class PointCloud:
-    """A PointCloud2 of x, y, z and confidence that is filled again for every message.
+class _Template(NamedTuple):
+    """A serialised message, to be filled again for every message of its make."""
 
-    Publishing serialises at once, so one message object serves them all.
-    """
-
-    def __init__(self) -> None:
-        """Make an empty cloud."""
-        self._message = PointCloud2(
-            fields=[
-                PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
-                for name, offset in POINT_FIELDS
-            ],
-            point_step=POINT_STEP,
-        )
-        self._values = np.empty((0, 0, 4), np.float32)
-
-    def fill(self, header: Header, lifted: Lifted) -> PointCloud2:
-        """Return the cloud of n objects (its height) of p keypoints (its width)."""
-        n, p = lifted.confidence.shape
-        if self._values.shape[:2] != (n, p):
-            self._resize(n, p)
-        self._values[..., :3] = lifted.shapes
-        self._values[..., 3] = lifted.confidence
-        self._message.header = header
-        self._message.is_dense = not np.isnan(lifted.residual).any()
-        return self._message
-
-    def _resize(self, n: int, p: int) -> None:
-        """Give the message room for n objects of p keypoints."""
-        message = self._message
-        message.height, message.width, message.row_step = n, p, p * POINT_STEP
-        message.data = array("B", bytes(n * p * POINT_STEP))
-        # A view of the message's own array: what is written to it needs no copying.
-        self._values = np.frombuffer(message.data, "<f4").reshape(n, p, 4)
+    raw: bytearray
+    values: NDArray[Any]  # a view of the numbers in it
 
 
-def seconds(stamp: Time) -> float:
-    """Return a stamp in seconds, 0 if it was never set."""
-    return float(stamp.sec + 1e-9 * stamp.nanosec)
+def point_cloud(header: Header, lifted: Lifted) -> bytes:
+    """Return the points and confidence of n objects as a serialised PointCloud2."""
+    raw, values = _point_cloud(header.frame_id, *lifted.confidence.shape)
+    _STAMP.pack_into(raw, _STAMP_AT, header.sec, header.nanosec)
+    values[..., :3] = lifted.shapes
+    values[..., 3] = lifted.confidence
+    raw[-1] = not np.isnan(lifted.residual).any()  # is_dense
+    return bytes(raw)
 
 
-def camera_rotation(header: Header, rotation: NDArray[np.float32]) -> QuaternionStamped:
-    """Return the rotation (3, 3) of an object as a quaternion."""
-    return QuaternionStamped(header=header, quaternion=to_quaternion(rotation))
+def camera_rotation(header: Header, rotation: NDArray[np.float32]) -> bytes:
+    """Return the rotation (3, 3) of an object as a serialised QuaternionStamped."""
+    raw, values = _quaternion(header.frame_id)
+    _STAMP.pack_into(raw, _STAMP_AT, header.sec, header.nanosec)
+    values[:] = quaternion(rotation)
+    return bytes(raw)
+
+
+@lru_cache(_MAKES)
+def _point_cloud(frame_id: str, n: int, p: int) -> _Template:
+    """Return a template of the cloud of n objects (its height) of p keypoints (its width)."""
+    message = PointCloud2(header=std_msgs.Header(frame_id=frame_id), height=n, width=p)
+    message.fields = [
+        PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
+        for name, offset in POINT_FIELDS
+    ]
+    message.point_step, message.row_step = POINT_STEP, p * POINT_STEP
+    message.data = array("B", bytes(n * p * POINT_STEP))
+    raw = bytearray(serialize_message(message))
+    # The data comes last but for is_dense.
+    values = np.frombuffer(raw, "<f4", n * p * 4, len(raw) - 1 - len(message.data))
+    return _Template(raw, values.reshape(n, p, 4))
+
+
+@lru_cache(_MAKES)
+def _quaternion(frame_id: str) -> _Template:
+    """Return a template of the quaternion x, y, z, w."""
+    message = QuaternionStamped(header=std_msgs.Header(frame_id=frame_id))
+    raw = bytearray(serialize_message(message))
+    return _Template(raw, np.frombuffer(raw, "<f8", 4, len(raw) - 4 * 8))
+
+
+def to_header(header: Header) -> std_msgs.Header:
+    """Return a header as a message."""
+    stamp = Time(sec=header.sec, nanosec=header.nanosec)
+    return std_msgs.Header(stamp=stamp, frame_id=header.frame_id)
 
 
 def objects(
@@ -87,7 +106,7 @@ def objects(
     ~/camera_rotation, its translation the object's place, zero unless the shapes are `placed`. NaN
     where the object could not be lifted.
     """
-    message = MultiDOFJointState(header=header, joint_names=list(names))
+    message = MultiDOFJointState(header=to_header(header), joint_names=list(names))
     message.transforms = transforms(lifted, placed=placed)
     return message
 
@@ -115,7 +134,7 @@ def markers(
     as in the point cloud; the others stand beside it as they do in the image. Objects that are NaN
     are left out.
     """
-    array_of_markers = MarkerArray()
+    array_of_markers, stamped = MarkerArray(), to_header(header)
     lifted = Lifted(*(part[~np.isnan(lifted.residual)] for part in lifted))
     sizes = np.sqrt((centre(lifted.shapes) ** 2).sum(-1).mean(-1)).tolist()
     apart = (lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]
@@ -130,7 +149,7 @@ def markers(
         joint, bone = _JOINT_SIZE * size, _BONE_SIZE * size
         joints.scale, bones.scale = Vector3(x=joint, y=joint, z=joint), Vector3(x=bone)
         for marker in (bones, joints):
-            marker.header, marker.id, marker.lifetime = header, i, _LIFETIME
+            marker.header, marker.id, marker.lifetime = stamped, i, _LIFETIME
             marker.pose.position = Point(x=x, y=y)
         array_of_markers.markers += [bones, joints]
     return array_of_markers

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
-from std_msgs.msg import Header
 
 from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
+from deep_nrsfm_ros.observations.serialised import Header
 
 
 class Broadcaster:
@@ -43,9 +43,9 @@ def frames(header: Header, lifted: Lifted, names: Sequence[str]) -> list[Transfo
 
     names: n, of the frames of the objects.
     """
-    moves = publishing.transforms(lifted, placed=True)
+    moves, stamped = publishing.transforms(lifted, placed=True), publishing.to_header(header)
     return [
-        TransformStamped(header=header, child_frame_id=name, transform=move)
+        TransformStamped(header=stamped, child_frame_id=name, transform=move)
         for name, move in zip(names, moves, strict=True)
         if not math.isnan(move.translation.x)
     ]

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
 from deep_nrsfm_ros.observations.bag_files import BagError, open_bag
 from deep_nrsfm_ros.observations.bag_topics import keypoint_topics
-from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.observations.ensemble import Ensemble, EnsembleBuilder
 from deep_nrsfm_ros.observations.field_mapping import FieldMapping, Size
 from deep_nrsfm_ros.observations.messages import (
     MULTI_ARRAY,
@@ -30,13 +30,13 @@ from deep_nrsfm_ros.observations.messages import (
     pack_points,
     read,
 )
-from deep_nrsfm_ros.observations.observation import MessageError, Observation
+from deep_nrsfm_ros.observations.observation import MessageError
+from deep_nrsfm_ros.observations.serialised import Reader
 
 STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
 Progress = Callable[[int, int], None]
 """Called with the number of messages read so far and the number there are."""
 
-_BLOCK = 4096  # messages mapped and stored together
 _SAMPLE = 256  # messages of a bag that tell how many keypoints there are
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -79,18 +79,21 @@ def read_bags(
     Memory stays within about twice the ensemble. Raises BagError naming the bag when one is
     missing, damaged beyond reading or without such a topic, or when no message is readable.
     """
-    frames, warnings = _Frames(KeypointMap(source, target)), []
+    frames, warnings = EnsembleBuilder(KeypointMap(source, target), min_confidence), []
     messages, unreadable, reason = 0, 0, ""
     if not paths:
         raise BagError("no bag to read; name at least one")
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
             for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
-                done = messages
+                done, reader = messages, Reader(kind, decode)
                 for raw in bag.messages(chosen):
                     messages += 1
                     try:
-                        frames.add(read(decode(raw), kind, len(source), min_confidence, size))
+                        if make := reader.known(raw, len(source)):
+                            frames.take(make, raw)
+                        else:
+                            frames.add(reader(raw, len(source), min_confidence, size)[1])
                     except Exception as error:  # whatever bytes a bag holds, others still count
                         unreadable += 1
                         reason = reason or _text(error)
@@ -138,41 +141,6 @@ def most_keypoints(paths: Sequence[Path], topic: str, mapping: FieldMapping | No
         names = ", ".join(path.name for path in map(Path, paths))
         raise BagError(f"no message in {names} tells how many keypoints there are; {reason}")
     return max(counts) if partial else counts.most_common(1)[0][0]
-
-
-class _Frames:
-    """Observations gathered block by block, so that memory holds arrays, not objects."""
-
-    def __init__(self, keypoint_map: KeypointMap) -> None:
-        """Start empty."""
-        self._map = keypoint_map
-        self.count = 0
-        self._waiting: list[Observation] = []
-        self._points: list[NDArray[np.float32]] = []
-        self._visible: list[NDArray[np.bool_]] = []
-
-    def add(self, observation: Observation) -> None:
-        """Append the objects of one observation."""
-        self.count += len(observation.confidence)
-        self._waiting.append(observation)
-        if len(self._waiting) == _BLOCK:
-            self._store()
-
-    def _store(self) -> None:
-        """Map what is waiting to the target layout."""
-        if self._waiting:
-            points = np.concatenate([seen.points for seen in self._waiting])
-            confidence = np.concatenate([seen.confidence for seen in self._waiting])
-            points, confidence = self._map(points, confidence)
-            self._points.append(points)
-            self._visible.append(confidence > 0)
-            self._waiting.clear()
-
-    def ensemble(self, source: str) -> Ensemble:
-        """Return everything that was added."""
-        self._store()
-        points, visible = np.concatenate(self._points), np.concatenate(self._visible)
-        return Ensemble(points, visible, self._map.target, source)
 
 
 def _text(error: Exception) -> str:

@@ -7,7 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout, KeypointMap
+from deep_nrsfm_ros.observations.observation import Observation
+from deep_nrsfm_ros.observations.serialised import SerialisedMake
+
+_BLOCK = 4096  # objects mapped and stored together
+_RUN = 2**20  # bytes of messages of one make that are read together
 
 
 @dataclass(frozen=True)
@@ -67,3 +72,66 @@ def concatenate(ensembles: list[Ensemble]) -> Ensemble:
         "; ".join(dict.fromkeys(e.source for e in ensembles)),
         np.concatenate(shapes) if len(shapes) == len(ensembles) else None,
     )
+
+
+class EnsembleBuilder:
+    """Objects gathered block by block, so that memory holds arrays, not messages.
+
+    count: how many there are.
+    """
+
+    def __init__(self, keypoint_map: KeypointMap, min_confidence: float) -> None:
+        """Start empty; a keypoint of a message that is taken needs `min_confidence`."""
+        self._map, self._min_confidence = keypoint_map, min_confidence
+        self.count = 0
+        self._make: SerialisedMake | None = None
+        self._run: list[bytes] = []  # messages of that make, not yet read
+        self._waiting: list[Observation] = []  # not yet mapped
+        self._objects = 0  # in those
+        self._points: list[NDArray[np.float32]] = []
+        self._visible: list[NDArray[np.bool_]] = []
+
+    def take(self, make: SerialisedMake, raw: bytes) -> None:
+        """Append the objects of a message of a known make, to be read with others of it."""
+        if make is not self._make or len(self._run) * len(raw) > _RUN:
+            self._read()
+            self._make = make
+        self._run.append(raw)
+        self.count += make.cloud.height
+
+    def add(self, observation: Observation) -> None:
+        """Append the objects of one observation."""
+        self._read()
+        self._wait(observation)
+        self.count += len(observation.confidence)
+
+    def _read(self) -> None:
+        """Read the run."""
+        if self._make and self._run:
+            self._wait(self._make.observation(self._run, self._min_confidence))
+            self._run.clear()
+
+    def _wait(self, observation: Observation) -> None:
+        """Keep the objects of one observation until there are enough to map."""
+        self._waiting.append(observation)
+        self._objects += len(observation.confidence)
+        if self._objects + len(self._waiting) >= _BLOCK:  # some show none
+            self._store()
+
+    def _store(self) -> None:
+        """Map what is waiting to the target layout."""
+        if self._waiting:
+            points = np.concatenate([seen.points for seen in self._waiting])
+            confidence = np.concatenate([seen.confidence for seen in self._waiting])
+            points, confidence = self._map(points, confidence)
+            self._points.append(points)
+            self._visible.append(confidence > 0)
+            self._waiting.clear()
+            self._objects = 0
+
+    def ensemble(self, source: str) -> Ensemble:
+        """Return everything that was taken and added, in that order."""
+        self._read()
+        self._store()
+        points, visible = np.concatenate(self._points), np.concatenate(self._visible)
+        return Ensemble(points, visible, self._map.target, source)

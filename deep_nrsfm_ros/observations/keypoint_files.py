@@ -19,9 +19,9 @@ from deep_nrsfm_ros.observations.bag_topics import keypoint_topics
 from deep_nrsfm_ros.observations.bags import Progress
 from deep_nrsfm_ros.observations.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.observations.field_mapping import FieldMapping, Size
-from deep_nrsfm_ros.observations.messages import read
 from deep_nrsfm_ros.observations.observation import Observation, observation
 from deep_nrsfm_ros.observations.openpose import read_people
+from deep_nrsfm_ros.observations.serialised import Reader, header_of
 
 KINDS = (
     "a bag (folder, .db3 or .mcap), an .npz with `points`, COCO keypoints (.json), a folder of "
@@ -113,14 +113,14 @@ def read_bag(
     seen, stamps, reason, camera, count = [], [], "", "", 0
     with closing(open_bag(path)) as bag:
         for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
+            reader = Reader(kind, decode)
             for record in bag.records(chosen):
                 count += 1
                 try:
-                    message = decode(record.raw)
-                    seen.append(read(message, kind, keypoints, min_confidence, size))
-                    stamps.append(stamp_of(message) or record.time)
-                    header = getattr(message, "header", None)
-                    camera = camera or str(getattr(header, "frame_id", ""))
+                    header, shown = reader(record.raw, keypoints, min_confidence, size)
+                    seen.append(shown)
+                    stamps.append((header and header.stamp) or record.time)
+                    camera = camera or (header.frame_id if header else "")
                 except Exception as error:  # whatever bytes a bag holds, the others still count
                     reason = reason or str(error) or repr(error)
                 if count % 256 == 0:
@@ -137,8 +137,8 @@ def read_bag(
 
 def stamp_of(message: Any) -> int:
     """Return the stamp of a message's header in ns, 0 if it has none."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) if stamp else 0
+    header = header_of(message)
+    return header.stamp if header else 0
 
 
 def _openpose(

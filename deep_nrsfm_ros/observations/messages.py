@@ -8,7 +8,7 @@ that the message claims is allocated.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,11 @@ from deep_nrsfm_ros.observations.observation import (
     check_keypoints,
     observation,
 )
+from deep_nrsfm_ros.observations.point_cloud import make_of
 
 POINT_CLOUD = "sensor_msgs/PointCloud2"
 MULTI_ARRAY = "std_msgs/Float32MultiArray"
 POLYGON = "geometry_msgs/PolygonStamped"
-
-_FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField datatypes FLOAT32 and FLOAT64
 
 # The layout that `pack_points` writes, as (name, offset) of float32 fields.
 POINT_FIELDS = (("x", 0), ("y", 4), ("z", 8), ("confidence", 12))
@@ -157,44 +156,7 @@ def read_points(message: Any) -> NDArray[np.float32]:
 
 def _point_cloud(message: Any, keypoints: int) -> NDArray[np.floating]:
     """Return (n, q, 2 or 3) of a PointCloud2: fields x, y and, where there is one, confidence."""
-    height, width, step = int(message.height), int(message.width), int(message.point_step)
-    check_keypoints(width, keypoints, "width")
-    names = ["x", "y"] + ["confidence"] * any(f.name == "confidence" for f in message.fields)
-    formats, offsets = zip(*(_field(message.fields, name, step) for name in names), strict=True)
-    if not height:
-        return np.empty((0, width, len(names)))
-    row_step = int(message.row_step) if height > 1 else width * step
-    if row_step < width * step:
-        raise MessageError(
-            f"row_step is {row_step}; {width} points of {step} bytes need at least {width * step}"
-        )
-    data = memoryview(message.data).cast("B")
-    needed = (height - 1) * row_step + width * step
-    if len(data) < needed:
-        raise MessageError(f"data has {len(data)} bytes; {height} x {width} points need {needed}")
-    order, values = ">" if message.is_bigendian else "<", np.empty((height, width, len(names)))
-    for i, (form, offset) in enumerate(zip(formats, offsets, strict=True)):
-        values[..., i] = np.ndarray((height, width), order + form, data, offset, (row_step, step))
-    return values
-
-
-def _field(fields: Sequence[Any], name: str, point_step: int) -> tuple[str, int]:
-    """Return (numpy format, offset) of the field called `name`, checked to lie in a point."""
-    found = [field for field in fields if field.name == name]
-    if len(found) != 1:
-        names = ", ".join(str(field.name) for field in fields[:20]) or "none"
-        raise MessageError(f"expected one field {name!r}; the fields are: {names}")
-    form = _FLOATS.get(int(found[0].datatype))
-    if form is None:
-        raise MessageError(
-            f"field {name!r} has datatype {found[0].datatype}; expected FLOAT32 (7) or FLOAT64 (8)"
-        )
-    offset = int(found[0].offset)
-    if offset < 0 or offset + int(form[1]) > point_step:
-        raise MessageError(
-            f"field {name!r} at offset {offset} does not fit into a point_step of {point_step}"
-        )
-    return form, offset
+    return make_of(message, keypoints).values(memoryview(message.data).cast("B"))
 
 
 def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 # No image is this large, and sums of squares stay far below the largest float32.
 _FARTHEST = 1e9
+_CERTAIN, _MISSING = np.float32(1), np.float32(0)
 _LEAST = np.nextafter(np.float32(0), np.float32(1))
 
 Ids = tuple[str | None, ...]
@@ -39,18 +40,20 @@ def observation(
 
     Values without a confidence are certain; a confidence above 1 counts as 1.
     """
-    with np.errstate(over="ignore"):
-        values = values.astype(np.float32)
-    x, y = values[..., 0], values[..., 1]
+    if values.dtype != np.float32:
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = values.astype(np.float32)
+    planes = values.transpose(2, 0, 1)
     # NaN compares false, so the first test drops it together with infinity.
-    seen = (np.abs(values).max(-1) < _FARTHEST) & ((x != 0) | (y != 0))
-    if values.shape[-1] == 3:
-        confidence = np.minimum(values[..., 2], np.float32(1))
-        seen &= confidence >= max(np.float32(min_confidence), _LEAST)
+    seen = np.logical_and.reduce(np.abs(planes) < _FARTHEST)
+    seen &= np.logical_or(planes[0], planes[1])
+    if len(planes) == 3:
+        seen &= planes[2] >= max(np.float32(min_confidence), _LEAST)
+        confidence = np.where(seen, np.minimum(planes[2], _CERTAIN), _MISSING)
     else:
-        confidence = np.ones_like(x)
-    points = values[..., :2]
-    points[~seen] = confidence[~seen] = 0
+        confidence = np.where(seen, _CERTAIN, _MISSING)
+    points = np.zeros((*seen.shape, 2), np.float32)
+    np.copyto(points, values[..., :2], where=seen[..., None])
     return Observation(points, confidence, ids)
 
 

@@ -29,6 +29,7 @@ from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
 from deep_nrsfm_ros.observations.messages import InputType
+from deep_nrsfm_ros.observations.serialised import Reader
 
 INPUTS = int(os.environ.get("FUZZ", "200"))
 FIRST = int(os.environ.get("FUZZ_FIRST", "0"))
@@ -156,7 +157,7 @@ class Bench:
     def lift(
         pipeline: Pipeline, message: Any, input_type: InputType, intrinsics: Any = None
     ) -> Lifted:
-        seen = pipeline.observe(message, input_type)
+        _, seen = pipeline.observe(b"", Reader(input_type, lambda _: message))
         if not len(seen.confidence):
             raise ValueError("no object, which is no error and no answer either")
         names = ("one",) * len(seen.confidence)

@@ -19,6 +19,7 @@ from deep_nrsfm_ros.nrsfm.geometry import quaternion
 from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
+from deep_nrsfm_ros.observations import serialised
 from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP, pack_points
 
 P = len(HUMAN17)
@@ -144,7 +145,7 @@ def placed() -> Lifted:
 
 def test_frames_lead_from_the_objects_to_the_camera() -> None:
     lifted = placed()
-    found = frames(Header(frame_id="optical"), lifted, ["a", "b", "c"])
+    found = frames(serialised.Header(frame_id="optical"), lifted, ["a", "b", "c"])
     assert [frame.child_frame_id for frame in found] == ["a", "c"]
     for frame, i in zip(found, (0, 2), strict=True):
         assert frame.header.frame_id == "optical"
@@ -156,7 +157,7 @@ def test_frames_lead_from_the_objects_to_the_camera() -> None:
 
 def test_markers_stand_where_the_points_are() -> None:
     lifted = placed()
-    markers = publishing.markers(Header(), lifted, [(0, 1)], placed=True).markers
+    markers = publishing.markers(serialised.Header(), lifted, [(0, 1)], placed=True).markers
     for marker in markers:
         position = marker.pose.position
         assert (position.x, position.y, position.z) == (0, 0, 0)

@@ -220,10 +220,11 @@ def test_simulated_time_may_stand_still_and_jump(start_lifter, connect):
     client.wait_for_health(lambda status, v: int(v["messages lifted"]) > 5)
 
 
-def test_bytes_that_are_no_message_harm_nothing(start_lifter, connect):
+def test_bytes_that_are_no_message_are_counted_and_harm_nothing(start_lifter, connect):
     lifter = start_lifter(qos_overrides=RELIABLE)
-    client = connect()
-    publisher = client.publisher(PointCloud2)
+    client, sent = connect(), []
+    raw_publisher = client.publisher(PointCloud2)
+    publisher = SimpleNamespace(publish=lambda m: (sent.append(m), raw_publisher.publish(m)))
     before, whole = client.exchange(publisher, cloud()).data, serialize_message(cloud())
     rng = random.Random(0)
     for _ in range(50 * MANY):
@@ -238,6 +239,11 @@ def test_bytes_that_are_no_message_harm_nothing(start_lifter, connect):
                     for m in client.heard["/lifter/points"]),
         "the answer to what came after",
     )  # fmt: skip
+    words = ("lifted", "without objects", "rejected")
+    client.wait_for_health(
+        lambda _, v: sum(int(v[f"messages {word}"]) for word in words) == len(sent)
+    )
+    assert "bytes that are no sensor_msgs/PointCloud2" in lifter.log
     assert lifter.process.poll() is None and "Traceback" not in lifter.log
 
 

@@ -26,7 +26,7 @@ def health(clock: Clock) -> Health:
 
 
 GOOD, POOR = np.full(2, 0.05, np.float32), np.full(2, 0.6, np.float32)
-SURE, UNSURE = np.full(2, 0.8, np.float32), np.full(2, 0.2, np.float32)
+SURE, UNSURE = np.full((2, 5), 0.8, np.float32), np.full((2, 5), 0.2, np.float32)
 
 
 def test_lifting_is_ok_and_measured(health, clock):
@@ -102,6 +102,12 @@ def test_low_confidence_is_a_warning_of_half_of_the_objects(health):
     assert health.report().level == OK
 
 
+def test_a_model_of_fewer_keypoints_may_take_over_between_two_reports(health):
+    health.lifted(0.001, GOOD, SURE)
+    health.lifted(0.001, GOOD, UNSURE[:, :3])
+    assert health.report().values["confidence"] == "0.50"
+
+
 def test_objects_that_could_not_be_lifted_do_not_spoil_the_error(health):
     health.lifted(0.001, np.array([np.nan, 0.1], np.float32), SURE)
     values = health.report().values
@@ -119,10 +125,10 @@ def test_idle_tells_whether_anything_came(health):
 
 
 def test_more_missed_than_lifted_is_a_warning_with_the_mend(health):
-    health.lifted(0.01, np.array([0.1], np.float32), np.array([0.9], np.float32))
+    health.lifted(0.01, np.array([0.1], np.float32), np.array([[0.9]], np.float32))
     health.missed(1)
     assert health.report().level == OK
-    health.lifted(0.01, np.array([0.1], np.float32), np.array([0.9], np.float32))
+    health.lifted(0.01, np.array([0.1], np.float32), np.array([[0.9]], np.float32))
     health.missed(2)
     level, message, values = health.report()
     assert level == WARN and message.startswith("2 of 3 messages missed") and "turns" in message

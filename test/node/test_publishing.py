@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from array import array
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
+from geometry_msgs.msg import QuaternionStamped
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import MultiDOFJointState, PointCloud2
-from std_msgs.msg import Header
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 
 from deep_nrsfm_ros.node import lifter, publishing
 from deep_nrsfm_ros.node.gaps import Gaps
 from deep_nrsfm_ros.node.listening import Source
+from deep_nrsfm_ros.node.message_types import decoder
+from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.observations.messages import POINT_CLOUD, read
+from deep_nrsfm_ros.observations.messages import POINT_FIELDS as FIELDS
+from deep_nrsfm_ros.observations.serialised import Header, Reader
 from deep_nrsfm_ros.observations.tracker import Tracker
 
 
@@ -32,13 +41,11 @@ def lifted(n: int, p: int = 5, seed: int = 0) -> Lifted:
     )
 
 
-def test_one_cloud_serves_messages_of_any_size():
-    cloud = publishing.PointCloud()
+def test_clouds_of_any_size_follow_each_other():
     for n, p in [(1, 5), (3, 5), (3, 4), (1, 5)]:
         wanted = lifted(n, p, seed=n + p)
-        message = deserialize_message(
-            serialize_message(cloud.fill(Header(frame_id="camera"), wanted)), PointCloud2
-        )
+        raw = publishing.point_cloud(Header(frame_id="camera"), wanted)
+        message = deserialize_message(raw, PointCloud2)
         assert message.header.frame_id == "camera" and message.is_dense
         values = np.frombuffer(message.data, "<f4").reshape(n, p, 4)
         np.testing.assert_array_equal(values[..., :3], wanted.shapes)
@@ -51,7 +58,42 @@ def test_one_cloud_serves_messages_of_any_size():
 def test_a_cloud_with_nan_is_not_dense():
     part = lifted(2)
     part.residual[1] = np.nan
-    assert not publishing.PointCloud().fill(Header(), part).is_dense
+    raw = publishing.point_cloud(Header(), part)
+    assert not deserialize_message(raw, PointCloud2).is_dense
+
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+def assert_same_bytes(raw: bytes, message: Any) -> None:
+    """Compare with what ROS sends, which leaves to chance what is between numbers."""
+    sent, kind = serialize_message(message), type(message).__name__
+    kind = f"{type(message).__module__.split('.')[0]}/msg/{kind}"
+    tidied = [STORE.serialize_cdr(STORE.deserialize_cdr(r, kind), kind) for r in (raw, sent)]
+    assert bytes(tidied[0]) == bytes(tidied[1]) and len(raw) == len(sent)
+
+
+texts = st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=9)
+headers = st.builds(Header, st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1), texts)
+
+
+@settings(deadline=None)
+@given(sent=st.lists(st.tuples(headers, st.integers(1, 3), st.integers(1, 5)), max_size=4))
+def test_what_is_serialised_is_what_ros_would_send(sent: list[tuple[Header, int, int]]) -> None:
+    for header, n, p in sent:  # one after the other: what came before must leave no trace
+        wanted = lifted(n, p, seed=n + 7 * p)
+        wanted.residual[0] = (np.nan, 0.1)[p % 2]
+        values = np.concatenate([wanted.shapes, wanted.confidence[..., None]], -1)
+        message = PointCloud2(header=publishing.to_header(header), height=n, width=p)
+        message.fields = [PointField(name=f, offset=o, datatype=7, count=1) for f, o in FIELDS]
+        message.point_step, message.row_step = 16, 16 * p
+        message.data = array("B", values.astype("<f4").tobytes())
+        message.is_dense = p % 2 == 1
+        assert_same_bytes(publishing.point_cloud(header, wanted), message)
+        turned = QuaternionStamped(header=message.header)
+        R = rotation_from_quaternion(np.array([n, p, -1, 2.0])).astype(np.float32)
+        turned.quaternion = publishing.to_quaternion(R)
+        assert_same_bytes(publishing.camera_rotation(header, R), turned)
 
 
 def test_objects_are_named_and_turned_row_by_row():
@@ -62,7 +104,8 @@ def test_objects_are_named_and_turned_row_by_row():
     message = deserialize_message(serialize_message(sent), MultiDOFJointState)
     assert message.header.frame_id == "camera" and message.joint_names == ["anna", ""]
     first, second = (transform.rotation for transform in message.transforms)
-    assert first == publishing.camera_rotation(Header(), both.rotations[0]).quaternion
+    raw = publishing.camera_rotation(Header(), both.rotations[0])
+    assert first == deserialize_message(raw, QuaternionStamped).quaternion
     assert np.isnan([second.x, second.y, second.z, second.w]).all()
     assert message.transforms[0].translation.x == 0
 
@@ -70,7 +113,8 @@ def test_objects_are_named_and_turned_row_by_row():
 def test_the_rotation_turns_the_object_into_the_camera():
     # A quarter turn about z: the object's x axis comes to lie on the camera's y axis.
     R = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
-    q = publishing.camera_rotation(Header(), R).quaternion
+    raw = publishing.camera_rotation(Header(), R)
+    q = deserialize_message(raw, QuaternionStamped).quaternion
     assert (q.x, q.y, q.z, q.w) == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
 
 
@@ -96,11 +140,11 @@ def test_markers_are_not_made_when_nobody_listens(
     rclpy.init(args=["--ros-args", *settings], domain_id=domain)
     try:
         node = lifter.LifterNode()
-        heard: list[PointCloud2] = []
+        heard: list[bytes] = []
         monkeypatch.setattr(node._points, "publish", heard.append)
         node._lift(
-            Source("/keypoints", POINT_CLOUD, Tracker(), Gaps()),
-            publishing.PointCloud().fill(Header(), lifted(1, len(HUMAN17))),
+            Source("/keypoints", Reader(POINT_CLOUD, decoder(POINT_CLOUD)), Tracker(), Gaps()),
+            publishing.point_cloud(Header(), lifted(1, len(HUMAN17))),
         )
         assert heard and not made
         node.destroy_node()

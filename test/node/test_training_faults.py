@@ -15,17 +15,18 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from safetensors.numpy import load_file
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
 
-from deep_nrsfm_ros.node.publishing import PointCloud
+from deep_nrsfm_ros.node.publishing import point_cloud
 from deep_nrsfm_ros.node.unfinished import checkpoint_file, look, record_file
 from deep_nrsfm_ros.nrsfm.checkpoint import read_checkpoint
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.nrsfm.model_file import load_model
 from deep_nrsfm_ros.observations.bags import frames, write_bag
+from deep_nrsfm_ros.observations.serialised import Header
 
 P = 17
 KILLS, MANY_KILLS = 5, int(os.environ.get("KILLS", "50"))
@@ -58,9 +59,7 @@ def cloud(number: int) -> PointCloud2:
     zeros = np.zeros(1, np.float32)
     points = np.concatenate([views(1), np.zeros((1, P, 1))], -1).astype(np.float32)
     seen = Lifted(points, zeros, zeros, zeros, zeros, confidence=np.ones((1, P), np.float32))
-    header = Header()
-    header.stamp.sec = number
-    return PointCloud().fill(header, seen)
+    return deserialize_message(point_cloud(Header(sec=number), seen), PointCloud2)
 
 
 class Stream:

@@ -79,11 +79,29 @@ def test_several_bags_and_several_objects(tmp_path: Path) -> None:
     assert all(done <= total for done, total in seen)
 
 
-def test_many_blocks_of_frames_keep_their_order(tmp_path: Path) -> None:
+@pytest.mark.parametrize("input_type", [MULTI_ARRAY, POINT_CLOUD])
+def test_many_blocks_of_frames_keep_their_order(tmp_path: Path, input_type: str) -> None:
     points, confidence = detections(5000, COCO17)
-    write_bag(tmp_path / "bag", TOPIC, frames(points, confidence), "mcap", MULTI_ARRAY)
+    write_bag(tmp_path / "bag", TOPIC, frames(points, confidence), "mcap", input_type)
     ensemble = read_bags([tmp_path / "bag"], TOPIC, COCO17, COCO17).ensemble
     np.testing.assert_array_equal(ensemble.points, points)
+    np.testing.assert_array_equal(ensemble.visible, confidence > 0)
+
+
+def test_messages_of_several_makes_keep_their_order(tmp_path: Path) -> None:
+    points, confidence = detections(300)
+    ends = np.random.default_rng(0).integers(0, 4, 400).cumsum().clip(0, 300)
+    cameras = ("left", "a much longer name", "")
+    seen = (
+        Frame(i, points[start:end], confidence[start:end], cameras[i // 7 % 3])
+        for i, (start, end) in enumerate(zip([0, *ends], ends, strict=False))
+    )
+    assert write_bag(tmp_path / "bag", TOPIC, seen) == 400
+    reading = read_bags([tmp_path / "bag"], TOPIC, BODY25, BODY25, min_confidence=0.3)
+    np.testing.assert_array_equal(reading.ensemble.visible, confidence >= 0.3)
+    sure = np.where(reading.ensemble.visible[..., None], points, 0)
+    np.testing.assert_array_equal(reading.ensemble.points, sure)
+    assert (reading.messages, reading.unreadable) == (400, 0)
 
 
 def test_progress_counts_to_the_total(tmp_path: Path) -> None:
