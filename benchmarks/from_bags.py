@@ -51,13 +51,13 @@ VIDEO_RATE, CMU_RATE = 30.0, 120.0
 EXCAVATOR = Path(__file__).parents[1] / "config/objects/excavator.yaml"
 WORK, WORK_LATER = 6000, 1500
 """Frames of the machine to learn from, and of other work to lift."""
-STEPS = {"video": 30_000, "tuned": 100, "machine": 8000, "mocap": 3000}
+STEPS = {"video": 30_000, "anatomy": 6000, "tuned": 100, "machine": 8000, "mocap": 3000}
 QUALITY = {
     "reprojection": "label-free, from the training's report: error of the network alone",
     "cycle": "label-free: error of reconstructing its own shapes seen from elsewhere",
 }
 _SHOWN = {name: CONVENTIONS[name] for name in ("shape %", "proper %", "mirrored %")}
-_ANATOMY = ("--bones", "3", "--front", "1")
+_ANATOMY = ("--bones", "3", "--front", "1", "--flat", "0.1")
 _DRAWN = 8
 _AT_ONCE = 256
 UNTOUCHED = {
@@ -118,9 +118,8 @@ def video(session: Session) -> Table:
     shipped = load_model(find_model("human", model_folders(session.models)))
     models = {
         "this video alone": session.trained("video", "video", *alone),
-        "this video, and what its layout knows": session.trained(
-            "video_anatomy", "video", *alone, *_ANATOMY
-        ),
+        "its layout heeded": session.trained("video_anatomy", "anatomy", *alone, *_ANATOMY),
+        "the same, longer": session.trained("video_anatomy", "video", *alone, *_ANATOMY),
         "human, tuned to it": session.trained("tuned", "tuned", *words, "--from", "human"),
         "human": shipped,
     }
@@ -137,8 +136,8 @@ def video(session: Session) -> Table:
         "mirrored to human %": "objects that are more like the mirror image of what the model "
         "human makes of them, which is no truth either",
         "human, flat": "the same without its depth, for comparison",
-        "what its layout knows": f"`{' '.join(_ANATOMY)}`: its training was told what faces, "
-        "knees, toes and bones measure, so that these say little of it",
+        "its layout heeded": f"this video alone, with `{' '.join(_ANATOMY)}`: its training was "
+        "told what faces, knees, toes and bones measure, so that these say little of it",
     }
     chosen = np.linspace(0, len(there) - 1, _DRAWN).astype(int).tolist()
     table = Table(
