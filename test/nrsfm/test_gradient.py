@@ -77,7 +77,7 @@ def test_it_is_the_gradient_that_torch_finds(
     try:
         x = objective.task(net, frames, known, torch.Generator()).x
         size = torch.linalg.svdvals((encode(net, x)[-1] @ net.camera_head)[..., 0])
-        if (size[:, 1] < 0.01 * size[:, 0]).any() or not size.all():
+        if (size[:, 1] < 0.05 * size[:, 0]).any() or not size.all():
             return  # hardly a camera: its gradient is large, and torch's own not exact
         losses, bars = descend(objective, net, frames, known, torch.Generator())
         expected, by_torch = _by_torch(objective, net, frames, known, torch.Generator())
