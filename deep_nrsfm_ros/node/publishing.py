@@ -6,7 +6,6 @@ ROS has serialised serves for the next.
 
 from __future__ import annotations
 
-import struct
 from array import array
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -28,7 +27,6 @@ from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP
 from deep_nrsfm_ros.observations.serialised import Header
 
 _MAKES = 16  # of each kind of message that are kept: cameras, and numbers of objects
-_STAMP, _STAMP_AT = struct.Struct("<iI"), 4  # in all that begins with a header
 
 _LIFETIME = Duration(nanosec=300_000_000)
 _BONES = std_msgs.ColorRGBA(r=0.2, g=0.6, b=1.0, a=1.0)
@@ -47,7 +45,7 @@ class _Template(NamedTuple):
 def point_cloud(header: Header, lifted: Lifted) -> bytes:
     """Return the points and confidence of n objects as a serialised PointCloud2."""
     raw, values = _point_cloud(header.frame_id, *lifted.confidence.shape)
-    _STAMP.pack_into(raw, _STAMP_AT, header.sec, header.nanosec)
+    header.write_stamp(raw)
     values[..., :3] = lifted.shapes
     values[..., 3] = lifted.confidence
     raw[-1] = not np.isnan(lifted.residual).any()  # is_dense
@@ -57,7 +55,7 @@ def point_cloud(header: Header, lifted: Lifted) -> bytes:
 def camera_rotation(header: Header, rotation: NDArray[np.float32]) -> bytes:
     """Return the rotation (3, 3) of an object as a serialised QuaternionStamped."""
     raw, values = _quaternion(header.frame_id)
-    _STAMP.pack_into(raw, _STAMP_AT, header.sec, header.nanosec)
+    header.write_stamp(raw)
     values[:] = quaternion(rotation)
     return bytes(raw)
 

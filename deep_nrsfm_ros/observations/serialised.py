@@ -36,6 +36,10 @@ class Header(NamedTuple):
         """Return the stamp in ns."""
         return self.sec * 1_000_000_000 + self.nanosec
 
+    def write_stamp(self, raw: bytearray) -> None:
+        """Write the stamp into a serialised message that begins with a header."""
+        _STAMP.pack_into(raw, _STAMP_AT, self.sec, self.nanosec)
+
 
 class SerialisedMake(NamedTuple):
     """What serialised PointCloud2 of one make have in common: all but stamp, data and padding.
