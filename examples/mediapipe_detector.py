@@ -27,9 +27,10 @@ import rclpy
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.time import Time
 from sensor_msgs.msg import Image, PointCloud2, PointField
@@ -184,11 +185,11 @@ class DetectorNode(Node):
 
 def main() -> None:
     """Run the node until its files end or it is told to stop; exit code 1 for a bad source."""
-    # rclpy's handlers come on top of these and shut the context down, which ends `spin`; Python's
-    # own would raise KeyboardInterrupt wherever it is, in the middle of rclpy or of MediaPipe.
+    # None of rclpy's handlers: they shut the context down amid whatever this thread asks of ROS.
+    signals: list[int] = []
     for number in ENDING:
-        signal.signal(number, lambda *_: None)
-    rclpy.init()
+        signal.signal(number, lambda number, _: signals.append(number))
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = DetectorNode()
     except ValueError as error:
@@ -196,20 +197,15 @@ def main() -> None:
         sys.exit(f"detector: {error}")
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    try:
-        # Not for ever: now and then rclpy wakes for a signal before it has shut down, and waits on.
-        while rclpy.ok() and not node.finished.done():
-            executor.spin_once(timeout_sec=0.5)
-        if rclpy.ok():
-            node.close()
-    except ExternalShutdownException:
-        pass
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
-        for number in ENDING:  # launchers and terminals send the signal twice
-            signal.signal(number, signal.SIG_IGN)
+    while not signals and not node.finished.done():
+        executor.spin_once(timeout_sec=0.2)  # a signal does not wake it
+    if not signals:
+        node.close()
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.shutdown()
+    for number in ENDING:  # launchers and terminals send the signal twice
+        signal.signal(number, signal.SIG_IGN)
 
 
 if __name__ == "__main__":
