@@ -100,7 +100,8 @@ def serve(page: str, port: int, work: Callable[[Broadcast, threading.Event], Non
         try:
             work(broadcast, stop)
             broadcast.end()
-            stop.wait()
+            while not stop.wait(0.5):  # a signal just before does not end a wait without end
+                pass
         except KeyboardInterrupt:
             pass
         finally:
