@@ -32,11 +32,12 @@ ALONE = LiftingOptions(correction="none", turns=1, mirror=False)
 LIFTING = {
     "network alone": ALONE,
     "back-projected": LiftingOptions(correction="back_projection", turns=1, mirror=False),
+    "without bones": LiftingOptions(correction="learned"),
     "as shipped": LiftingOptions(),
     "as shipped, noise 0": LiftingOptions(noise=0.0),
 }
-"""How a model's shapes come about: one pass, one pass moved onto the input, the default, and the
-default for keypoints without noise."""
+"""How a model's shapes come about: one pass, one pass moved onto the input, all but what the bones
+tell, the default, and the default for keypoints without noise."""
 
 
 def arguments() -> argparse.ArgumentParser:

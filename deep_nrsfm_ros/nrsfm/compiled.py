@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.confidence import CALIBRATED, LEAST_RESIDUAL
 from deep_nrsfm_ros.nrsfm.correction import UNKNOWN
 from deep_nrsfm_ros.nrsfm.fitting import NEAREST, RESIDUAL_SPREAD, Constants
@@ -42,7 +43,9 @@ class Kernel:
         header += [bool(options.whitening), constants.normaliser.scale == "rms"]
         header += [constants.covariance is not None]
         header += [constants.refill, *(constants.reference or (-1, -1)), constants.min_visible]
-        header += [*options.widths, *(constants.partners or range(p))]
+        bones = constants.bones or Bones(np.zeros((2, 0), np.int32), np.zeros(0), np.zeros(0))
+        header += [len(bones.lengths), *options.widths, *(constants.partners or range(p))]
+        header += [*bones.ends.T.flat]
         floats = [_panels(net.L), _panels(net.L_inverse)]
         for i, (D, b, b_) in enumerate(zip(net.D, net.b, net.b_, strict=True)):
             # Of shapes, the coordinates stand one after the other, (3, p).
@@ -55,7 +58,7 @@ class Kernel:
         # Three rows for each point: (p, 3, 3, p).
         rows = covariance.reshape(p, 3, p, 3).swapaxes(2, 3)
         doubles = [_padded(rows, _kernel.DOUBLES), filling(net), constants.turns, constants.frame]
-        doubles += [CALIBRATED, constants.noise, constants.length]
+        doubles += [CALIBRATED, np.stack(bones[1:], 1), constants.noise, constants.length]
         doubles += [UNKNOWN * np.trace(covariance) / (3 * p), NEAREST, RESIDUAL_SPREAD]
         doubles += [LEAST_RESIDUAL]
         self._plan = _kernel.plan(

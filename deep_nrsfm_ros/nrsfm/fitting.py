@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.confidence import near
 from deep_nrsfm_ros.nrsfm.correction import correct
 from deep_nrsfm_ros.nrsfm.geometry import (
@@ -41,6 +42,7 @@ class Constants(NamedTuple):
     turns: Float32  # (k, 2, 2) of the input within the image plane
     partners: Sequence[int] | None  # of each keypoint in the mirror image; None: no mirror images
     covariance: NDArray[np.float64] | None  # (3p, 3p) by which to correct; None: not at all
+    bones: Bones | None  # by which to correct as well
     spread: Float32  # (p,) standard deviation of the errors of each point
     noise: float  # of the keypoints, relative to the size of the object
     refill: int  # rounds
@@ -114,7 +116,8 @@ class Fit:
             size = np.sqrt((W * W * seen).sum((1, 2)) / np.maximum(2 * seen.sum((1, 2)), 1))
             noise = known.noise * size
             cameras = M[:, None] - R[:, None, 2, :, None] * points[:, :, None] if perspective else M
-            S = correct(S @ R, cameras, W, visible, known.covariance, noise) @ R.swapaxes(1, 2)
+            S = correct(S @ R, cameras, W, visible, known.covariance, noise, known.bones)
+            S = S @ R.swapaxes(1, 2)
         return S, R, residual, unit, origin
 
     def _average(

@@ -22,10 +22,11 @@ class LiftingOptions:
     """Lifting."""
 
     correction: str = option(
-        "learned",
-        "how what is left of the keypoints moves the shape: by what the model has learned of its "
-        "own errors, depth included; by back-projection, within the image plane; or not at all",
-        choices=("learned", "back_projection", "none"),
+        "bones",
+        "how the shape is moved after the network: by what the keypoints show, what the model has "
+        "learned of its own errors, depth included, and how long the bones of the layout are; by "
+        "the same without the bones; by back-projection, within the image plane; or not at all",
+        choices=("bones", "learned", "back_projection", "none"),
     )
     noise: float = option(
         0.02,
@@ -118,7 +119,7 @@ def _constants(model: Model, options: LiftingOptions) -> Constants:
     angles = 2 * np.pi * np.arange(options.turns) / options.turns
     c, s = np.cos(angles), np.sin(angles)
     covariance = None
-    if options.correction == "learned":
+    if options.correction in ("bones", "learned"):
         turn = np.kron(np.eye(p), model.object_frame)
         covariance = turn.T @ model.error_covariance @ turn
     elif options.correction == "back_projection":
@@ -131,6 +132,7 @@ def _constants(model: Model, options: LiftingOptions) -> Constants:
         np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy(),
         model.layout.partners() if options.mirror else None,
         covariance,
+        model.bones if options.correction == "bones" else None,
         np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1)),
         options.noise,
         options.refill,

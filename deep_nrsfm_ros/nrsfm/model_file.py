@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load, save_file
 
 from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, weight_shapes
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
@@ -25,6 +26,7 @@ _FORMAT = "deep_nrsfm_ros model 2"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _MAX_BYTES = 64 * 2**20
 _MAX_HEADER = 2**20
+_SMALLEST = 1e-9  # length of a bone, or its spread, that can be divided by
 _LARGEST = 1e9  # no weight of a trained model comes near; products of them stay finite
 
 
@@ -42,6 +44,8 @@ class Model:
     provenance: data, recipe and versions; quality: label-free figures.
     error_covariance: (3p, 3p) of the network's errors, in its own axes; see `correction`. Equal
         and apart from each other if nothing is known.
+    bone_lengths: (b, 2) of the layout's edges, shares of their sum and how much they vary; see
+        `bones`. Empty if nothing is known.
     """
 
     name: str
@@ -52,12 +56,21 @@ class Model:
     provenance: dict[str, Any] = field(default_factory=dict)
     quality: dict[str, Any] = field(default_factory=dict)
     error_covariance: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    bone_lengths: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
     def __post_init__(self) -> None:
         """Fill in a covariance that is not given."""
         if not self.error_covariance.size:
             unknown = np.eye(3 * len(self.layout), dtype=np.float32)
             object.__setattr__(self, "error_covariance", unknown)
+
+    @property
+    def bones(self) -> Bones | None:
+        """What is known of the bones."""
+        if not len(self.bone_lengths):
+            return None
+        ends = np.array(self.layout.edge_indices(), np.int32).T
+        return Bones(ends, *self.bone_lengths.astype(np.float64).T)
 
 
 def save_model(path: Path, model: Model) -> None:
@@ -73,6 +86,8 @@ def save_model(path: Path, model: Model) -> None:
     }
     weights = {k: np.ascontiguousarray(w, np.float32) for k, w in model.network.named()}
     weights["error_covariance"] = np.ascontiguousarray(model.error_covariance, np.float32)
+    if len(model.bone_lengths):
+        weights["bone_lengths"] = np.ascontiguousarray(model.bone_lengths, np.float32)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -134,6 +149,8 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     layout = _layout(header["layout"])
     p = len(layout)
     shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
+    if "bone_lengths" in weights:  # older files have none
+        shapes["bone_lengths"] = (len(layout.edges), 2)
     for name, shape in shapes.items():
         found = weights[name]
         if found.shape != shape or found.dtype != np.float32:
@@ -153,6 +170,9 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
         raise ValueError("error_covariance is not symmetric")
     if not np.linalg.eigvalsh(covariance)[0] > 0:
         raise ValueError("error_covariance is not positive definite")
+    bone_lengths = weights.get("bone_lengths", np.zeros((0, 2), np.float32))
+    if not (bone_lengths > _SMALLEST).all():
+        raise ValueError(f"bone_lengths are not all above {_SMALLEST:g}")
     return Model(
         str(header["name"]),
         Network.from_named(architecture, weights),
@@ -162,6 +182,7 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
         dict(header["provenance"]),
         dict(header["quality"]),
         covariance,
+        bone_lengths,
     )
 
 

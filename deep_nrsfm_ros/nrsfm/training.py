@@ -18,7 +18,7 @@ from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
 from deep_nrsfm_ros.nrsfm.best import Best
 from deep_nrsfm_ros.nrsfm.checkpoint import read_checkpoint, write_checkpoint
-from deep_nrsfm_ros.nrsfm.correction import error_covariance
+from deep_nrsfm_ros.nrsfm.correction import bone_lengths, error_covariance
 from deep_nrsfm_ros.nrsfm.distributed import ALONE, Team
 from deep_nrsfm_ros.nrsfm.geometry import Floats
 from deep_nrsfm_ros.nrsfm.handedness import object_frame
@@ -261,7 +261,8 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
     mask = sample.mask.cpu().numpy()
     W, _ = complete(net, sample.points.cpu().numpy(), mask)
     S, _, _ = lift(W)
-    covariance = error_covariance(lift, W, np.random.default_rng(trainer.seed))
+    rng = np.random.default_rng(trainer.seed)
+    covariance = error_covariance(lift, W, rng)
     return Model(
         name,
         net,
@@ -269,6 +270,7 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         normaliser,
         object_frame(S, layout, mask[..., 0] > 0),
         error_covariance=covariance,
+        bone_lengths=bone_lengths(lift, W, layout.edge_indices(), covariance, rng),
         provenance={
             "data": source,
             "frames": trainer.frames_in_all,

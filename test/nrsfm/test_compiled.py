@@ -40,7 +40,13 @@ def model(
     frame = np.linalg.qr(rng.standard_normal((3, 3)))[0].astype(np.float32)
     B = rng.standard_normal((3 * p, 3 * p))
     covariance = (0.01 * np.eye(3 * p) + 0.003 * B @ B.T / p).astype(np.float32)
-    return Model("random", network, layout, Normaliser(scale), frame, error_covariance=covariance)
+    b = len(layout.edges)
+    lengths, spread = rng.uniform(0.01, 0.2, (2, b))
+    return Model(
+        *("random", network, layout, Normaliser(scale), frame),
+        error_covariance=covariance,
+        bone_lengths=np.stack((lengths, spread), 1).astype(np.float32),
+    )
 
 
 def objects(
@@ -62,7 +68,7 @@ def objects(
     scale=st.sampled_from(["rms", "none"]),
     options=st.builds(
         LiftingOptions,
-        correction=st.sampled_from(["learned", "back_projection", "none"]),
+        correction=st.sampled_from(["bones", "learned", "back_projection", "none"]),
         noise=st.sampled_from([0.01, 0.1]),
         refill=st.integers(0, 3),
         turns=st.integers(1, 5),

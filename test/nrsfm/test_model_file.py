@@ -45,8 +45,9 @@ def model(
     provenance = {"data": "bags a, b", "frames": 5, "recipe": {"cycle": 2.0}}
     quality = {"cycle_error": 0.25, "coherence": 0.5}
     covariance = np.diag(rng.uniform(1, 2, 3 * len(layout))).astype(np.float32)
+    bones = rng.uniform(0.1, 0.2, (len(layout.edges), 2)).astype(np.float32)
     return Model(
-        "mine", network, layout, Normaliser("none"), MIRROR, provenance, quality, covariance
+        "mine", network, layout, Normaliser("none"), MIRROR, provenance, quality, covariance, bones
     )
 
 
@@ -173,6 +174,23 @@ def test_the_error_covariance_is_checked(file: Path, kind: str, refusal: str) ->
 
     rewrite(file, change)
     assert f"error_covariance is {refusal}" in refused(file)
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1])
+def test_bones_have_a_length(file: Path, value: float) -> None:
+    def change(header: Any, weights: Any, metadata: Any) -> None:
+        weights["bone_lengths"][3, 1] = value
+
+    rewrite(file, change)
+    assert "bone_lengths are not all above" in refused(file)
+
+
+def test_a_file_that_knows_nothing_of_bones_is_read(file: Path) -> None:
+    def change(header: Any, weights: Any, metadata: Any) -> None:
+        del weights["bone_lengths"]
+
+    rewrite(file, change)
+    assert load_model(file).bones is None
 
 
 HEADERS: dict[str, dict[str, Any]] = {

@@ -44,8 +44,8 @@ void product(int rows, const float *X, int stride, Matrix A, const float *b, int
 
 /* Solve A x = b for a symmetric positive definite A (n, n), of which the upper half is read and spoilt.
 
-   n is a multiple of DOUBLES. b (n, DOUBLES) stands beside A, as columns n, n + 1 ... of its rows, and
-   x takes its place. */
-void solve(int n, double *A);
+   n is a multiple of DOUBLES. b (n, DOUBLES) stands beside A, as columns n, n + 1 ... of its rows, which
+   are `stride` apart, and x takes its place. */
+void solve(int n, int stride, double *A);
 
 #endif

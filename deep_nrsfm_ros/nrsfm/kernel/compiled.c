@@ -16,10 +16,11 @@ int lay_out(Plan *k, const int *header, const float *floats, const double *doubl
     const double *d = doubles;
     k->p = *h++, k->layers = *h++, k->turns = *h++, k->mirrored = *h++, k->whitened = *h++;
     k->rms = *h++, k->corrected = *h++, k->refill = *h++, k->reference[0] = *h++;
-    k->reference[1] = *h++, k->min_visible = *h++;
+    k->reference[1] = *h++, k->min_visible = *h++, k->bones = *h++;
     int p = k->p, wide = k->wide = FLOATS_OF(p), last;
     k->widths = h, h += k->layers;
     k->partners = h, h += p;
+    k->ends = h, h += 2 * k->bones;
     f = matrix(&k->L, p, p, f);
     f = matrix(&k->L_inverse, p, p, f);
     for (int i = 0; i < k->layers; i++) {
@@ -38,6 +39,7 @@ int lay_out(Plan *k, const int *header, const float *floats, const double *doubl
     k->turn = d, d += 4 * k->turns;
     k->frame = d, d += 9;
     k->calibration = d, d += 5;
+    k->lengths = d, d += 2 * k->bones;
     k->noise = *d++, k->length = *d++, k->unknown = *d++, k->nearest = *d++;
     k->residual_spread = *d++, k->least_residual = *d++;
     return h - header == lengths[0] && f - floats == lengths[1] && d - doubles == lengths[2];
@@ -45,7 +47,8 @@ int lay_out(Plan *k, const int *header, const float *floats, const double *doubl
 
 size_t scratch(Plan *k, char *at) {
     int n = k->block = 6 * k->turns < ROWS ? ROWS / (6 * k->turns) : 1;
-    int p = k->p, wide = k->wide, even = DOUBLES_OF(p), all = k->turns * (1 + k->mirrored);
+    int p = k->p, wide = k->wide, all = k->turns * (1 + k->mirrored);
+    size_t even = DOUBLES_OF(p), bones = DOUBLES_OF(k->bones);
     size_t widest = 3 * wide, turned = (size_t)n * k->turns, used = 0;
     for (int i = 0; i < k->layers; i++)
         if ((size_t)FLOATS_OF(k->widths[i]) > widest) widest = FLOATS_OF(k->widths[i]);
@@ -63,7 +66,12 @@ size_t scratch(Plan *k, char *at) {
     ROOM(k->residual, double, all)
     ROOM(k->cameras, double, 6 * even)
     ROOM(k->HC, double, 6 * even)
-    ROOM(k->A, double, 2 * (size_t)even * (2 * even + DOUBLES))
+    ROOM(k->E, double, 3 * even)
+    ROOM(k->A, double, (2 * even + bones) * (2 * even + bones + DOUBLES))
+    ROOM(k->whole, double, 2 * even * (2 * even + bones + DOUBLES))
+    ROOM(k->left, double, 2 * even)
+    ROOM(k->edges, double, 4 * bones)
+    ROOM(k->along, double, 3 * even * bones)
     ROOM(k->missing, int, p)
     ROOM(k->some, Object *, n)
     ROOM(k->objects, Object, n)

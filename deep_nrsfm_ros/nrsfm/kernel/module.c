@@ -23,8 +23,8 @@ static PyObject *plan(PyObject *Py_UNUSED(module), PyObject *args) {
     for (int i = 0; i < 3; i++) aligned[i + 1] = aligned[i] + (parts[i].len + LINE - 1) / LINE * LINE;
     const int *header = parts[0].buf;
     Py_ssize_t lengths[3] = {parts[0].len / 4, parts[1].len / 4, parts[2].len / 8};
-    int sound = lengths[0] > 12 && header[0] > 0 && header[1] > 0 && header[1] <= MOST_LAYERS;
-    sound = sound && lengths[0] == 11 + header[0] + header[1];
+    int sound = lengths[0] > 13 && header[0] > 0 && header[1] > 0 && header[1] <= MOST_LAYERS;
+    sound = sound && header[11] >= 0 && lengths[0] == 12 + header[0] + header[1] + 2 * header[11];
     Plan *k = sound ? PyMem_Calloc(1, sizeof(Plan)) : NULL;
     char *memory = NULL;
     if (k && lay_out(k, header, parts[1].buf, parts[2].buf, lengths)) {

@@ -25,18 +25,18 @@ typedef struct {
 } Object;
 
 typedef struct {
-    int p, wide, layers, turns, mirrored, whitened, rms, corrected, refill, reference[2], min_visible;
-    const int *widths, *partners;
+    int p, wide, layers, turns, mirrored, whitened, rms, corrected, refill, reference[2], min_visible, bones;
+    const int *widths, *partners, *ends;
     Matrix L, L_inverse, encoder[MOST_LAYERS], decoder[MOST_LAYERS], code_head;
     const float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head, *spread;
-    const double *covariance, *filling, *turn, *frame, *calibration;
+    const double *covariance, *filling, *turn, *frame, *calibration, *lengths;
     double noise, length, unknown, nearest, residual_spread, least_residual;
     void *memory;
     /* Scratch, for `block` objects at a time. */
     int block, *missing;
     Object *objects, **some;
     float *x, *V, *Psi[2], *psi[2], *shapes;
-    double *M, *cameras, *HC, *A, *residual;
+    double *M, *cameras, *HC, *E, *A, *whole, *left, *edges, *along, *residual;
 } Plan;
 
 /* compiled.py: point `k` at its parts of three arrays; return whether they have a plan's `lengths`. */
@@ -55,6 +55,9 @@ void observe(Plan *k, Object *o);
 /* network.py: set `shapes` (n, turns, 3, wide) and the cameras M (n, turns) of n objects by turns of
    their input; `across`: of its mirror image. */
 void forward(Plan *k, int n, Object *const *objects, int across, float *shapes, camera *M);
+
+/* bones.py: set the edges (bones, 4) of S + E, unit vectors and lengths; return the size of the object. */
+double observe_bones(Plan *k, const Object *o);
 
 /* correction.py: move S, in the axes of the object, towards the visible of W. `cameras` (3, 2, p), p in
    DOUBLES: those of each point. */

@@ -63,14 +63,14 @@ TARGET static void FOR(product)(int rows, const float *X, int stride, Matrix A, 
 }
 
 /* Columns j ... of rows k ... k + 3, less what the rows above have in them. */
-HERE void FOR(subtract)(const int vectors, int k, int wide, const double *A, int j,
+HERE void FOR(subtract)(const int vectors, int k, int stride, const double *A, int j,
                         FOR(doubles) left[4][2]) {
     typedef FOR(doubles) vector;
     for (int r = 0; r < 4; r++)
         for (int v = 0; v < vectors; v++)
-            left[r][v] = ((const vector *)(A + (size_t)(k + r) * wide + j))[v];
+            left[r][v] = ((const vector *)(A + (size_t)(k + r) * stride + j))[v];
     for (int i = 0; i < k; i++) {
-        const double *above = A + (size_t)i * wide;
+        const double *above = A + (size_t)i * stride;
         for (int r = 0; r < 4; r++)
             for (int v = 0; v < vectors; v++)
                 left[r][v] -= above[k + r] * ((const vector *)(above + j))[v];
@@ -78,50 +78,50 @@ HERE void FOR(subtract)(const int vectors, int k, int wide, const double *A, int
 }
 
 /* Columns j ... of rows k ... k + 3 of U, whose columns k ... k + 3 are there. */
-HERE void FOR(eliminate)(const int vectors, int k, int wide, double *A, int j,
+HERE void FOR(eliminate)(const int vectors, int k, int stride, double *A, int j,
                          const double *scale) {
     typedef FOR(doubles) vector;
     vector left[4][2];
-    FOR(subtract)(vectors, k, wide, A, j, left);
+    FOR(subtract)(vectors, k, stride, A, j, left);
     for (int r = 0; r < 4; r++)
         for (int v = 0; v < vectors; v++) {
             for (int q = 0; q < r; q++)
-                left[r][v] -= A[(size_t)(k + q) * wide + k + r] * left[q][v];
+                left[r][v] -= A[(size_t)(k + q) * stride + k + r] * left[q][v];
             left[r][v] *= scale[r];
-            ((vector *)(A + (size_t)(k + r) * wide + j))[v] = left[r][v];
+            ((vector *)(A + (size_t)(k + r) * stride + j))[v] = left[r][v];
         }
 }
 
 /* By Cholesky's U^T U = A, four rows at a time; y of U^T y = b comes out beside U. */
-TARGET static void FOR(solve)(int n, double *A) {
+TARGET static void FOR(solve)(int n, int stride, double *A) {
     typedef FOR(doubles) vector;
     int wide = n + DOUBLES;
     for (int k = 0; k < n; k += 4) {
         vector corner[4][2];
         double U[4][4], scale[4];
-        FOR(subtract)(4 / LANES, k, wide, A, k, corner);
+        FOR(subtract)(4 / LANES, k, stride, A, k, corner);
         for (int r = 0; r < 4; r++)
             for (int c = 0; c < 4; c++) U[r][c] = corner[r][c / LANES][c % LANES];
         for (int r = 0; r < 4; r++) {
             scale[r] = 1 / sqrt(fmax(U[r][r], 1e-300));
-            for (int c = r; c < 4; c++) A[(size_t)(k + r) * wide + k + c] = U[r][c] *= scale[r];
+            for (int c = r; c < 4; c++) A[(size_t)(k + r) * stride + k + c] = U[r][c] *= scale[r];
             for (int q = r + 1; q < 4; q++)
                 for (int c = q; c < 4; c++) U[q][c] -= U[r][q] * U[r][c];
         }
         int j = k + 4;
-        for (; j + 2 * LANES <= wide; j += 2 * LANES) FOR(eliminate)(2, k, wide, A, j, scale);
-        for (; j < wide; j += LANES) FOR(eliminate)(1, k, wide, A, j, scale);
+        for (; j + 2 * LANES <= wide; j += 2 * LANES) FOR(eliminate)(2, k, stride, A, j, scale);
+        for (; j < wide; j += LANES) FOR(eliminate)(1, k, stride, A, j, scale);
     }
     for (int k = n - 4; k >= 0; k -= 4)
         for (int c = n; c < wide; c += LANES) {
             vector x[4];
-            for (int r = 0; r < 4; r++) x[r] = *(const vector *)(A + (size_t)(k + r) * wide + c);
+            for (int r = 0; r < 4; r++) x[r] = *(const vector *)(A + (size_t)(k + r) * stride + c);
             for (int j = k + 4; j < n; j++)
                 for (int r = 0; r < 4; r++)
-                    x[r] -= A[(size_t)(k + r) * wide + j] *
-                            *(const vector *)(A + (size_t)j * wide + c);
+                    x[r] -= A[(size_t)(k + r) * stride + j] *
+                            *(const vector *)(A + (size_t)j * stride + c);
             for (int r = 3; r >= 0; r--) {
-                double *row = A + (size_t)(k + r) * wide;
+                double *row = A + (size_t)(k + r) * stride;
                 for (int q = r + 1; q < 4; q++) x[r] -= row[k + q] * x[q];
                 *(vector *)(row + c) = x[r] /= row[k + r];
             }

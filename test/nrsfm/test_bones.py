@@ -1,0 +1,124 @@
+"""Lengths of bones as observations: their derivatives, the formula, and what they are for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deep_nrsfm_ros.nrsfm.bones import Bones, shares
+from deep_nrsfm_ros.nrsfm.correction import bone_lengths, correct
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
+
+some = settings(max_examples=25, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+P = 6
+EDGES = [(0, 1), (1, 2), (3, 2), (4, 5)]
+
+
+def lengths(X: np.ndarray) -> np.ndarray:
+    return np.stack([np.linalg.norm(X[..., i, :] - X[..., j, :], axis=-1) for i, j in EDGES], -1)
+
+
+def bones_of(X: np.ndarray, spread: float = 0.02) -> Bones:
+    """Return bones that have in X (p, 3) the lengths they should have."""
+    share = lengths(X) / lengths(X).sum()
+    return Bones(np.array(EDGES, np.int32).T, share, spread * share)
+
+
+@some
+@given(seeds)
+def test_lengths_grow_as_their_derivatives_say(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    X, E = rng.standard_normal((2, 3, P, 3))
+    G, _, _ = bones_of(X[0]).observe(X)
+    grown = (lengths(X + 1e-6 * E) - lengths(X - 1e-6 * E)) / 2e-6
+    np.testing.assert_allclose((G @ E.reshape(3, -1, 1))[..., 0], grown, atol=1e-4)
+
+
+@some
+@given(seeds, st.floats(0.01, 100))
+def test_a_shape_of_the_right_proportions_lacks_nothing_at_any_size(seed: int, size: float) -> None:
+    X = np.random.default_rng(seed).standard_normal((1, P, 3))
+    bones = bones_of(X[0])
+    _, wanted, varies = bones.observe(size * X)
+    np.testing.assert_allclose(wanted, 0, atol=1e-9 * size)
+    # A larger one as a whole surprises no more than one whose lengths all vary at random would.
+    whole = size * lengths(X)[0]
+    assert whole @ np.linalg.solve(varies[0], whole) < 1
+    one = np.eye(len(EDGES))[0] * whole
+    assert one @ np.linalg.solve(varies[0], one) > 100
+
+
+@some
+@given(seeds, st.sampled_from([0.05, 0.3]))
+def test_the_correction_is_the_mean_given_keypoints_and_lengths(seed: int, noise: float) -> None:
+    rng = np.random.default_rng(seed)
+    S, W, M = rng.standard_normal((1, P, 3)), rng.standard_normal((1, P, 2)), random_cameras(1, rng)
+    B = rng.standard_normal((3 * P, 3 * P))
+    covariance = 0.1 * B @ B.T / P + 0.01 * np.eye(3 * P)
+    bones = bones_of(rng.standard_normal((P, 3)))
+    all_seen, noises = np.ones((1, P), bool), np.array([noise])
+    by_keypoints = correct(S, M, W, all_seen, covariance, noises)
+    # Information adds up: of the errors, of the keypoints but for a translation, of the lengths.
+    H = np.kron(np.eye(P), M[0].T)
+    free = np.eye(2 * P) - np.tile(np.eye(2), (P, P)) / P
+    G, wanted, varies = (part[0] for part in bones.observe(by_keypoints))
+    known = np.linalg.inv(covariance) + H.T @ free @ H / noise**2
+    known += G.T @ np.linalg.solve(varies, G)
+    r = (W - S @ M)[0].ravel()
+    told = H.T @ free @ r / noise**2
+    told += G.T @ np.linalg.solve(varies, wanted + G @ (by_keypoints - S).ravel())
+    E = np.linalg.solve(known, told).reshape(P, 3)
+    found = correct(S, M, W, all_seen, covariance, noises, bones) - S
+    np.testing.assert_allclose(found[0], E, atol=1e-2 * np.abs(E).max())
+
+
+@some
+@given(seeds)
+def test_lengths_tell_the_depth_that_the_network_has_flattened(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = centre(rng.standard_normal((1, P, 3)))
+    M = random_cameras(1, rng)
+    R = rotation_from_camera(M)
+    flat = truth @ R.swapaxes(1, 2) * [1, 1, 0.6] @ R  # along the line of sight
+    W, seen = truth @ M, np.ones((1, P), bool)
+    found = [
+        correct(flat, M, W, seen, np.eye(3 * P), 0.01, bones)
+        for bones in (None, bones_of(truth[0], 0.01), bones_of(truth[0], 100.0))
+    ]
+    wrong = [np.abs(lengths(S[0]) / lengths(truth[0]) - 1).max() for S in found]
+    assert wrong[1] < 0.7 * wrong[0]
+    np.testing.assert_allclose(found[2], found[0], atol=1e-3)  # no bones, these
+
+
+def test_points_in_one_place_have_no_direction_and_do_no_harm() -> None:
+    S, M = np.zeros((1, P, 3)), random_cameras(1, np.random.default_rng(0))
+    bones = bones_of(np.random.default_rng(0).standard_normal((P, 3)))
+    W = np.zeros((1, P, 2))
+    found = correct(S, M, W, np.ones((1, P), bool), np.eye(3 * P), 0.0, bones)
+    assert np.isfinite(found).all()
+
+
+def test_rigid_edges_are_told_from_others_without_labels() -> None:
+    """A network that makes small errors; an arm of the object grows, by itself, by 30 %."""
+    rng = np.random.default_rng(0)
+    shape, f = centre(rng.standard_normal((P, 3))), 2000
+    shapes = np.tile(shape, (f, 1, 1))
+    shapes[:, 5] += 0.3 * rng.uniform(-1, 1, (f, 1)) * (shape[5] - shape[4])
+
+    def lift(W: np.ndarray) -> tuple[Any, ...]:
+        """Find the frame's shape by its keypoints; every shape of a frame is seen alike."""
+        errors = 0.05 * rng.standard_normal(shapes.shape)
+        rows = np.linalg.pinv(shapes) @ W
+        U, _, Vt = np.linalg.svd(rows, full_matrices=False)
+        return shapes + errors, U @ Vt, W
+
+    found = bone_lengths(lift, shapes @ random_cameras(f, rng), EDGES, np.eye(3 * P), rng)
+    expected = shares(shapes, EDGES)
+    np.testing.assert_allclose(found[:, 0], expected.mean(0), rtol=0.02)
+    relative = found[:, 1] / found[:, 0]
+    assert relative[3] > 2 * relative[:3].max() and relative.min() >= 0.0099
+    assert not len(bone_lengths(lift, shapes @ random_cameras(f, rng), [], np.eye(3 * P), rng))
