@@ -73,6 +73,8 @@ class BagFile:
         definitions: dict[str, str] = {}
         for storage in storages:
             for topic in storage.topics():
+                if not isinstance(topic.name, str) or not isinstance(topic.type, str):
+                    continue  # a damaged table may have lost either
                 counts[topic.name, topic.type] += topic.total
                 definitions[topic.type] = definitions.get(topic.type) or topic.definition
         recorded = _recorded_counts(path)

@@ -21,7 +21,7 @@ def read_camera_info(message: Any, *, rectified: bool = False) -> Intrinsics:
         lens = str(message.distortion_model)
         bin_x, bin_y = max(int(message.binning_x), 1), max(int(message.binning_y), 1)
         left, top = float(message.roi.x_offset), float(message.roi.y_offset)
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise MessageError(f"expected a message of type sensor_msgs/CameraInfo: {error}") from None
     name, columns = ("p", 4) if rectified else ("k", 3)
     if len(matrix) != 3 * columns:

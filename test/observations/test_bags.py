@@ -1,5 +1,6 @@
 """Real bags in both storages: round trips, several at once, and everything that can be wrong."""
 
+import sqlite3
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -238,6 +239,22 @@ def test_cut_off_bag_gives_its_readable_part(tmp_path: Path, storage: str, metad
         file.write_bytes(whole[: int(share * len(whole))])
         with pytest.raises(BagError, match="bag"):
             read_bags([bag], TOPIC, BODY25, BODY25)
+
+
+@pytest.mark.parametrize("column", ["name", "type"])
+def test_a_topic_that_has_lost_its_name_or_type_is_none(tmp_path: Path, column: str) -> None:
+    bag = tmp_path / "bag"
+    write_bag(bag, TOPIC, frames(*detections(30)), "sqlite3")
+    (bag / "metadata.yaml").unlink()
+    with sqlite3.connect(*bag.glob("*.db3")) as file:
+        columns = [row[1] for row in file.execute("PRAGMA table_info(topics)")]
+        values = ["99", *(f"'{name}'" for name in columns[1:])]
+        values[columns.index(column)] = "NULL"
+        file.execute("CREATE TABLE damaged AS SELECT * FROM topics")
+        file.execute(f"INSERT INTO damaged VALUES ({', '.join(values)})")
+        file.execute("DROP TABLE topics")
+        file.execute("ALTER TABLE damaged RENAME TO topics")
+    assert len(read_bags([bag], "", BODY25, BODY25).ensemble) == 30
 
 
 def test_bag_without_metadata_only_is_read_in_full(tmp_path: Path) -> None:

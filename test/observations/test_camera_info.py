@@ -65,6 +65,7 @@ def test_lenses_as_drivers_send_them(
         (info(distortion_model="fov", d=[0.9]), "'fov'; expected one of plumb_bob.*set rectified"),
         (info(d=[1.0, 2, 3]), "has 3 coefficients"),
         (info(distortion_model=RATIONAL, d=[1.0] * 12), "has 12 coefficients"),
+        (info(binning_x=np.inf), "expected a message of type sensor_msgs/CameraInfo"),
         (SimpleNamespace(), "expected a message of type sensor_msgs/CameraInfo"),
     ],
 )
