@@ -224,8 +224,7 @@ class _CutSqlite:
         self._file = sqlite3.connect(f"{uri}?immutable=1", uri=True)
         # Otherwise sqlite refuses a file shorter than its header says.
         self._file.execute("PRAGMA writable_schema = ON")
-        rows = self._file.execute("SELECT id, name, type FROM topics").fetchall()
-        self._topics = [row for row in rows if isinstance(row[1], str) and isinstance(row[2], str)]
+        self._topics = self._file.execute("SELECT id, name, type FROM topics").fetchall()
         self._definitions: dict[str, str] = {}
         with suppress(sqlite3.Error):  # older bags have none
             found = "SELECT topic_type, encoded_message_definition FROM message_definitions"

@@ -246,15 +246,15 @@ def test_a_topic_that_has_lost_its_name_or_type_is_none(tmp_path: Path, column: 
     bag = tmp_path / "bag"
     write_bag(bag, TOPIC, frames(*detections(30)), "sqlite3")
     (bag / "metadata.yaml").unlink()
-    with sqlite3.connect(*bag.glob("*.db3")) as file:
-        columns = [row[1] for row in file.execute("PRAGMA table_info(topics)")]
-        values = ["99", *(f"'{name}'" for name in columns[1:])]
-        values[columns.index(column)] = "NULL"
-        file.execute("CREATE TABLE damaged AS SELECT * FROM topics")
-        file.execute(f"INSERT INTO damaged VALUES ({', '.join(values)})")
-        file.execute("DROP TABLE topics")
-        file.execute("ALTER TABLE damaged RENAME TO topics")
-    assert len(read_bags([bag], "", BODY25, BODY25).ensemble) == 30
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as tables:
+        tables.execute("CREATE TABLE damaged AS SELECT * FROM topics")
+        tables.execute("INSERT INTO damaged SELECT * FROM topics")
+        tables.execute(f"UPDATE damaged SET {column} = NULL, id = 99 WHERE rowid = 2")
+        tables.execute("DROP TABLE topics")
+        tables.execute("ALTER TABLE damaged RENAME TO topics")
+    for path in (bag, file):
+        assert len(read_bags([path], "", BODY25, BODY25).ensemble) == 30
 
 
 def test_bag_without_metadata_only_is_read_in_full(tmp_path: Path) -> None:
