@@ -1,4 +1,4 @@
-"""Bones keep their lengths: what the edges of a layout tell about depth.
+"""Bones keep their lengths: what edges, and other rigid pairs, tell about depth.
 
 How long each edge is among all, and how much that varies, needs no 3D label: shapes of the training
 frames tell. They vary by more than the object does, as they come with errors; by how much more is
@@ -21,7 +21,7 @@ from deep_nrsfm_ros.nrsfm.geometry import Floats
 
 
 class Bones(NamedTuple):
-    """What is known of b edges."""
+    """What is known of b bones."""
 
     ends: NDArray[np.int32]  # (2, b) keypoints
     lengths: NDArray[np.float64]  # (b,) shares of the sum of all

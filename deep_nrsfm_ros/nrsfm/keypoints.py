@@ -24,7 +24,7 @@ MOST_KEYPOINTS = 1000
 class KeypointLayout:
     """Names of p keypoints in the order in which they come.
 
-    edges: pairs of names, for drawing.
+    edges: pairs of names, for drawing, and bones: how well each keeps its length is learned.
     handedness: one or more (left, right, up, front), four keypoints of which the tetrahedron has
         positive volume on the real object: seen from behind, `left` is left of `right`, `up` is
         above them and `front` before them. Each is a vote on whether depth is mirrored; the
@@ -34,6 +34,7 @@ class KeypointLayout:
     derived: keypoints that a source without them can give as the mean of others.
     reference_length: length of the reference pair on the real object, in metres, for the output
         to be in metres. None: it is not known.
+    rigid: pairs that keep their distance as bones do, without an edge to be drawn.
     """
 
     name: str
@@ -43,6 +44,7 @@ class KeypointLayout:
     reference: Edge | None = None
     derived: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     reference_length: float | None = None
+    rigid: tuple[Edge, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse a layout that repeats a keypoint or names one that it does not have."""
@@ -57,6 +59,7 @@ class KeypointLayout:
             raise ValueError(f"layout {self.name!r} names {', '.join(twice)} more than once")
         groups: list[tuple[str, int, tuple[str, ...]]]
         groups = [("edge", 2, edge) for edge in self.edges]
+        groups += [("rigid pair", 2, pair) for pair in self.rigid]
         groups += [("handedness", 4, four) for four in self.handedness]
         groups += [("reference", 2, self.reference)] if self.reference else []
         for what, size, group in groups:
@@ -109,6 +112,10 @@ class KeypointLayout:
     def edge_indices(self) -> list[tuple[int, int]]:
         """Return the edges as pairs of places."""
         return [(self.index(a), self.index(b)) for a, b in self.edges]
+
+    def bone_indices(self) -> list[tuple[int, int]]:
+        """Return the edges and the rigid pairs as pairs of places."""
+        return [(self.index(a), self.index(b)) for a, b in (*self.edges, *self.rigid)]
 
     def partners(self) -> list[int] | None:
         """Return the place of each keypoint in the mirror image, left_ and right_ exchanged.
@@ -230,6 +237,7 @@ HUMAN17 = KeypointLayout(
         "neck": ("left_shoulder", "right_shoulder"),
         "mid_hip": ("left_hip", "right_hip"),
     },
+    rigid=(*_TRUNK, *_FLANKS, ("left_shoulder", "right_hip"), ("right_shoulder", "left_hip")),
 )
 
 _CMU_PARENT = (

@@ -44,7 +44,7 @@ class Model:
     provenance: data, recipe and versions; quality: label-free figures.
     error_covariance: (3p, 3p) of the network's errors, in its own axes; see `correction`. Equal
         and apart from each other if nothing is known.
-    bone_lengths: (b, 2) of the layout's edges, shares of their sum and how much they vary; see
+    bone_lengths: (b, 2) of the layout's bones, shares of their sum and how much they vary; see
         `bones`. Empty if nothing is known.
     """
 
@@ -69,7 +69,7 @@ class Model:
         """What is known of the bones."""
         if not len(self.bone_lengths):
             return None
-        ends = np.array(self.layout.edge_indices(), np.int32).T
+        ends = np.array(self.layout.bone_indices(), np.int32).T
         return Bones(ends, *self.bone_lengths.astype(np.float64).T)
 
 
@@ -150,7 +150,7 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     p = len(layout)
     shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
     if "bone_lengths" in weights:  # older files have none
-        shapes["bone_lengths"] = (len(layout.edges), 2)
+        shapes["bone_lengths"] = (len(layout.bone_indices()), 2)
     for name, shape in shapes.items():
         found = weights[name]
         if found.shape != shape or found.dtype != np.float32:
@@ -212,7 +212,7 @@ def _layout(header: dict[str, Any]) -> KeypointLayout:
     handedness = header["handedness"] or []
     if handedness and isinstance(handedness[0], str):  # the one of an older file
         handedness = [handedness]
-    header = header | {"handedness": handedness}
+    header = {"rigid": []} | header | {"handedness": handedness}  # as older files have none
     _check_names(header)
     return KeypointLayout(**_tuples(header))
 
@@ -220,7 +220,8 @@ def _layout(header: dict[str, Any]) -> KeypointLayout:
 def _check_names(layout: dict[str, Any]) -> None:
     """Raise ValueError unless every name in the header's layout is a text."""
     derived = layout["derived"]
-    lists = [layout["keypoints"], *layout["edges"], *layout["handedness"], layout["reference"]]
+    pairs = [*layout["edges"], *layout["rigid"], layout["reference"]]
+    lists = [layout["keypoints"], *pairs, *layout["handedness"]]
     for names in ([layout["name"]], [*derived], *derived.values(), *lists):
         if not isinstance(names, (list, type(None))) or any(
             type(n) is not str for n in names or ()

@@ -14,7 +14,7 @@ from deep_nrsfm_ros.nrsfm.yaml_file import read_fields, words
 
 OBJECT_SUFFIXES = (".yaml", ".yml")
 FIELDS = (
-    *("name", "keypoints", "edges", "handedness"),
+    *("name", "keypoints", "edges", "rigid", "handedness"),
     *("reference", "reference_length", "derived"),
 )
 HANDEDNESS = ("left", "right", "up", "front")
@@ -88,16 +88,17 @@ class _Description:
         return KeypointLayout(
             name,
             keypoints,
-            edges=self._edges(),
+            edges=self._pairs("edges"),
+            rigid=self._pairs("rigid"),
             handedness=self._handedness(),
             reference=None if reference is None else self._pair("reference", reference),
             derived=self._derived(),
             reference_length=self._reference_length(),
         )
 
-    def _edges(self) -> tuple[Edge, ...]:
-        edges = self._list("edges", self._fields.get("edges", []))
-        return tuple(self._pair(f"edges[{i}]", edge) for i, edge in enumerate(edges))
+    def _pairs(self, field: str) -> tuple[Edge, ...]:
+        pairs = self._list(field, self._fields.get(field, []))
+        return tuple(self._pair(f"{field}[{i}]", pair) for i, pair in enumerate(pairs))
 
     def _handedness(self) -> tuple[Tetrahedron, ...]:
         given = self._fields.get("handedness", [])

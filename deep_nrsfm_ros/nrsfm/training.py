@@ -270,7 +270,7 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         normaliser,
         object_frame(S, layout, mask[..., 0] > 0),
         error_covariance=covariance,
-        bone_lengths=bone_lengths(lift, W, layout.edge_indices(), covariance, rng),
+        bone_lengths=bone_lengths(lift, W, layout.bone_indices(), covariance, rng),
         provenance={
             "data": source,
             "frames": trainer.frames_in_all,

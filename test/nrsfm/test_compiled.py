@@ -40,7 +40,7 @@ def model(
     frame = np.linalg.qr(rng.standard_normal((3, 3)))[0].astype(np.float32)
     B = rng.standard_normal((3 * p, 3 * p))
     covariance = (0.01 * np.eye(3 * p) + 0.003 * B @ B.T / p).astype(np.float32)
-    b = len(layout.edges)
+    b = len(layout.bone_indices())
     lengths, spread = rng.uniform(0.01, 0.2, (2, b))
     return Model(
         *("random", network, layout, Normaliser(scale), frame),

@@ -78,6 +78,9 @@ def test_edges_are_pairs_of_places(preset: KeypointLayout) -> None:
     assert pairs and len(set(map(frozenset, pairs))) == len(pairs)
     for (a, b), edge in zip(pairs, preset.edges, strict=True):
         assert a != b and (preset.keypoints[a], preset.keypoints[b]) == edge
+    bones = preset.bone_indices()
+    assert bones[: len(pairs)] == pairs and len(set(map(frozenset, bones))) == len(bones)
+    assert len(bones) == len(pairs) + len(preset.rigid)
 
 
 @pytest.mark.parametrize("name", ["human17", "cmu31"])
@@ -96,6 +99,8 @@ def test_presets_go_by_name() -> None:
     [
         ({"keypoints": ("a", "b", "a")}, "a more than once"),
         ({"edges": (("a", "x"),)}, "no keypoint 'x'"),
+        ({"rigid": (("a", "x"),)}, "no keypoint 'x'"),
+        ({"rigid": (("b", "b"),)}, "rigid pair .* repeats a name"),
         ({"handedness": (("a", "b", "c", "x"),)}, "no keypoint 'x'"),
         ({"handedness": ("a", "b", "c", "x")}, "handedness 'a' must be 4 names"),
         ({"reference": ("x", "a")}, "no keypoint 'x'"),

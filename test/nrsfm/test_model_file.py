@@ -45,7 +45,7 @@ def model(
     provenance = {"data": "bags a, b", "frames": 5, "recipe": {"cycle": 2.0}}
     quality = {"cycle_error": 0.25, "coherence": 0.5}
     covariance = np.diag(rng.uniform(1, 2, 3 * len(layout))).astype(np.float32)
-    bones = rng.uniform(0.1, 0.2, (len(layout.edges), 2)).astype(np.float32)
+    bones = rng.uniform(0.1, 0.2, (len(layout.bone_indices()), 2)).astype(np.float32)
     return Model(
         "mine", network, layout, Normaliser("none"), MIRROR, provenance, quality, covariance, bones
     )
@@ -174,6 +174,15 @@ def test_the_error_covariance_is_checked(file: Path, kind: str, refusal: str) ->
 
     rewrite(file, change)
     assert f"error_covariance is {refusal}" in refused(file)
+
+
+def test_a_layout_of_before_there_were_rigid_pairs_is_read(file: Path) -> None:
+    def change(header: Any, weights: Any, metadata: Any) -> None:
+        del header["layout"]["rigid"]
+        weights["bone_lengths"] = weights["bone_lengths"][: len(HUMAN17.edges)]
+
+    rewrite(file, change)
+    assert load_model(file).layout == dataclasses.replace(HUMAN17, rigid=())
 
 
 @pytest.mark.parametrize("value", [0.0, -0.1])

@@ -23,6 +23,8 @@ keypoints: [hinge_top, hinge_bottom, handle, corner_top, corner_bottom]
 edges:
   - [hinge_top, hinge_bottom]
   - [corner_top, corner_bottom]
+rigid:
+  - [hinge_top, corner_bottom]
 handedness: {left: hinge_bottom, right: corner_bottom, up: hinge_top, front: handle}
 reference: [hinge_top, hinge_bottom]
 reference_length: 2
@@ -56,6 +58,7 @@ def test_every_field_arrives(tmp_path: Path) -> None:
         reference=("hinge_top", "hinge_bottom"),
         derived={"handle": ("corner_top", "corner_bottom")},
         reference_length=2.0,
+        rigid=(("hinge_top", "corner_bottom"),),
     )
 
 
@@ -72,7 +75,7 @@ def test_handedness_may_be_several(tmp_path: Path) -> None:
 def test_name_and_keypoints_are_enough(tmp_path: Path) -> None:
     expected = KeypointLayout("thing", ("a", "b", "c", "d"))
     assert read_object(write(tmp_path, LEAST)) == expected
-    empty = "edges:\nhandedness:\nreference:\nreference_length:\nderived:\n"
+    empty = "edges:\nrigid:\nhandedness:\nreference:\nreference_length:\nderived:\n"
     assert read_object(write(tmp_path, LEAST + empty)) == expected
 
 
