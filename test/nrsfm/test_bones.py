@@ -76,22 +76,27 @@ def test_the_correction_is_the_mean_given_keypoints_and_lengths(seed: int, noise
     np.testing.assert_allclose(found[0], E, atol=1e-2 * np.abs(E).max())
 
 
-@some
-@given(seeds)
-def test_lengths_tell_the_depth_that_the_network_has_flattened(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    truth = centre(rng.standard_normal((1, P, 3)))
-    M = random_cameras(1, rng)
+def test_lengths_tell_the_depth_that_the_network_has_flattened() -> None:
+    rng, n = np.random.default_rng(0), 300
+    truth = centre(rng.standard_normal((n, P, 3)))
+    M = random_cameras(n, rng)
     R = rotation_from_camera(M)
     flat = truth @ R.swapaxes(1, 2) * [1, 1, 0.6] @ R  # along the line of sight
-    W, seen = truth @ M, np.ones((1, P), bool)
-    found = [
-        correct(flat, M, W, seen, np.eye(3 * P), 0.01, bones)
-        for bones in (None, bones_of(truth[0], 0.01), bones_of(truth[0], 100.0))
-    ]
-    wrong = [np.abs(lengths(S[0]) / lengths(truth[0]) - 1).max() for S in found]
-    assert wrong[1] < 0.7 * wrong[0]
-    np.testing.assert_allclose(found[2], found[0], atol=1e-3)  # no bones, these
+    W, seen = truth @ M, np.ones((n, P), bool)
+
+    def wrong(spread: float | None) -> np.ndarray:
+        """Return by how much the worst length of each shape is wrong."""
+        found = []
+        for i in range(n):
+            bones = spread and bones_of(truth[i], spread)
+            one = (part[i : i + 1] for part in (flat, M, W, seen))
+            found.append(correct(*one, np.eye(3 * P), 0.01, bones or None)[0])
+        return np.abs(lengths(np.array(found)) / lengths(truth) - 1).max(1)
+
+    without, rigid = wrong(None), wrong(0.01)
+    assert np.median(rigid / without) < 0.3  # one linear step does not always do so
+    assert (rigid < without).mean() > 0.95
+    np.testing.assert_allclose(wrong(100.0), without, atol=1e-3)  # no bones, these
 
 
 def test_points_in_one_place_have_no_direction_and_do_no_harm() -> None:
