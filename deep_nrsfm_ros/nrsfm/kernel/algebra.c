@@ -18,4 +18,4 @@ void product(int rows, const float *X, int stride, Matrix A, const float *b, int
     CHOSEN(product)(rows, X, stride, A, b, relu, out);
 }
 
-void solve(int n, int stride, double *A) { CHOSEN(solve)(n, stride, A); }
+void solve(int n, int done, int stride, double *A) { CHOSEN(solve)(n, done, stride, A); }

@@ -68,7 +68,6 @@ size_t scratch(Plan *k, char *at) {
     ROOM(k->HC, double, 6 * even)
     ROOM(k->E, double, 3 * even)
     ROOM(k->A, double, (2 * even + bones) * (2 * even + bones + DOUBLES))
-    ROOM(k->whole, double, 2 * even * (2 * even + bones + DOUBLES))
     ROOM(k->left, double, 2 * even)
     ROOM(k->edges, double, 4 * bones)
     ROOM(k->along, double, 3 * even * bones)

@@ -1,6 +1,4 @@
 /* correction.py, for one object. */
-#include <string.h>
-
 #include "plan.h"
 
 /* Set the rows of A = H Sigma H^T (2, p) x (2, p) for point i; p in DOUBLES. Only the upper half is read.
@@ -96,7 +94,6 @@ static void add_bones(Plan *k, const Object *o, double *A, int stride) {
 
 void correct(Plan *k, Object *o, double noise) {
     int p = DOUBLES_OF(k->p), n = 2 * p, bones = DOUBLES_OF(k->bones), stride = n + bones + DOUBLES;
-    size_t rows = (size_t)n * stride * sizeof(double);
     double *A = k->A, *m = k->cameras, unknown = k->unknown;
     for (int i = 0; i < p; i++) {
         const double *Sigma = k->covariance + (size_t)9 * p * i;
@@ -117,13 +114,11 @@ void correct(Plan *k, Object *o, double noise) {
             k->left[a * p + i] = b[0] = o->visible[i] ? left : 0;
         }
     }
-    if (bones) memcpy(k->whole, A, rows);
-    solve(n, stride, A);
+    solve(n, 0, stride, A);
     errors(k, A + n, stride, 0);
     if (bones) {
-        memcpy(A, k->whole, rows);
         add_bones(k, o, A, stride);
-        solve(n + bones, stride, A);
+        solve(n + bones, n, stride, A);
         errors(k, A + n + bones, stride, k->bones);
     }
     for (int r = 0; r < 3; r++)

@@ -24,7 +24,7 @@ void complete(Plan *k, const Object *o, float *filled) {
         for (int i = 0; i < p; i++)
             for (int c = 0; c < 2 && o->mask[i]; c++) row[n + c] -= P[i] * o->points[2 * i + c];
     }
-    solve(n, wide, k->A);
+    solve(n, 0, wide, k->A);
     memcpy(filled, o->points, 2 * p * sizeof(float));
     for (int a = 0; a < m; a++)
         for (int c = 0; c < 2; c++)
