@@ -48,9 +48,9 @@ class Bones(NamedTuple):
         return G.reshape(n, len(L), 3 * p), wanted, size[:, None, None] ** 2 * varies
 
 
-def shares(S: Floats, edges: Sequence[tuple[int, int]]) -> Floats:
-    """Return the lengths (n, b) of the edges of shapes S (n, p, 3), by their sum."""
-    i, j = np.array(edges).T
+def shares(S: Floats, pairs: Sequence[tuple[int, int]]) -> Floats:
+    """Return the distances (n, b) of pairs of keypoints in shapes S (n, p, 3), by their sum."""
+    i, j = np.array(pairs).T
     lengths: Floats = np.linalg.norm(S[:, i] - S[:, j], axis=2).astype(np.float64)
-    lengths /= lengths.sum(1, keepdims=True)
+    lengths /= np.maximum(lengths.sum(1, keepdims=True), 1e-9)
     return lengths

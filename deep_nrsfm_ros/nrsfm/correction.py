@@ -31,6 +31,7 @@ _FLOOR = 1e-4  # variance of every direction, relative to the mean: any keypoint
 _BLOCK = 64  # frames at a time: more do not fit the cache, and take five times as long
 _LEAST_SHARE = 0.3  # of the deviation of a length, that is the object's own in any case
 _LEAST_SPREAD = 0.01  # of a length: no bone is known better
+_SHORTEST = 1e-6  # share of all lengths, where two keypoints are one
 UNKNOWN = 1e4  # variance of what is not known at all, relative to that of the errors
 
 
@@ -118,21 +119,21 @@ def error_covariance(
 def bone_lengths(
     lift: Callable[[Floats], tuple[Floats, Floats, Floats]],
     W: Floats,
-    edges: Sequence[tuple[int, int]],
+    pairs: Sequence[tuple[int, int]],
     covariance: Floats,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """Return the lengths and spread (b, 2) of edges, as those of `Bones`, found without labels.
+    """Return the lengths and spread (b, 2) of bones, as those of `Bones`, found without labels.
 
-    lift, W: as in `error_covariance`, which gives the covariance.
+    lift, W: as in `error_covariance`, which gives the covariance. pairs: of keypoints.
     """
-    if not edges:
+    if not pairs:
         return np.zeros((0, 2), np.float32)
     everything = np.ones(W.shape[:2], bool)
     T = centre(correct(*lift(W), everything, covariance))
     again = correct(*lift(T @ random_cameras(len(T), rng)), everything, covariance)
-    found, found_again = shares(T, edges), shares(again, edges)
-    lengths, variance = found.mean(0), found.var(0)
+    found, found_again = shares(T, pairs), shares(again, pairs)
+    lengths, variance = np.maximum(found.mean(0), _SHORTEST), found.var(0)
     error = ((found_again - found) ** 2).mean(0)
     least = np.maximum(_LEAST_SHARE**2 * variance, (_LEAST_SPREAD * lengths) ** 2)
     return np.stack((lengths, np.sqrt(np.maximum(variance - error, least))), 1).astype(np.float32)

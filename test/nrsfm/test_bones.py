@@ -126,4 +126,9 @@ def test_rigid_edges_are_told_from_others_without_labels() -> None:
     np.testing.assert_allclose(found[:, 0], expected.mean(0), rtol=0.02)
     relative = found[:, 1] / found[:, 0]
     assert relative[3] > 2 * relative[:3].max() and relative.min() >= 0.0099
+    shapes[:, 1] = shapes[:, 0]  # two keypoints in one place
+    found = bone_lengths(
+        lambda W: (shapes, random_cameras(f, rng), W), shapes[..., :2], EDGES, np.eye(3 * P), rng
+    )
+    assert (found > 0).all()
     assert not len(bone_lengths(lift, shapes @ random_cameras(f, rng), [], np.eye(3 * P), rng))
