@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.bones import shares
 from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
 from deep_nrsfm_ros.observations.ensemble import Ensemble
@@ -112,10 +113,10 @@ def _share(yes: NDArray[np.bool_]) -> float:
 
 
 def _spread(S: Floats, visible: NDArray[np.bool_]) -> float:
-    a, b = np.array(HUMAN17.edge_indices()).T
-    lengths = np.linalg.norm(S[:, a] - S[:, b], axis=2)
-    shares = lengths / lengths.sum(1, keepdims=True)
+    edges = HUMAN17.edge_indices()
+    a, b = np.array(edges).T
+    found = shares(S, edges)
     seen = visible[:, a] & visible[:, b]
-    shares[~seen] = np.nan
-    low, middle, high = np.nanpercentile(shares[:, seen.any(0)], (16, 50, 84), axis=0)
+    found[~seen] = np.nan
+    low, middle, high = np.nanpercentile(found[:, seen.any(0)], (16, 50, 84), axis=0)
     return float(np.mean((high - low) / 2 / middle))

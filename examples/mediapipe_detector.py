@@ -197,15 +197,17 @@ def main() -> None:
         sys.exit(f"detector: {error}")
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while not signals and not node.finished.done():
-        executor.spin_once(timeout_sec=0.2)  # a signal does not wake it
-    if not signals:
-        node.close()
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.shutdown()
-    for number in ENDING:  # launchers and terminals send the signal twice
-        signal.signal(number, signal.SIG_IGN)
+    try:
+        while not signals and not node.finished.done():
+            executor.spin_once(timeout_sec=0.2)  # a signal does not wake it
+        if not signals:
+            node.close()
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown()
+        for number in ENDING:  # launchers and terminals send the signal twice
+            signal.signal(number, signal.SIG_IGN)
 
 
 if __name__ == "__main__":

@@ -63,8 +63,8 @@ def correct(
     H[:, range(p), :, range(p)] = np.broadcast_to(M, (n, p, 3, 2)).transpose(1, 0, 3, 2)
     H = H.reshape(n, 2 * p, 3 * p)
     unknown = UNKNOWN * np.trace(covariance) / (3 * p)
-    # Not quite zero, so that there is an answer even where M is no camera.
-    spread = np.where(visible, np.square(noise)[:, None] + 1e-12 * unknown, unknown)  # (n, p)
+    least = 1e-12 * unknown  # not quite zero: there is an answer even where M is no camera
+    spread = np.where(visible, np.square(noise)[:, None] + least, unknown)  # (n, p)
     R: Floats = np.zeros((n, p, 2, p, 2))
     for axis in range(2):
         R[:, :, axis, :, axis] = unknown  # of the translation, the same for all points
@@ -76,7 +76,7 @@ def correct(
         G, wanted, varies = bones.observe(S + E.reshape(S.shape))
         b = wanted.shape[1]
         R = np.pad(R, ((0, 0), (0, b), (0, b)))
-        R[:, 2 * p :, 2 * p :] = varies + 1e-12 * unknown * np.eye(b)
+        R[:, 2 * p :, 2 * p :] = varies + least * np.eye(b)
         r = np.concatenate((r, wanted + (G @ E[..., None])[..., 0]), 1)
         E = _mean(covariance, np.concatenate((H, G), 1), R, r)
     corrected: Floats = S + E.reshape(S.shape).astype(S.dtype)

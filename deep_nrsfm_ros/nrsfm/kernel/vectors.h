@@ -92,24 +92,32 @@ HERE void FOR(eliminate)(const int vectors, int k, int stride, double *A, int j,
         }
 }
 
+/* The corner k ... k + 3 of U in place of A's, and one over its diagonal. */
+HERE void FOR(factor)(int k, int stride, double *A, double scale[4]) {
+    FOR(doubles) corner[4][2];
+    double U[4][4];
+    FOR(subtract)(4 / LANES, k, stride, A, k, corner);
+    for (int r = 0; r < 4; r++)
+        for (int c = 0; c < 4; c++) U[r][c] = corner[r][c / LANES][c % LANES];
+    for (int r = 0; r < 4; r++) {
+        scale[r] = 1 / sqrt(fmax(U[r][r], 1e-300));
+        for (int c = r; c < 4; c++) A[(size_t)(k + r) * stride + k + c] = U[r][c] *= scale[r];
+        for (int q = r + 1; q < 4; q++)
+            for (int c = q; c < 4; c++) U[q][c] -= U[r][q] * U[r][c];
+    }
+}
+
 /* By Cholesky's U^T U = A, four rows at a time; y of U^T y = b comes out beside U. */
 TARGET static void FOR(solve)(int n, int done, int stride, double *A) {
     typedef FOR(doubles) vector;
     int wide = n + DOUBLES;
     for (int k = 0; k < n; k += 4) {
-        vector corner[4][2];
-        double U[4][4], scale[4];
-        if (k >= done) FOR(subtract)(4 / LANES, k, stride, A, k, corner);
-        for (int r = 0; r < 4 && k < done; r++) scale[r] = 1 / A[(size_t)(k + r) * stride + k + r];
-        for (int r = 0; r < 4 && k >= done; r++)
-            for (int c = 0; c < 4; c++) U[r][c] = corner[r][c / LANES][c % LANES];
-        for (int r = 0; r < 4 && k >= done; r++) {
-            scale[r] = 1 / sqrt(fmax(U[r][r], 1e-300));
-            for (int c = r; c < 4; c++) A[(size_t)(k + r) * stride + k + c] = U[r][c] *= scale[r];
-            for (int q = r + 1; q < 4; q++)
-                for (int c = q; c < 4; c++) U[q][c] -= U[r][q] * U[r][c];
-        }
         int j = k < done ? done : k + 4;
+        double scale[4];
+        if (k < done)
+            for (int r = 0; r < 4; r++) scale[r] = 1 / A[(size_t)(k + r) * stride + k + r];
+        else
+            FOR(factor)(k, stride, A, scale);
         for (; j + 2 * LANES <= wide; j += 2 * LANES) FOR(eliminate)(2, k, stride, A, j, scale);
         for (; j < wide; j += LANES) FOR(eliminate)(1, k, stride, A, j, scale);
     }
