@@ -55,9 +55,11 @@ class Kernel:
         last = options.widths[-1]
         code_head = _padded(net.code_head.reshape(6, last, last).swapaxes(1, 2)).swapaxes(1, 2)
         floats += [_panels(code_head.reshape(-1, last)), net.camera_head, constants.spread]
-        # Three rows for each point: (p, 3, 3, p).
-        rows = covariance.reshape(p, 3, p, 3).swapaxes(2, 3)
-        doubles = [_padded(rows, _kernel.DOUBLES), filling(net), constants.turns, constants.frame]
+        # Three rows for each point: (p, 3, 3, p), both p filled up.
+        rows = _padded(covariance.reshape(p, 3, p, 3).swapaxes(2, 3), _kernel.DOUBLES)
+        rows = _padded(rows.swapaxes(0, 3), _kernel.DOUBLES).swapaxes(0, 3)
+        floats += [rows]
+        doubles = [filling(net), constants.turns, constants.frame]
         doubles += [CALIBRATED, np.stack(bones[1:], 1), constants.noise, constants.length]
         doubles += [UNKNOWN * np.trace(covariance) / (3 * p), NEAREST, RESIDUAL_SPREAD]
         doubles += [LEAST_RESIDUAL]

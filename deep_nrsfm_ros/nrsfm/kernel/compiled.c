@@ -34,7 +34,7 @@ int lay_out(Plan *k, const int *header, const float *floats, const double *doubl
     f = matrix(&k->code_head, 6 * FLOATS_OF(last), last, f);
     k->camera_head = f, f += last;
     k->spread = f, f += p;
-    k->covariance = d, d += (size_t)9 * p * DOUBLES_OF(p);
+    k->covariance = f, f += (size_t)9 * DOUBLES_OF(p) * DOUBLES_OF(p);
     k->filling = d, d += (size_t)p * p;
     k->turn = d, d += 4 * k->turns;
     k->frame = d, d += 9;

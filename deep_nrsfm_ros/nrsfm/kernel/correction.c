@@ -3,86 +3,96 @@
 
 /* Set the rows of A = H Sigma H^T (2, p) x (2, p) for point i; p in DOUBLES. Only the upper half is read.
 
-   Sigma: (3, 3, p), its three rows for that point. `cameras` (3, 2, p). HC: (2, 3, p) of room. */
-INLINE void project_inline(int p, int i, const double *restrict Sigma,
-                           const double *restrict cameras, double *restrict HC,
+   Sigma: (3, 3, p), its three rows for that point. m: the cameras (3, 2, p). */
+INLINE void project_inline(ptrdiff_t p, ptrdiff_t i, const float *restrict Sigma, const double *restrict m,
                            double *restrict A, int wide) {
-    const double *C = Sigma, *m = cameras;
-    for (int j = 0; j < 3 * p; j++)
-        for (int a = 0; a < 2; a++)
-            HC[3 * a * p + j] = m[a * p + i] * C[j] + m[(2 + a) * p + i] * C[3 * p + j] +
-                                m[(4 + a) * p + i] * C[6 * p + j];
-    for (int a = 0; a < 2; a++)
-        for (int c = a; c < 2; c++) {
-            const double *x = HC + 3 * a * p, *n = m + c * p;
-            double *row = A + (size_t)(a * p + i) * wide + c * p;
-            for (int j = a == c ? i / DOUBLES * DOUBLES : 0; j < p; j++)
-                row[j] = x[j] * n[j] + x[p + j] * n[2 * p + j] + x[2 * p + j] * n[4 * p + j];
+    double *restrict along = A + (size_t)i * wide, *restrict across = A + (size_t)(p + i) * wide + p;
+    for (ptrdiff_t j = 0; j < p; j++) {
+        double x[3], y[3];
+        for (int c = 0; c < 3; c++) {
+            const float *C = Sigma + c * p + j;
+            x[c] = m[i] * C[0] + m[2 * p + i] * C[3 * p] + m[4 * p + i] * C[6 * p];
+            y[c] = m[p + i] * C[0] + m[3 * p + i] * C[3 * p] + m[5 * p + i] * C[6 * p];
         }
+        along[j] = x[0] * m[j] + x[1] * m[2 * p + j] + x[2] * m[4 * p + j];
+        along[p + j] = x[0] * m[p + j] + x[1] * m[3 * p + j] + x[2] * m[5 * p + j];
+        across[j] = y[0] * m[p + j] + y[1] * m[3 * p + j] + y[2] * m[5 * p + j];
+    }
 }
-FAST(project,
-     (int p, int i, const double *Sigma, const double *cameras, double *HC, double *A, int wide),
-     (p, i, Sigma, cameras, HC, A, wide))
+FAST(project, (ptrdiff_t p, ptrdiff_t i, const float *Sigma, const double *m, double *A, int wide),
+     (p, i, Sigma, m, A, wide))
 
-/* E (3, p) += what v (3) of point i says by `Sigma` (3, 3, p), which is symmetric. */
-INLINE void combine_inline(int p, const double *restrict Sigma, double x, double y, double z,
+/* E (n) += v^T Sigma, for v (n) and Sigma (n, n); n is a multiple of DOUBLES. */
+INLINE void combine_inline(ptrdiff_t n, const double *restrict v, const float *restrict Sigma,
                            double *restrict E) {
-    for (int j = 0; j < 3 * p; j++)
-        E[j] += x * Sigma[j] + y * Sigma[3 * p + j] + z * Sigma[6 * p + j];
+    for (ptrdiff_t i = 0; i < n; i += DOUBLES, Sigma += DOUBLES * n)
+        for (ptrdiff_t j = 0; j < n; j++)
+            E[j] += v[i] * Sigma[j] + v[i + 1] * Sigma[n + j] + v[i + 2] * Sigma[2 * n + j] +
+                    v[i + 3] * Sigma[3 * n + j];
 }
-FAST(combine, (int p, const double *Sigma, double x, double y, double z, double *E),
-     (p, Sigma, x, y, z, E))
+FAST(combine, (ptrdiff_t n, const double *v, const float *Sigma, double *E), (n, v, Sigma, E))
 
 /* E (3, p) of the answer x beside A: that of the keypoints, and of n bones. */
 static void errors(Plan *k, const double *x, int stride, int n) {
     int p = DOUBLES_OF(k->p);
-    double *m = k->cameras, *E = k->E;
-    for (int j = 0; j < 3 * p; j++) E[j] = 0;
-    for (int i = 0; i < k->p; i++) {
-        double along = x[(size_t)i * stride], across = x[(size_t)(p + i) * stride], v[3];
-        for (int r = 0; r < 3; r++) v[r] = m[2 * r * p + i] * along + m[(2 * r + 1) * p + i] * across;
-        combine(p, k->covariance + (size_t)9 * p * i, v[0], v[1], v[2], E);
+    double *m = k->cameras, *v = k->HC;
+    for (int j = 0; j < 3 * p; j++) k->E[j] = 0;
+    for (int i = 0; i < p; i++) {
+        double along = x[(size_t)i * stride], across = x[(size_t)(p + i) * stride];
+        for (int r = 0; r < 3; r++)
+            v[3 * i + r] = i < k->p ? m[2 * r * p + i] * along + m[(2 * r + 1) * p + i] * across : 0;
     }
-    for (int b = 0; b < n; b++) {
-        const double *from = k->along + (size_t)3 * p * b;
-        for (int j = 0; j < 3 * p; j++) E[j] += x[(size_t)(2 * p + b) * stride] * from[j];
+    for (int b = 0; b < n; b++)
+        for (int end = 0; end < 2; end++)
+            for (int r = 0; r < 3; r++)
+                v[3 * k->ends[2 * b + end] + r] +=
+                    (end ? -1 : 1) * k->edges[4 * b + r] * x[(size_t)(2 * p + b) * stride];
+    combine(3 * p, v, k->covariance, k->E);
+}
+
+/* Set along (3, p), the covariance of the errors with the growth of a bone, and `seen` (2, p), that of the
+   keypoints: of Sigma its rows (3, 3, p) of both ends, of the bone its unit vector g. m: as above. */
+INLINE void grow_inline(ptrdiff_t p, const float *restrict from, const float *restrict to,
+                        const double *restrict g, const double *restrict m, double *restrict along,
+                        double *restrict seen) {
+    for (ptrdiff_t j = 0; j < 3 * p; j++)
+        along[j] = g[0] * (from[j] - to[j]) + g[1] * (from[3 * p + j] - to[3 * p + j]) +
+                   g[2] * (from[6 * p + j] - to[6 * p + j]);
+    for (ptrdiff_t i = 0; i < p; i++) {
+        double x = along[i], y = along[p + i], z = along[2 * p + i];
+        seen[i] = m[i] * x + m[2 * p + i] * y + m[4 * p + i] * z;
+        seen[p + i] = m[p + i] * x + m[3 * p + i] * y + m[5 * p + i] * z;
     }
 }
+FAST(grow,
+     (ptrdiff_t p, const float *from, const float *to, const double *g, const double *m, double *along,
+      double *seen),
+     (p, from, to, g, m, along, seen))
 
 /* Complete A (2, p) x (2, p) by the rows, columns and right side of the bones. */
 static void add_bones(Plan *k, const Object *o, double *A, int stride) {
     int p = DOUBLES_OF(k->p), n = DOUBLES_OF(k->bones);
-    double *m = k->cameras, size = observe_bones(k, o);
+    double *seen = k->HC, size = observe_bones(k, o);
     for (int b = 0; b < n; b++) {
         double *row = A + (size_t)(2 * p + b) * stride + 2 * p;
         for (int j = b; j < n + DOUBLES; j++) row[j] = j == b;
         for (int i = 0; i < 2 * p; i++) A[(size_t)i * stride + 2 * p + b] = 0;
         if (b >= k->bones) continue; /* No bone: x = 0. */
         const int *ends = k->ends + 2 * b;
-        const double *g = k->edges + 4 * b, *Sigma[2];
+        const double *g = k->edges + 4 * b;
+        const float *Sigma[2];
         double *along = k->along + (size_t)3 * p * b, growth = 0;
         for (int end = 0; end < 2; end++) Sigma[end] = k->covariance + (size_t)9 * p * ends[end];
-        for (int j = 0; j < 3 * p; j++) {
-            along[j] = 0;
-            for (int r = 0; r < 3; r++)
-                along[j] += g[r] * (Sigma[0][3 * r * p + j] - Sigma[1][3 * r * p + j]);
-        }
-        for (int a = 0; a < 2; a++)
-            for (int i = 0; i < k->p; i++) {
-                double sum = 0;
-                for (int r = 0; r < 3; r++) sum += m[(2 * r + a) * p + i] * along[r * p + i];
-                A[(size_t)(a * p + i) * stride + 2 * p + b] = sum;
-            }
+        grow(p, Sigma[0], Sigma[1], g, k->cameras, along, seen);
+        for (int i = 0; i < 2 * p; i++) A[(size_t)i * stride + 2 * p + b] = seen[i];
         for (int r = 0; r < 3; r++) growth += g[r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
         row[n] = size * k->lengths[2 * b] - g[3] + growth;
-    }
-    for (int b = 0; b < k->bones; b++) {
-        double *row = A + (size_t)(2 * p + b) * stride + 2 * p, *along = k->along + (size_t)3 * p * b;
-        for (int c = b; c < k->bones; c++) {
-            const int *ends = k->ends + 2 * c;
-            row[c] = size * size * k->lengths[2 * b] * k->lengths[2 * c];
-            for (int r = 0; r < 3; r++)
-                row[c] += k->edges[4 * c + r] * (along[r * p + ends[0]] - along[r * p + ends[1]]);
+        for (int c = 0; c <= b; c++) {
+            const int *others = k->ends + 2 * c;
+            const double *h = k->edges + 4 * c;
+            double both = size * size * k->lengths[2 * b] * k->lengths[2 * c];
+            for (int r = 0; r < 3; r++) both += h[r] * (along[r * p + others[0]] - along[r * p + others[1]]);
+            A[(size_t)(2 * p + c) * stride + 2 * p + b] = both;
         }
         double spread = size * k->lengths[2 * b + 1];
         row[b] += spread * spread + 1e-12 * k->unknown;
@@ -96,8 +106,8 @@ void correct(Plan *k, Object *o, double noise) {
     int p = DOUBLES_OF(k->p), n = 2 * p, bones = DOUBLES_OF(k->bones), stride = n + bones + DOUBLES;
     double *A = k->A, *m = k->cameras, unknown = k->unknown;
     for (int i = 0; i < p; i++) {
-        const double *Sigma = k->covariance + (size_t)9 * p * i;
-        if (i < k->p) project(p, i, Sigma, m, k->HC, A, stride);
+        const float *Sigma = k->covariance + (size_t)9 * p * i;
+        if (i < k->p) project(p, i, Sigma, m, A, stride);
         for (int a = 0; a < 2; a++) {
             double *row = A + (size_t)(a * p + i) * stride + a * p, *b = A + (size_t)(a * p + i) * stride + n;
             for (int j = 0; j < DOUBLES; j++) b[j] = 0;

@@ -32,15 +32,15 @@ void complete(Plan *k, const Object *o, float *filled) {
 }
 
 /* Psi (3, n) = relu(c V[0] + s V[1] - b), n at a time. */
-INLINE void turn_inline(int n, float c, float s, const float *restrict V, const float *restrict b,
+INLINE void turn_inline(ptrdiff_t n, float c, float s, const float *restrict V, const float *restrict b,
                         float *restrict Psi) {
     for (int r = 0; r < 3; r++)
-        for (int j = 0; j < n; j++) {
+        for (ptrdiff_t j = 0; j < n; j++) {
             float v = c * V[r * n + j] + s * V[(3 + r) * n + j] - b[j];
             Psi[r * n + j] = v > 0 ? v : 0;
         }
 }
-FAST(turn, (int n, float c, float s, const float *V, const float *b, float *Psi),
+FAST(turn, (ptrdiff_t n, float c, float s, const float *V, const float *b, float *Psi),
      (n, c, s, V, b, Psi))
 
 /* Set the first block codes of n objects, (n, turns, 2, 3, k_1).

@@ -28,8 +28,8 @@ typedef struct {
     int p, wide, layers, turns, mirrored, whitened, rms, corrected, refill, reference[2], min_visible, bones;
     const int *widths, *partners, *ends;
     Matrix L, L_inverse, encoder[MOST_LAYERS], decoder[MOST_LAYERS], code_head;
-    const float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head, *spread;
-    const double *covariance, *filling, *turn, *frame, *calibration, *lengths;
+    const float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head, *spread, *covariance;
+    const double *filling, *turn, *frame, *calibration, *lengths;
     double noise, length, unknown, nearest, residual_spread, least_residual;
     void *memory;
     /* Scratch, for `block` objects at a time. */
