@@ -65,7 +65,7 @@ size_t scratch(Plan *k, char *at) {
     ROOM(k->M, double, 6 * (size_t)n * all)
     ROOM(k->residual, double, all)
     ROOM(k->cameras, double, 6 * even)
-    ROOM(k->HC, double, 6 * even)
+    ROOM(k->seen, double, 2 * DOUBLES * even)
     ROOM(k->E, double, 3 * even)
     ROOM(k->A, double, (2 * even + bones) * (2 * even + bones + DOUBLES))
     ROOM(k->left, double, 2 * even)

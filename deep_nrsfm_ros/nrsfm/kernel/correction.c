@@ -1,4 +1,6 @@
 /* correction.py, for one object. */
+#include <string.h>
+
 #include "plan.h"
 
 /* Set the rows of A = H Sigma H^T (2, p) x (2, p) for point i; p in DOUBLES. Only the upper half is read.
@@ -35,7 +37,7 @@ FAST(combine, (ptrdiff_t n, const double *v, const float *Sigma, double *E), (n,
 /* E (3, p) of the answer x beside A: that of the keypoints, and of n bones. */
 static void errors(Plan *k, const double *x, int stride, int n) {
     int p = DOUBLES_OF(k->p);
-    double *m = k->cameras, *v = k->HC;
+    double *m = k->cameras, *v = k->seen;
     for (int j = 0; j < 3 * p; j++) k->E[j] = 0;
     for (int i = 0; i < p; i++) {
         double along = x[(size_t)i * stride], across = x[(size_t)(p + i) * stride];
@@ -65,41 +67,51 @@ INLINE void grow_inline(ptrdiff_t p, const float *restrict from, const float *re
     }
 }
 FAST(grow,
-     (ptrdiff_t p, const float *from, const float *to, const double *g, const double *m, double *along,
-      double *seen),
+     (ptrdiff_t p, const float *from, const float *to, const double *g, const double *m,
+      double *along, double *seen),
      (p, from, to, g, m, along, seen))
 
-/* Complete A (2, p) x (2, p) by the rows, columns and right side of the bones. */
-static void add_bones(Plan *k, const Object *o, double *A, int stride) {
+/* Set the columns of the bones and the right side, b (2, p), in the rows (2, p) of the keypoints. */
+static void add_columns(Plan *k, const double *b, double *A, int stride) {
     int p = DOUBLES_OF(k->p), n = DOUBLES_OF(k->bones);
-    double *seen = k->HC, size = observe_bones(k, o);
+    double *seen = k->seen;
+    for (int first = 0; first < n; first += DOUBLES) {
+        memset(seen, 0, DOUBLES * 2 * p * sizeof(double));
+        for (int bone = first; bone < first + DOUBLES && bone < k->bones; bone++) {
+            const float *from = k->covariance + (size_t)9 * p * k->ends[2 * bone];
+            const float *to = k->covariance + (size_t)9 * p * k->ends[2 * bone + 1];
+            grow(p, from, to, k->edges + 4 * bone, k->cameras, k->along + (size_t)3 * p * bone,
+                 seen + (bone - first) * 2 * p);
+        }
+        for (int i = 0; i < 2 * p; i++)
+            for (int j = 0; j < DOUBLES; j++)
+                A[(size_t)i * stride + 2 * p + first + j] = seen[2 * j * p + i];
+    }
+    for (int i = 0; i < 2 * p; i++)
+        for (int j = 0; j < DOUBLES; j++) A[(size_t)i * stride + 2 * p + n + j] = j ? 0 : b[i];
+}
+
+/* Set the rows of the bones, whose `along` are there; `size`: that of the object. */
+static void add_rows(Plan *k, double size, double *A, int stride) {
+    int p = DOUBLES_OF(k->p), n = DOUBLES_OF(k->bones);
     for (int b = 0; b < n; b++) {
         double *row = A + (size_t)(2 * p + b) * stride + 2 * p;
         for (int j = b; j < n + DOUBLES; j++) row[j] = j == b;
-        for (int i = 0; i < 2 * p; i++) A[(size_t)i * stride + 2 * p + b] = 0;
         if (b >= k->bones) continue; /* No bone: x = 0. */
-        const int *ends = k->ends + 2 * b;
-        const double *g = k->edges + 4 * b;
-        const float *Sigma[2];
-        double *along = k->along + (size_t)3 * p * b, growth = 0;
-        for (int end = 0; end < 2; end++) Sigma[end] = k->covariance + (size_t)9 * p * ends[end];
-        grow(p, Sigma[0], Sigma[1], g, k->cameras, along, seen);
-        for (int i = 0; i < 2 * p; i++) A[(size_t)i * stride + 2 * p + b] = seen[i];
-        for (int r = 0; r < 3; r++) growth += g[r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
-        row[n] = size * k->lengths[2 * b] - g[3] + growth;
-        for (int c = 0; c <= b; c++) {
-            const int *others = k->ends + 2 * c;
-            const double *h = k->edges + 4 * c;
-            double both = size * size * k->lengths[2 * b] * k->lengths[2 * c];
-            for (int r = 0; r < 3; r++) both += h[r] * (along[r * p + others[0]] - along[r * p + others[1]]);
-            A[(size_t)(2 * p + c) * stride + 2 * p + b] = both;
+        const double *known = k->lengths + 2 * b, *along = k->along + (size_t)3 * p * b;
+        double spread = size * known[1], missing = size * known[0] - k->edges[4 * b + 3];
+        for (int c = b; c < k->bones; c++) {
+            const int *ends = k->ends + 2 * c;
+            const double *g = k->edges + 4 * c;
+            row[c] = size * size * known[0] * k->lengths[2 * c];
+            for (int r = 0; r < 3; r++) row[c] += g[r] * (along[r * p + ends[0]] - along[r * p + ends[1]]);
         }
-        double spread = size * k->lengths[2 * b + 1];
         row[b] += spread * spread + 1e-12 * k->unknown;
+        const int *ends = k->ends + 2 * b;
+        for (int r = 0; r < 3; r++)
+            missing += k->edges[4 * b + r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
+        row[n] = missing;
     }
-    for (int i = 0; i < 2 * p; i++)
-        for (int j = 0; j < DOUBLES; j++)
-            A[(size_t)i * stride + 2 * p + n + j] = j ? 0 : k->left[i];
 }
 
 void correct(Plan *k, Object *o, double noise) {
@@ -127,7 +139,9 @@ void correct(Plan *k, Object *o, double noise) {
     solve(n, 0, stride, A);
     errors(k, A + n, stride, 0);
     if (bones) {
-        add_bones(k, o, A, stride);
+        double size = observe_bones(k, o);
+        add_columns(k, k->left, A, stride);
+        add_rows(k, size, A, stride);
         solve(n + bones, n, stride, A);
         errors(k, A + n + bones, stride, k->bones);
     }

@@ -36,7 +36,7 @@ typedef struct {
     int block, *missing;
     Object *objects, **some;
     float *x, *V, *Psi[2], *psi[2], *shapes;
-    double *M, *cameras, *HC, *E, *A, *left, *edges, *along, *residual;
+    double *M, *cameras, *seen, *E, *A, *left, *edges, *along, *residual;
 } Plan;
 
 /* compiled.py: point `k` at its parts of three arrays; return whether they have a plan's `lengths`. */

@@ -64,7 +64,7 @@ TARGET static void FOR(product)(int rows, const float *X, int stride, Matrix A, 
 
 /* Columns j ... of rows k ... k + 3, less what the rows above have in them. */
 HERE void FOR(subtract)(const int vectors, int k, int stride, const double *A, int j,
-                        FOR(doubles) left[4][2]) {
+                        FOR(doubles) left[4][3]) {
     typedef FOR(doubles) vector;
     for (int r = 0; r < 4; r++)
         for (int v = 0; v < vectors; v++)
@@ -81,7 +81,7 @@ HERE void FOR(subtract)(const int vectors, int k, int stride, const double *A, i
 HERE void FOR(eliminate)(const int vectors, int k, int stride, double *A, int j,
                          const double *scale) {
     typedef FOR(doubles) vector;
-    vector left[4][2];
+    vector left[4][3];
     FOR(subtract)(vectors, k, stride, A, j, left);
     for (int r = 0; r < 4; r++)
         for (int v = 0; v < vectors; v++) {
@@ -94,7 +94,7 @@ HERE void FOR(eliminate)(const int vectors, int k, int stride, double *A, int j,
 
 /* The corner k ... k + 3 of U in place of A's, and one over its diagonal. */
 HERE void FOR(factor)(int k, int stride, double *A, double scale[4]) {
-    FOR(doubles) corner[4][2];
+    FOR(doubles) corner[4][3];
     double U[4][4];
     FOR(subtract)(4 / LANES, k, stride, A, k, corner);
     for (int r = 0; r < 4; r++)
@@ -118,7 +118,7 @@ TARGET static void FOR(solve)(int n, int done, int stride, double *A) {
             for (int r = 0; r < 4; r++) scale[r] = 1 / A[(size_t)(k + r) * stride + k + r];
         else
             FOR(factor)(k, stride, A, scale);
-        for (; j + 2 * LANES <= wide; j += 2 * LANES) FOR(eliminate)(2, k, stride, A, j, scale);
+        for (; j + 3 * LANES <= wide; j += 3 * LANES) FOR(eliminate)(3, k, stride, A, j, scale);
         for (; j < wide; j += LANES) FOR(eliminate)(1, k, stride, A, j, scale);
     }
     for (int k = n - 4; k >= 0; k -= 4)
