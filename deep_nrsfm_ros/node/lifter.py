@@ -98,9 +98,14 @@ class LifterNode(Node):
         self._health = Health()
         self._points = self.create_publisher(PointCloud2, "~/points", 10)
         self._rotation = self.create_publisher(QuaternionStamped, "~/camera_rotation", 10)
-        self._objects = self.create_publisher(MultiDOFJointState, "~/objects", 10)
-        self._markers = self.create_publisher(MarkerArray, "~/markers", 10)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        rare = publishing.UNWATCHED
+        self._objects = self.create_publisher(
+            MultiDOFJointState, "~/objects", 10, event_callbacks=rare
+        )
+        self._markers = self.create_publisher(MarkerArray, "~/markers", 10, event_callbacks=rare)
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, "/diagnostics", 10, event_callbacks=rare
+        )
         self._training = TrainingService(
             *(self, self._training_request, self._activate, self._fence.models_dir)
         )

@@ -16,6 +16,7 @@ from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Transform, Vector3
 from numpy.typing import NDArray
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 from std_msgs import msg as std_msgs
@@ -25,6 +26,12 @@ from deep_nrsfm_ros.nrsfm.geometry import centre, quaternion
 from deep_nrsfm_ros.nrsfm.lifting import Lifted
 from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP
 from deep_nrsfm_ros.observations.serialised import Header
+
+UNWATCHED = PublisherEventCallbacks(use_default_callbacks=False)
+"""For publishers beside the hot path: rclpy looks after two events of any other at every message.
+
+They would tell of a subscriber whose quality of service does not fit. Its own node tells it too.
+"""
 
 _MAKES = 16  # of each kind of message that are kept: cameras, and numbers of objects
 

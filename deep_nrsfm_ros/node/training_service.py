@@ -47,7 +47,9 @@ class TrainingService:
         self._state, self._last_failure = "idle", "none"
         self._heard: SimpleQueue[Progress] = SimpleQueue()
         self._wake = node.create_guard_condition(self._report)
-        self._publisher = node.create_publisher(DiagnosticStatus, "~/training_status", _LATCHED)
+        self._publisher = node.create_publisher(
+            DiagnosticStatus, "~/training_status", _LATCHED, event_callbacks=publishing.UNWATCHED
+        )
         node.create_service(Trigger, "~/train", self._train)
         node.create_service(Trigger, "~/cancel_training", self._cancel)
         self._tell_of_unfinished()
