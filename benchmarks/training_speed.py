@@ -17,7 +17,7 @@ from benchmarks.plain_torch import PlainTraining
 from benchmarks.speed import arguments, by_turns, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.nrsfm.distributed import join
-from deep_nrsfm_ros.nrsfm.losses import Frames
+from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
 
@@ -41,13 +41,13 @@ def preset(name: str, batch: int) -> Preset:
     return base._replace(recipe=dataclasses.replace(base.recipe, batch=batch))
 
 
-def frames(f: int) -> Frames:
+def frames(f: int) -> Pool:
     """Return f frames of no shape in particular; their values cost no time."""
     points = np.random.default_rng(0).standard_normal((f, P, 2), dtype=np.float32)
-    return Frames(torch.from_numpy(points), torch.ones(f, P, 1))
+    return Pool.of(points, np.ones((f, P), bool))
 
 
-def contenders(name: str, data: Frames) -> tuple[Trainer, PlainTraining]:
+def contenders(name: str, data: Pool) -> tuple[Trainer, PlainTraining]:
     """Return both, with the same weights."""
     chosen = preset(name, BATCH)
     ours = Trainer(data, chosen, 0)

@@ -17,6 +17,7 @@ from deep_nrsfm_ros.nrsfm.gradient import descend
 from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
 from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 
 
@@ -30,7 +31,7 @@ class Trainer:
 
     def __init__(
         self,
-        frames: Frames,
+        frames: Pool,
         preset: Preset,
         seed: int,
         start: Network | None = None,
@@ -46,13 +47,13 @@ class Trainer:
         self.frames, self.preset, self.seed, self.step = frames, preset, seed, 0
         self.team, self.batch = team, team.share(preset.recipe.batch)
         self.cpu_seconds = 0.0
-        count = torch.tensor(len(frames.points), device=frames.points.device)
+        count = torch.tensor(len(frames), device=frames.device)
         team.total(count)
         self.frames_in_all = int(count)
         self.time_gone = 0.0  # share of the time there is, if that is limited
         self.kept: int | None = None  # the step of the weights, where that is not the last one
         self.ended = ""  # why there is nothing left to be done; "" if it was stopped
-        device = frames.points.device
+        device = frames.device
         initial = start or initialise(
             architecture,
             frames.points.shape[1],
@@ -92,10 +93,10 @@ class Trainer:
     def sample(self, size: int, step: int = -1) -> Frames:
         """Return the random batch of a step; leaves the generator ready for its cameras."""
         self.generator.manual_seed((self.seed << 32) + (self.team.rank << 24) + step + 1)
-        f = len(self.frames.points)
-        device = self.frames.points.device
-        chosen = torch.randint(f, (size,), generator=self.generator, device=device)
-        return Frames(self.frames.points[chosen], self.frames.mask[chosen])
+        pool, generator = self.frames, self.generator
+        return pool.batch(
+            torch.randint(len(pool), (size,), generator=generator, device=pool.device)
+        )
 
     def advance(self) -> None:
         """Take one gradient step."""
@@ -166,19 +167,17 @@ class Trainer:
 _COUNTS = {"step", "seed", "cpu_seconds"}
 
 
-def second_moment(
-    frames: Frames, normaliser: Normaliser, team: Team = ALONE
-) -> NDArray[np.float64]:
+def second_moment(frames: Pool, normaliser: Normaliser, team: Team = ALONE) -> NDArray[np.float64]:
     """Return E[W W^T] (p, p), each entry over the frames in which both points are visible.
 
     The frames are those of all processes.
     """
     total = seen = torch.zeros(())
-    for start in range(0, len(frames.points), 16384):
-        points, mask = (tensor[start : start + 16384] for tensor in frames)
-        W = normaliser.encode(points, mask).W.double()
-        total = total + (W @ W.swapaxes(-1, -2)).sum(0)
-        seen = seen + (mask @ mask.swapaxes(-1, -2)).double().sum(0)
+    for points, mask in frames.blocks():
+        # One product for all frames: one of each would take as long again as an epoch's share.
+        W = normaliser.encode(points, mask).W.mT.reshape(-1, points.shape[1]).double()
+        there = mask[..., 0].double()
+        total, seen = total + W.T @ W, seen + there.T @ there
     team.total(total, seen)
     moment = (total / seen.clamp(min=1)).cpu().numpy()
     return np.asarray(moment, np.float64)

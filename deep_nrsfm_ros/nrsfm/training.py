@@ -24,9 +24,10 @@ from deep_nrsfm_ros.nrsfm.geometry import Floats
 from deep_nrsfm_ros.nrsfm.handedness import object_frame
 from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
 from deep_nrsfm_ros.nrsfm.limits import WHOLE, Limits
-from deep_nrsfm_ros.nrsfm.losses import Frames, visible_centre
+from deep_nrsfm_ros.nrsfm.losses import visible_centre
 from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Network, coherence, complete, reconstruct
+from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.progress import Clock, Progress
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
@@ -70,12 +71,12 @@ def train(
         check(config)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     usable = _usable(points, visible)
-    if team.size > min(len(usable.points), preset.recipe.batch):
+    if team.size > min(len(usable), preset.recipe.batch):
         raise ValueError(
-            f"{team.size} processes are more than the {len(usable.points)} frames or the batch of "
+            f"{team.size} processes are more than the {len(usable)} frames or the batch of "
             f"{preset.recipe.batch} can be shared out to"
         )
-    frames = Frames(*(team.shard(tensor).to(device) for tensor in usable))
+    frames = dataclasses.replace(usable, usable=team.shard(usable.usable)).to(device)
     run = _Run(frames, preset, limits, start, team, anatomy)
     run.on_progress, run.should_stop = on_progress, should_stop
     run.checkpoint, run.checkpoint_seconds = checkpoint, checkpoint_seconds
@@ -102,7 +103,7 @@ class _Run:
 
     def __init__(
         self,
-        frames: Frames,
+        frames: Pool,
         preset: Preset,
         limits: Limits,
         start: Network | None,
@@ -232,18 +233,21 @@ class _Run:
             self.leader_error = float(tensors["screening"])
 
 
-def _usable(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> Frames:
+def _usable(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> Pool:
     """Return the frames that have an extent; raise ValueError if there are none.
 
     The error of a frame is relative to its extent: a few without one would drown all others.
     """
-    mask = torch.from_numpy(visible[..., None].astype(np.float32))
-    tensor = torch.from_numpy(np.where(visible[..., None], points, np.float32(0)))
-    extent = visible_centre(tensor, mask).norm(dim=(-2, -1)).numpy()
+    pool = Pool.of(points, visible)
+    extent, done = np.zeros(len(pool), np.float32), 0
+    for block in pool.blocks():
+        found = visible_centre(*block).norm(dim=(-2, -1))
+        extent[done : done + len(found)] = found.numpy()
+        done += len(found)
     usable = torch.from_numpy(extent > 1e-4 * extent.max(initial=0))
     if not usable.any():
         raise ValueError(f"none of the {len(points)} frames shows two keypoints apart")
-    return Frames(tensor[usable], mask[usable])
+    return dataclasses.replace(pool, usable=pool.usable[usable])
 
 
 def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> Model:
@@ -257,7 +261,7 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         seen = normaliser.encode(W, np.ones_like(W[..., :1]))
         return *reconstruct(net, seen.W), seen.W
 
-    sample = trainer.sample(min(_COVARIANCE_FRAMES, 4 * len(trainer.frames.points)))
+    sample = trainer.sample(min(_COVARIANCE_FRAMES, 4 * len(trainer.frames)))
     mask = sample.mask.cpu().numpy()
     W, _ = complete(net, sample.points.cpu().numpy(), mask)
     S, _, _ = lift(W)

@@ -11,6 +11,7 @@ import torch
 from benchmarks.plain_torch import PlainNetwork, PlainTraining
 from deep_nrsfm_ros.nrsfm.losses import Frames
 from deep_nrsfm_ros.nrsfm.network import forward, initialise
+from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
 
@@ -33,6 +34,10 @@ def test_computes_what_our_network_does(name: str, points: torch.Tensor) -> None
         np.testing.assert_allclose(plain.detach().numpy(), ours, rtol=1e-3, atol=1e-4)
 
 
+def pool(points: torch.Tensor) -> Pool:
+    return Pool.of(points.numpy(), np.ones((len(points), P), bool))
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_has_the_same_losses(name: str, points: torch.Tensor) -> None:
     preset = PRESETS[name]
@@ -41,7 +46,7 @@ def test_has_the_same_losses(name: str, points: torch.Tensor) -> None:
         architecture=architecture, recipe=dataclasses.replace(preset.recipe, batch=len(points))
     )
     frames = Frames(points, torch.ones(len(points), P, 1))
-    ours = Trainer(frames, preset, 0)
+    ours = Trainer(pool(points), preset, 0)
     plain = PlainTraining(ours.net, points, preset)
     generator = torch.Generator().manual_seed(3)
     shapes = ours.objective(ours.net, frames, None, generator).shapes
@@ -53,8 +58,7 @@ def test_has_the_same_losses(name: str, points: torch.Tensor) -> None:
 
 def test_its_steps_lower_the_loss(points: torch.Tensor) -> None:
     preset = PRESETS["paper"]
-    frames = Frames(points, torch.ones(len(points), P, 1))
-    plain = PlainTraining(Trainer(frames, preset, 0).initial, points, preset)
+    plain = PlainTraining(Trainer(pool(points), preset, 0).initial, points, preset)
     before = plain.loss(points).item()
     for _ in range(20):
         plain.advance()

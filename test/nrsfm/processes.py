@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -11,9 +12,9 @@ from safetensors.torch import save_file
 
 from deep_nrsfm_ros.nrsfm.distributed import Team, join, rank
 from deep_nrsfm_ros.nrsfm.limits import Limits
-from deep_nrsfm_ros.nrsfm.losses import Frames
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
 from deep_nrsfm_ros.nrsfm.training import train
@@ -27,8 +28,9 @@ PRESET = Preset(
 
 def first_step(points: torch.Tensor, team: Team) -> dict[str, torch.Tensor]:
     """Return the gradient of one step, what it was asked on, and the whitening."""
-    frames = Frames(*map(team.shard, (points, torch.ones_like(points[..., :1]))))
-    trainer = Trainer(frames, PRESET, 0, team=team)
+    pool = Pool.of(points.numpy(), np.ones(points.shape[:2], bool))
+    pool = dataclasses.replace(pool, usable=team.shard(pool.usable))
+    trainer = Trainer(pool, PRESET, 0, team=team)
     batch = trainer.sample(trainer.batch, 0).points
     trainer.advance()
     gradient = trainer.weights.grad

@@ -20,6 +20,7 @@ from deep_nrsfm_ros.nrsfm.distributed import ALONE, Team, join, rank
 from deep_nrsfm_ros.nrsfm.gradient import descend
 from deep_nrsfm_ros.nrsfm.limits import Limits
 from deep_nrsfm_ros.nrsfm.losses import Frames
+from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
 from deep_nrsfm_ros.nrsfm.training import train
 
@@ -60,7 +61,7 @@ def test_the_first_step_is_that_of_one_process_with_both_batches(
     figure: Any, found: list[dict[str, torch.Tensor]]
 ) -> None:
     points = torch.from_numpy(figure.points)
-    alone = Trainer(Frames(points, torch.ones_like(points[..., :1])), PRESET, 0)
+    alone = Trainer(Pool.of(figure.points, np.ones(points.shape[:2], bool)), PRESET, 0)
     assert [len(part["batch"]) for part in found] == [32, 33]
     batch = torch.cat([part["batch"] for part in found])
     assert len(batch.unique(dim=0)) > 60  # each draws its own

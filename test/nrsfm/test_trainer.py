@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from deep_nrsfm_ros.nrsfm.losses import Frames
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
 from deep_nrsfm_ros.nrsfm.trainer import learning_rate, second_moment
 
@@ -29,8 +28,7 @@ def test_second_moment_is_over_the_frames_that_show_both_points(figure: Any, sca
             for j in np.flatnonzero(there):
                 total[i, j] += W[i] @ W[j]
                 seen[i, j] += 1
-    mask = torch.from_numpy(visible[..., None].astype(np.float32))
-    found = second_moment(Frames(torch.from_numpy(points), mask), Normaliser(scale))
+    found = second_moment(Pool.of(points, visible), Normaliser(scale))
     assert seen[2, 3] == 0 == found[2, 3]
     np.testing.assert_allclose(found, total / np.maximum(seen, 1), atol=1e-5)
 

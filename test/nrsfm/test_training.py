@@ -16,10 +16,10 @@ from deep_nrsfm_ros.nrsfm.geometry import align
 from deep_nrsfm_ros.nrsfm.handedness import votes
 from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
 from deep_nrsfm_ros.nrsfm.limits import Limits
-from deep_nrsfm_ros.nrsfm.losses import Frames
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.progress import Progress
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.nrsfm.trainer import Trainer, learning_rate
@@ -187,7 +187,7 @@ def test_stopping_before_anything_is_learned_leaves_no_checkpoint(
 
 
 def test_screening_goes_on_with_the_lowest_cycle_error(figure: Any) -> None:
-    frames = Frames(torch.from_numpy(figure.points), torch.ones(*figure.points.shape[:2], 1))
+    frames = Pool.of(figure.points, np.ones(figure.points.shape[:2], bool))
     chosen = set()
     for seed in (3, 6):
         preset = small(**SCREENED, seed=seed)
