@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from deep_nrsfm_ros.observations.outliers import find_outliers
 
 Bools = NDArray[np.bool_]
 
+_BLOCK = 4096  # frames looked at together
 _RECENT = 4  # kept frames that a frame is compared with: several objects may take turns
 _HOPELESS = 0.25  # share of a frame's visible points that may be outliers
 _EXAMPLES = 12  # worst frames that are kept for show
@@ -169,10 +171,10 @@ def curate(ensemble: Ensemble, options: Curation | None = None) -> Curated:
         if number[i]
     )
     kept = ensemble[frames[stay]]
-    left = visible[stay] & ~outliers[stay]
-    points = np.where(left[..., None], kept.points, np.float32(0))
+    kept.visible[outliers[stay]] = False
+    kept.points[~kept.visible] = 0
     return Curated(
-        Ensemble(points, left, kept.layout, kept.source, kept.shapes),
+        kept,
         frames[stay],
         len(ensemble),
         int((~enough).sum()),
@@ -205,23 +207,42 @@ def novel(points: NDArray[np.float32], visible: Bools, least: float) -> Bools:
     their RMS radius, are within `least` (RMS) of it, says nothing new.
     """
     kept = np.zeros(len(points), bool)
-    recent: deque[int] = deque(maxlen=_RECENT)
-    for i in range(len(points)):
-        seen = visible[i]
-        if recent:
-            before = np.array(recent)
-            before = before[visible[before][:, seen].all(1)]
-            now, then = _fitted(points[i, seen]), _fitted(points[before][:, seen])
-            if (((now - then) ** 2).sum(2).mean(1) < least**2).any():
-                continue
-        kept[i] = True
-        recent.append(i)
+    recent: deque[_Kept] = deque(maxlen=_RECENT)
+    for start in range(0, len(points), _BLOCK):
+        seen = visible[start : start + _BLOCK]
+        fitted = _fitted(points[start : start + _BLOCK], seen)
+        patterns = (int.from_bytes(row) for row in np.packbits(seen, 1))
+        for i, now, pattern in zip(range(start, len(points)), fitted, patterns, strict=False):
+            closest = least**2 * pattern.bit_count()
+            for before in recent:
+                if pattern & ~before.pattern:
+                    continue
+                then = before.fitted
+                if pattern != before.pattern:
+                    then = _fitted(points[before.frame], visible[i])
+                away = (now - then).ravel()
+                if away @ away < closest:
+                    break
+            else:
+                kept[i] = True
+                recent.append(_Kept(i, pattern, now))
     return kept
 
 
-def _fitted(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return points (..., n, 2) centred, with RMS radius 1."""
-    X = points - points.mean(-2, keepdims=True)
-    radius = np.sqrt((X * X).sum(-1).mean(-1))[..., None, None]
+class _Kept(NamedTuple):
+    """A frame that was kept: which, its visible points as bits, and as `_fitted` has it."""
+
+    frame: int
+    pattern: int
+    fitted: NDArray[np.float32]
+
+
+def _fitted(points: NDArray[np.float32], visible: Bools) -> NDArray[np.float32]:
+    """Return points (..., p, 2), the visible centred and with RMS radius 1, the others 0."""
+    there = visible[..., None].astype(np.float32)
+    number = np.maximum(there.sum(-2, keepdims=True), 1)
+    X = np.where(visible[..., None], points, np.float32(0))
+    X = (X - X.sum(-2, keepdims=True) / number) * there
+    radius = np.sqrt((X * X).sum((-2, -1), keepdims=True) / number)
     fitted: NDArray[np.float32] = X / np.maximum(radius, np.float32(1e-9))
     return fitted

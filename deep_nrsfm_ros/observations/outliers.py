@@ -26,7 +26,7 @@ _QUIET = 0.5  # least typical deviation of a point: nothing within 6 % of the si
 _FREE = 100.0  # variance of where a frame is: the median that centres it is only a guess
 _MISSING = 1e6  # variance of a missing coordinate
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a standard normal vector in the plane
-_BLOCK = 2**24  # floats held at a time
+_BLOCK = 4096  # frames judged together
 _LEAST = 4  # points of a frame that are never doubted
 
 
@@ -57,14 +57,16 @@ class PointModel:
     typical: Floats
 
     @classmethod
-    def fit(cls, X: Floats, visible: Bools, threshold: float) -> PointModel:
-        """Fit to normalised frames X (f, p, 2): points beyond `threshold` are left out and again.
+    def fit(cls, points: NDArray[np.float32], visible: Bools, threshold: float) -> PointModel:
+        """Fit to frames (f, p, 2), or to some of many; deterministic.
 
-        Missing points are filled by expectation-maximisation. Deterministic.
+        Points beyond `threshold` are left out and it is fitted again. Missing points are filled by
+        expectation-maximisation.
         """
-        if len(X) > _SAMPLE:
-            chosen = np.random.default_rng(0).choice(len(X), _SAMPLE, replace=False)
-            X, visible = X[chosen], visible[chosen]
+        if len(points) > _SAMPLE:
+            chosen = np.random.default_rng(0).choice(len(points), _SAMPLE, replace=False)
+            points, visible = points[chosen], visible[chosen]
+        X = normalised(points, visible)
         p = X.shape[1]
         mean = np.zeros((p, 2))
         for j in np.flatnonzero(visible.any(0)):
@@ -97,11 +99,10 @@ class PointModel:
         f, p = visible.shape
         C = self.covariance
         used, filled = np.zeros_like(C), np.empty((f, 2 * p))
-        for part, precisions, which in self._precisions(visible):
-            x = ((X[part] - self.mean) * visible[part][..., None]).reshape(-1, 2 * p)
-            filled[part] = (precisions[which] @ x[..., None])[..., 0] @ C
-            counts = np.bincount(which, minlength=len(precisions))
-            used += np.tensordot(counts / f, precisions, 1)
+        for frames, precision in self._precisions(visible):
+            x = ((X[frames] - self.mean) * visible[frames][..., None]).reshape(-1, 2 * p)
+            filled[frames] = x @ precision @ C
+            used += len(frames) / f * precision
         shift = filled.mean(0)
         spread = (filled - shift).T @ (filled - shift) / f
         covariance = spread + C - C @ used @ C + _FLOOR**2 * np.eye(2 * p)
@@ -117,29 +118,28 @@ class PointModel:
         f, p = visible.shape
         distances = np.zeros((f, p))
         own = np.arange(p)
-        for part, precisions, which in self._precisions(visible):
-            d = ((X[part] - self.mean) * visible[part][..., None]).reshape(-1, 2 * p)
-            y = (precisions[which] @ d[..., None]).reshape(-1, p, 2)
-            blocks = precisions.reshape(-1, p, 2, p, 2)[:, own, :, own].swapaxes(0, 1)
-            squares = np.einsum("fpi,fpij,fpj->fp", y, np.linalg.inv(blocks)[which], y)
-            distances[part] = np.sqrt(np.maximum(squares, 0))
+        for frames, precision in self._precisions(visible):
+            d = ((X[frames] - self.mean) * visible[frames][..., None]).reshape(-1, 2 * p)
+            y = (d @ precision).reshape(-1, p, 2)
+            blocks = np.linalg.inv(precision.reshape(p, 2, p, 2)[own, :, own])
+            squares = np.einsum("fpi,pij,fpj->fp", y, blocks, y)
+            distances[frames] = np.sqrt(np.maximum(squares, 0))
         return np.where(visible, distances, 0.0)
 
-    def _precisions(self, visible: Bools) -> Iterator[tuple[slice, Floats, NDArray[np.intp]]]:
-        """Yield (frames, precisions (k, 2 p, 2 p), index (n,) into them), bounded in memory.
+    def _precisions(self, visible: Bools) -> Iterator[tuple[NDArray[np.intp], Floats]]:
+        """Yield (frames, precision (2 p, 2 p)) for each pattern of visible points.
 
-        One precision for each pattern of visible points. Missing coordinates and the place of
-        the frame are variables of very large variance, which drop out.
+        Missing coordinates and the place of the frame are variables of very large variance, which
+        drop out.
         """
         p = visible.shape[1]
-        place = np.kron(np.ones((p, p)), np.eye(2)) * _FREE
-        rows, diagonal = max(1, _BLOCK // (2 * p) ** 2), np.arange(2 * p)
-        for start in range(0, len(visible), rows):
-            part = slice(start, start + rows)
-            patterns, which = np.unique(visible[part], axis=0, return_inverse=True)
-            covariances = np.repeat((self.covariance + place)[None], len(patterns), 0)
-            covariances[:, diagonal, diagonal] += _MISSING * np.repeat(~patterns, 2, axis=1)
-            yield part, np.linalg.inv(covariances), which.ravel()
+        covariance = self.covariance + np.kron(np.ones((p, p)), np.eye(2)) * _FREE
+        patterns, which, counts = np.unique(
+            visible, axis=0, return_inverse=True, return_counts=True
+        )
+        frames = np.split(np.argsort(which.ravel(), kind="stable"), np.cumsum(counts)[:-1])
+        for pattern, those in zip(patterns, frames, strict=True):
+            yield those, np.linalg.inv(covariance + np.diag(_MISSING * np.repeat(~pattern, 2)))
 
 
 def find_outliers(
@@ -150,8 +150,19 @@ def find_outliers(
     In each frame the worst point is taken out and the others are judged again without it, until
     none deviates by more than `threshold` or `_LEAST` are left.
     """
+    model = PointModel.fit(points, visible, threshold)
+    outliers, worst = np.zeros_like(visible), np.zeros(len(points))
+    for start in range(0, len(points), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        outliers[part], worst[part] = _judge(model, points[part], visible[part], threshold)
+    return outliers, worst
+
+
+def _judge(
+    model: PointModel, points: NDArray[np.float32], visible: Bools, threshold: float
+) -> tuple[Bools, Floats]:
+    """Return what `find_outliers` does, of some of its frames."""
     X = normalised(points, visible)
-    model = PointModel.fit(X, visible, threshold)
     kept, worst = visible.copy(), np.zeros(len(X))
     left = np.arange(len(X))
     while len(left):

@@ -25,7 +25,8 @@ _CHAOS = 0.1  # noise, as a share of the extent, that leaves no shape to see
 _NARROW = 20.0  # degrees of view span below which depth is hardly seen
 _STIFF = 0.02  # share of the extent beyond a rigid object that may be noise
 _RARELY = 0.01  # share of the frames below which a keypoint does not count
-_SAMPLE = 4000  # frames looked at
+_SAMPLE = 4000  # frames whose spectrum is looked at
+_BLOCK = 4096  # frames looked at together
 _ROUNDS = 10  # of filling missing points, for each rank
 
 
@@ -72,9 +73,12 @@ def examine(ensemble: Ensemble) -> Variation:
             f"only {points} keypoints are seen ({', '.join(names) or 'none'}); NRSfM needs at "
             "least 4, better 8; check the layout and lower --min-confidence",
         )
-    W, visible = ensemble.points[:, counts], ensemble.visible[:, counts]
-    lines = on_one_line(W, visible)
-    usable = (visible.sum(1) >= 3) & ~lines
+    lines = np.zeros(len(ensemble), bool)
+    for start in range(0, len(ensemble), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        seen_there = ensemble.visible[part][:, counts]
+        lines[part] = on_one_line(ensemble.points[part][:, counts], seen_there)
+    usable = (ensemble.visible[:, counts].sum(1) >= 3) & ~lines
     frames = int(usable.sum())
     if frames < FEWEST_FRAMES <= lines.sum():
         return _refused(
@@ -92,7 +96,7 @@ def examine(ensemble: Ensemble) -> Variation:
             "and move the object or the camera meanwhile",
         )
     chosen = np.flatnonzero(usable)[:: -(-frames // _SAMPLE)]
-    W, visible = W[chosen], visible[chosen]
+    W, visible = ensemble.points[chosen][:, counts], ensemble.visible[chosen][:, counts]
     stacked = _filled(_stacked(W, visible), np.repeat(visible, 2, axis=0))
     U, values, _ = np.linalg.svd(stacked, full_matrices=False)
     values /= np.linalg.norm(values) or 1.0
