@@ -24,16 +24,25 @@ def polar(A: Array) -> Array:
     because a d - b^2 cancels when they are nearly parallel. A of rank one or less gives a
     result that is finite but not orthonormal.
     """
-    G = A @ A.swapaxes(-1, -2)
-    trace = (G[..., 0, 0] + G[..., 1, 1])[..., None, None]
-    a, b = A[..., 0, :], A[..., 1, :]
-    cx = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    cy = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    cz = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    trace = (A * A).sum((-2, -1))[..., None, None]
+    c = _cross(A[..., 0, :], A[..., 1, :])
     # Relative to the size of A, which in a deep narrow network is small.
-    floor = _TINY * (trace * trace)[..., 0, 0] + 1e-36
-    s = ((cx * cx + cy * cy + cz * cz + floor) ** 0.5)[..., None, None]
-    return ((trace + s) * A - G @ A) / (s * (trace + 2 * s) ** 0.5)
+    floor = _TINY * (trace * trace) + 1e-36
+    s = ((c * c).sum(-1)[..., None, None] + floor) ** 0.5
+    return ((trace + s) * A - A @ A.swapaxes(-1, -2) @ A) / (s * (trace + 2 * s) ** 0.5)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the cross product (..., 3) of two arrays, each library by its fastest way."""
+    if not isinstance(a, np.ndarray):
+        from torch.linalg import cross
+
+        return cross(a, b)
+    c = np.empty(a.shape, a.dtype)
+    # np.cross takes four times as long.
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        c[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
+    return c
 
 
 def spectral_norm(A: Array) -> Array:
@@ -53,11 +62,8 @@ def random_cameras(n: int, rng: np.random.Generator) -> NDArray[np.float32]:
 def rotation_from_camera(M: Floats) -> Floats:
     """Return R (..., 3, 3), object to camera, of which M^T (..., 2, 3) is the first two rows."""
     R = np.empty((*M.shape[:-2], 3, 3), M.dtype)
-    a, b = R[..., 0, :], R[..., 1, :]
-    a[...], b[...] = M[..., 0], M[..., 1]
-    # np.cross takes four times as long.
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        R[..., 2, i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
+    R[..., :2, :] = M.swapaxes(-1, -2)
+    R[..., 2, :] = _cross(R[..., 0, :], R[..., 1, :])
     return R
 
 

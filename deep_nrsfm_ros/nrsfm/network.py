@@ -257,13 +257,14 @@ def encode(net: Network, W: Array) -> list[Array]:
 
 
 def _relu(X: Array) -> Array:
-    """Return max(X, 0), each library by its fastest way."""
-    return np.maximum(X, 0) if isinstance(X, np.ndarray) else X.relu()
+    """Put max(X, 0) in place of X, and return it: a second array would take as long to fill."""
+    return np.maximum(X, 0, out=X) if isinstance(X, np.ndarray) else X.relu_()
 
 
 def _relu_threshold(V: Array, b: Array) -> Array:
-    """Return relu(V - b (x) 1_3x2), the paper's relaxation (eq. "singleBISTA")."""
-    return _relu(V - b)
+    """Put relu(V - b (x) 1_3x2) in place of V: the paper's relaxation (eq. "singleBISTA")."""
+    V -= b
+    return _relu(V)
 
 
 def _block_threshold(V: Array, b: Array) -> Array:
