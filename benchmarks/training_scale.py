@@ -1,4 +1,4 @@
-"""Training as the frames grow: time of an epoch, and memory over that of the ensemble."""
+"""Training as the frames grow: time of curation and an epoch, and memory over the ensemble's."""
 
 from __future__ import annotations
 
@@ -13,33 +13,36 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.speed import arguments, show
 from benchmarks.table import Table, bars
+from deep_nrsfm_ros.nrsfm.keypoints import CMU31
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
+from deep_nrsfm_ros.observations.curation import curate
+from deep_nrsfm_ros.observations.ensemble import Ensemble
 
-P = 31
 EXPONENT = "exponent"
 
 
 def table(measured: Sequence[dict[str, float]]) -> Table:
     """Return the table of what `measure` found, and the exponents of what grows."""
-    grows = ("preparation s", "epoch s")
+    grows = ("curation s", "preparation s", "epoch s")
     result = Table(
         "training_scale",
         "Training as the frames grow, the default recipe, one thread",
         ("frames",),
-        (*grows, "ensemble MB", "memory / ensemble"),
+        (*grows, "ensemble MB", "curation / ensemble", "training / ensemble"),
         {
-            "preparation s": "from the ensemble to the first step",
+            "curation s": "from the ensemble to one that is fit to be trained on",
+            "preparation s": "from there to the first step",
             "epoch s": "as many steps as it takes to draw as many frames as there are",
-            "memory / ensemble": "the most resident memory from before the ensemble is made to the "
-            "last step, less what there was before, over the size of the ensemble's arrays; a "
+            "curation / ensemble": "the most resident memory while it is curated, the ensemble "
+            "included, less what there was before that was made, over the size of its arrays",
+            "training / ensemble": "likewise of the training, which has the curated ensemble; a "
             "small training has gone before, so that libraries are not counted",
             EXPONENT: "e of time = c frames^e, least squares of the logarithms: 1 is linear",
         },
-        bars("memory / ensemble"),
+        bars("training / ensemble"),
     )
     for row in measured:
         figures = {name: value for name, value in row.items() if name != "frames"}
@@ -64,8 +67,8 @@ def measure(f: int) -> dict[str, float]:
     torch.set_num_threads(1)
     base, times = PRESETS["default"], [0.0]
 
-    def epoch(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> None:
-        steps = max(2, len(points) // base.recipe.batch)
+    def epoch(ensemble: Ensemble) -> None:
+        steps = max(2, len(ensemble) // base.recipe.batch)
         recipe = dataclasses.replace(base.recipe, steps=steps, seeds=1)
 
         def note(trainer: Trainer) -> None:
@@ -73,28 +76,34 @@ def measure(f: int) -> dict[str, float]:
                 times.append(time.perf_counter())
 
         times[:] = [time.perf_counter()]
-        train(points, visible, base._replace(recipe=recipe), on_step=note)
+        train(ensemble.points, ensemble.visible, base._replace(recipe=recipe), on_step=note)
 
-    epoch(*_ensemble(10 * base.recipe.batch))
+    epoch(curate(_ensemble(10 * base.recipe.batch)).ensemble)
     before = memory("VmRSS")
     ensemble = _ensemble(f)
+    size = (ensemble.points.nbytes + ensemble.visible.nbytes) / 2**20
     forget_peak()
-    epoch(*ensemble)
+    started = time.perf_counter()
+    ensemble = curate(ensemble).ensemble
+    curated, curation = time.perf_counter() - started, memory("VmHWM") - before
+    forget_peak()
+    epoch(ensemble)
     began, ready, done = times
-    size = sum(array.nbytes for array in ensemble) / 2**20
     return {
         "frames": f,
+        "curation s": curated,
         "preparation s": ready - began,
         "epoch s": done - ready,
         "ensemble MB": size,
-        "memory / ensemble": (memory("VmHWM") - before) / size,
+        "curation / ensemble": curation / size,
+        "training / ensemble": (memory("VmHWM") - before) / size,
     }
 
 
-def _ensemble(f: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return points (f, P, 2) and visibility of no shape in particular."""
-    points = np.random.default_rng(0).standard_normal((f, P, 2), dtype=np.float32)
-    return points, np.ones((f, P), bool)
+def _ensemble(f: int) -> Ensemble:
+    """Return f frames of no shape in particular."""
+    points = np.random.default_rng(0).standard_normal((f, len(CMU31), 2), dtype=np.float32)
+    return Ensemble(points, np.ones(points.shape[:2], bool), CMU31, "chance")
 
 
 def memory(what: str) -> float:

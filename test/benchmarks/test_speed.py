@@ -162,18 +162,20 @@ def test_training_speed_compares_with_plain_torch(tmp_path: Path) -> None:
 
 def test_exponents_are_those_of_the_times() -> None:
     measured = [
-        {"frames": f, "epoch s": 3e-5 * f, "preparation s": 1e-9 * f**2} for f in (1e4, 1e5, 1e6)
+        {"frames": f, "curation s": f**0.5, "preparation s": 1e-9 * f**2, "epoch s": 3e-5 * f}
+        for f in (1e4, 1e5, 1e6)
     ]
     values = training_scale.table(measured).values()[(training_scale.EXPONENT,)]
     assert values["epoch s"] == [pytest.approx(1)]
     assert values["preparation s"] == [pytest.approx(2)]
+    assert values["curation s"] == [pytest.approx(0.5)]
 
 
 @pytest.mark.usefixtures("few")
 def test_an_epoch_is_measured() -> None:
     found = training_scale.measure(300)
     assert found["ensemble MB"] == pytest.approx(300 * 31 * 9 / 2**20)
-    assert found["epoch s"] > 0 and found["preparation s"] > 0
+    assert found["epoch s"] > 0 and found["preparation s"] > 0 and found["curation s"] > 0
 
 
 def test_bag_reading_gives_the_share_of_rosbags(tmp_path: Path) -> None:
