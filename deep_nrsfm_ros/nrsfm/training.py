@@ -53,6 +53,7 @@ def train(
 ) -> Trainer:
     """Train on keypoints (f, p, 2) with visibility (f, p), any unit, x right and y down.
 
+    They are not copied: whoever changes them meanwhile changes what is learned from.
     Returns the trainer at its last step, or at its best one if `limits` say so; its `ended` says
     why there is nothing left to be done, and is "" after `should_stop`. With `limits.minutes`,
     which count from this call on and over all that is gone on with, the same seed does not give
