@@ -246,6 +246,9 @@ class Client:
     def call(self, service: str) -> Trigger.Response:
         client = self.node.create_client(Trigger, service)
         self.wait(client.service_is_ready, service)
+        # The lifter may know of this client a little later, and an answer before that is lost.
+        settled = time.monotonic() + 0.2
+        self.wait(lambda: time.monotonic() > settled, "the lifter to know of the client")
         future = client.call_async(Trigger.Request())
         self.wait(future.done, f"an answer of {service}")
         self.node.destroy_client(client)
