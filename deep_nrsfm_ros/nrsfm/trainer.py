@@ -174,7 +174,7 @@ def second_moment(frames: Pool, normaliser: Normaliser, team: Team = ALONE) -> N
     """
     total = seen = torch.zeros(())
     for points, mask in frames.blocks():
-        # One product for all frames: one a frame takes seven times as long, and as much memory.
+        # One product for all frames: one a frame took seven times as long.
         W = normaliser.encode(points, mask).W.mT.reshape(-1, points.shape[1]).double()
         there = mask[..., 0].double()
         total, seen = total + W.T @ W, seen + there.T @ there

@@ -98,18 +98,18 @@ static void add_rows(Plan *k, double size, double *A, int stride) {
         double *row = A + (size_t)(2 * p + b) * stride + 2 * p;
         for (int j = b; j < n + DOUBLES; j++) row[j] = j == b;
         if (b >= k->bones) continue; /* No bone: x = 0. */
+        const int *ends = k->ends + 2 * b;
         const double *known = k->lengths + 2 * b, *along = k->along + (size_t)3 * p * b;
-        double spread = size * known[1], missing = size * known[0] - k->edges[4 * b + 3];
+        const double *g = k->edges + 4 * b;
+        double spread = size * known[1], missing = size * known[0] - g[3];
+        for (int r = 0; r < 3; r++) missing += g[r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
         for (int c = b; c < k->bones; c++) {
-            const int *ends = k->ends + 2 * c;
-            const double *g = k->edges + 4 * c;
+            const int *others = k->ends + 2 * c;
+            const double *h = k->edges + 4 * c;
             row[c] = size * size * known[0] * k->lengths[2 * c];
-            for (int r = 0; r < 3; r++) row[c] += g[r] * (along[r * p + ends[0]] - along[r * p + ends[1]]);
+            for (int r = 0; r < 3; r++) row[c] += h[r] * (along[r * p + others[0]] - along[r * p + others[1]]);
         }
         row[b] += spread * spread + 1e-12 * k->unknown;
-        const int *ends = k->ends + 2 * b;
-        for (int r = 0; r < 3; r++)
-            missing += k->edges[4 * b + r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
         row[n] = missing;
     }
 }
