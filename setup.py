@@ -33,7 +33,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),
         (f"{SHARE}/launch", glob("launch/*.launch.py")),
-        (f"{SHARE}/config", glob("config/*.yaml") + glob("config/*.rviz")),
+        (f"{SHARE}/config", glob("config/*.*")),
         (f"{SHARE}/config/objects", glob("config/objects/*.yaml")),
         (f"{SHARE}/config/security", glob("config/security/*.xml")),
         (f"{SHARE}/config/mappings", glob("config/mappings/*.yaml")),

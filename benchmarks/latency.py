@@ -35,7 +35,7 @@ class Size(NamedTuple):
     starts: int
 
 
-WHOLE = Size((30.0, 100.0, 500.0), (1, 5, 20), 3, 5.0, 12, 5)
+WHOLE = Size((30.0, 100.0, 500.0), (1, 5, 20), 3, 5.0, 12, 15)
 QUICK = Size((100.0,), (1,), 1, 0.2, 2, 1)
 
 
@@ -167,7 +167,7 @@ def start(size: Size, folder: Path) -> Table:
         ("start s", "memory MB"),
         {
             "start s": "from the start of the process to its first answer, the median of "
-            f"{size.starts}, by turns",
+            f"{size.starts}, by turns; the client says ten times a second that it is there",
             "memory MB": "resident, after some messages, the median of the same",
             RATIO: "of the row lifter to the row relay",
         },

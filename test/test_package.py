@@ -128,7 +128,7 @@ def test_share_has_what_the_source_has(prefix):
     assert (share / "package.xml").read_bytes() == (ROOT / "package.xml").read_bytes()
     for folder, patterns in {
         "launch": ["*.launch.py"],
-        "config": ["*.yaml", "*.rviz"],
+        "config": ["*.yaml", "*.rviz", "*.xml"],
         "config/objects": ["*.yaml"],
         "config/security": ["*.xml"],
         "config/mappings": ["*.yaml"],

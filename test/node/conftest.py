@@ -36,6 +36,7 @@ from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 
 DEADLINE = float(os.environ.get("DEADLINE", "60"))  # seconds; a busy machine may want more
+PROMPT_DISCOVERY = Path(__file__).parents[2] / "config" / "prompt_discovery.xml"
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 ENDINGS: dict[str, list[tuple[int, float, float]]] = defaultdict(list)
@@ -57,6 +58,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Give the test a DDS domain that no other test on this machine has."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROMPT_DISCOVERY))
     for number in random.sample(range(1, 102), 101):
         path = Path(tempfile.gettempdir()) / f"ros_domain_{number}_in_test.lock"
         with path.open("w") as lock:
