@@ -177,6 +177,7 @@ def started(
     domain = fresh_domain()
     client = Client(name, domain)
     os.environ["ROS_DOMAIN_ID"] = str(domain)
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # what pip installs is compiled: so be this
     try:
         began = time.perf_counter()
         with node(module, own | dict(parameters or {}), folder / f"{what}.log") as process:
