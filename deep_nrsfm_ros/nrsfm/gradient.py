@@ -7,10 +7,12 @@ recipe does not use take torch's own gradient.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective
+from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective, Task
 from deep_nrsfm_ros.nrsfm.network import (
     Network,
     decode,
@@ -19,32 +21,54 @@ from deep_nrsfm_ros.nrsfm.network import (
     unwhiten,
     whiten,
 )
+from deep_nrsfm_ros.nrsfm.recording import Recorded
 
 
-def descend(
-    objective: Objective,
-    net: Network,
-    frames: Frames,
-    known: Tensor | None,
-    generator: torch.Generator,
-) -> tuple[Losses, list[Tensor]]:
-    """Return the losses, as the objective does, and the gradients of their total.
+class Descent:
+    """Losses of batches and their gradients, for one objective and one kind of network."""
 
-    The gradients are by what the network has learned, in the order of `Network.learned`.
-    """
-    if not net.architecture.usual:
-        return _by_torch(objective, net, frames, known, generator)
-    with torch.inference_mode():
-        task = objective.task(net, frames, known, generator)
+    def __init__(self, objective: Objective, net: Network) -> None:
+        """Prepare for networks like `net`."""
+        self._objective, self._architecture = objective, net.architecture
+        self._names = [name for name, _ in net.named()]
+        # What the layout knows of the object has its gradient from torch, which no record keeps.
+        self._answer = self._answer_of if objective.anatomy else Recorded(self._answer_of)
+
+    def __call__(
+        self, net: Network, frames: Frames, known: Tensor | None, generator: torch.Generator
+    ) -> tuple[Losses, Tensor]:
+        """Return the losses, as the objective does, and the gradient (n,) of their total.
+
+        The gradient is by what the network has learned, in the order of `Network.learned`.
+        """
+        if not net.architecture.usual:
+            return _by_torch(self._objective, net, frames, known, generator)
+        with torch.inference_mode():
+            task = self._objective.task(net, frames, known, generator)
+            tensors = (*(weight for _, weight in net.named()), *task.given())
+            *losses, gradient = self._answer(*tensors)
+            return Losses(*losses), gradient
+
+    def _answer_of(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """Return losses and gradient of a network's weights and a task, all of it tensors."""
+        n = len(self._names)
+        weights = dict(zip(self._names, tensors[:n], strict=True))
+        net, task = Network.from_named(self._architecture, weights), Task(*tensors[n:])
         Psi = encode(net, task.x)
         psi_n, M = recover(net, Psi[-1])
         S, psi = decode(net, psi_n)
-        left = objective.differences(net, task, S, M)
-        S_bar, M_bar = objective.gradient(net, task, S, M, left)
+        left = self._objective.differences(net, task, S, M)
+        S_bar, M_bar = self._objective.gradient(net, task, S, M, left)
         D_bar, b__bar, psi_bar = _through_decoder(net, psi, S_bar)
         heads_bar, Psi_bar = _through_recovery(net, Psi[-1], M, psi_bar, M_bar)
         b_bar = _through_encoder(net, task.x, Psi, Psi_bar, D_bar)
-        return objective.losses(net, S, M, left), [*D_bar, *b_bar, *b__bar, *heads_bar]
+        gradient = _joined([*D_bar, *b_bar, *b__bar, *heads_bar])
+        return *self._objective.losses(net, S, M, left), gradient
+
+
+def _joined(bars: Sequence[Tensor]) -> Tensor:
+    """Return gradients by several weights as one vector."""
+    return torch.cat([bar.flatten() for bar in bars])
 
 
 def _by_torch(
@@ -53,14 +77,14 @@ def _by_torch(
     frames: Frames,
     known: Tensor | None,
     generator: torch.Generator,
-) -> tuple[Losses, list[Tensor]]:
-    """Return what `descend` does, by torch's autograd."""
+) -> tuple[Losses, Tensor]:
+    """Return what a `Descent` does, by torch's autograd."""
     weights = {name: weight.detach() for name, weight in net.named()}
     learned = [weights[name].requires_grad_() for name, _ in net.learned()]
     net = Network.from_named(net.architecture, weights)
     losses = objective(net, frames, known, generator)
     bars = torch.autograd.grad(losses.total, learned, materialize_grads=True)
-    return Losses(*(term.detach() for term in losses)), list(bars)
+    return Losses(*(term.detach() for term in losses)), _joined(bars)
 
 
 def _through_decoder(

@@ -41,7 +41,11 @@ class Task(NamedTuple):
     x: Tensor  # (b + c, p, 2) input: b frames, then c known shapes by random cameras
     W: Tensor  # (b, p, 2) what S M of the frames should be, centred on the visible points
     mask: Tensor  # (b, p, 1)
-    T: Tensor | None  # (c, p, 3) the known shapes
+    T: Tensor | None = None  # (c, p, 3) the known shapes
+
+    def given(self) -> list[Tensor]:
+        """Return what there is of it, of which `Task` makes it again."""
+        return [part for part in self if part is not None]
 
 
 class Relative(NamedTuple):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
 from deep_nrsfm_ros.nrsfm.distributed import ALONE, Team
-from deep_nrsfm_ros.nrsfm.gradient import descend
+from deep_nrsfm_ros.nrsfm.gradient import Descent
 from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
 from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
@@ -71,6 +71,7 @@ class Trainer:
         self.net = self._views()
         self.optimiser = torch.optim.Adam([self.weights], lr=recipe.learning_rate, fused=True)
         self.objective = Objective(normaliser, recipe, anatomy=anatomy)
+        self.descent = Descent(self.objective, self.net)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)
@@ -104,11 +105,11 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.preset.recipe, self.step, self.time_gone)
         batch = self.sample(self.batch, self.step)
-        losses, bars = descend(self.objective, self.net, batch, self.shapes, self.generator)
+        losses, gradient = self.descent(self.net, batch, self.shapes, self.generator)
         self.shapes = losses.shapes
-        gradient = torch.cat([bar.flatten() for bar in bars])
         if self.team.size > 1:
-            self.team.total(gradient.mul_(self.batch / self.preset.recipe.batch))
+            gradient = gradient * (self.batch / self.preset.recipe.batch)
+            self.team.total(gradient)
         self.weights.grad = gradient
         self.optimiser.step()
         self.step += 1
