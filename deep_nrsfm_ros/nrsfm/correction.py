@@ -23,6 +23,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.blocks import blocks
 from deep_nrsfm_ros.nrsfm.bones import Bones, shares
 from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, random_cameras, rotation_from_camera
 
@@ -54,10 +55,11 @@ def correct(
     n, p, _ = S.shape
     noise = np.broadcast_to(noise, n)
     if n > _BLOCK:
-        blocks = (slice(i, i + _BLOCK) for i in range(0, n, _BLOCK))
-        return np.concatenate(
-            [correct(S[b], M[b], W[b], visible[b], covariance, noise[b], bones) for b in blocks]
+        parts = (
+            correct(S[b], M[b], W[b], visible[b], covariance, noise[b], bones)
+            for b in blocks(n, _BLOCK)
         )
+        return np.concatenate([*parts])
     M = (M if M.ndim == 4 else M[:, None]).astype(np.float64)
     H: Floats = np.zeros((n, p, 2, p, 3))
     H[:, range(p), :, range(p)] = np.broadcast_to(M, (n, p, 3, 2)).transpose(1, 0, 3, 2)

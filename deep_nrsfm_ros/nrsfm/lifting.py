@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.nrsfm.blocks import blocks
 from deep_nrsfm_ros.nrsfm.compiled import Kernel, fits
 from deep_nrsfm_ros.nrsfm.fitting import Constants, Fit, Float32
 from deep_nrsfm_ros.nrsfm.model_file import Model
@@ -153,10 +154,9 @@ def lift_all(
     on_progress: called with how many are done and how many there are.
     """
     parts = []
-    for start in range(0, len(points), _BLOCK) or (0,):
-        end = min(start + _BLOCK, len(points))
-        parts.append(lifter(points[start:end], confidence[start:end]))
-        on_progress(end, len(points))
+    for part in blocks(len(points), _BLOCK) or [slice(0)]:
+        parts.append(lifter(points[part], confidence[part]))
+        on_progress(part.stop, len(points))
     return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 

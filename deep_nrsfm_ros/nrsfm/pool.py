@@ -10,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from deep_nrsfm_ros.nrsfm.blocks import blocks
 from deep_nrsfm_ros.nrsfm.losses import Frames
-
-_BLOCK = 4096  # frames
 
 
 @dataclass(frozen=True)
@@ -53,6 +52,5 @@ class Pool:
         return Frames(self.points[frames].where(visible, 0.0), visible.float())
 
     def blocks(self) -> Iterator[Frames]:
-        """Yield all usable frames, some at a time."""
-        for start in range(0, len(self), _BLOCK):
-            yield self.batch(slice(start, start + _BLOCK))
+        """Return all usable frames, some at a time."""
+        return map(self.batch, blocks(len(self)))

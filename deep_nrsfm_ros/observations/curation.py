@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import check, option
+from deep_nrsfm_ros.nrsfm.blocks import blocks
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 from deep_nrsfm_ros.observations.outliers import find_outliers
 
 Bools = NDArray[np.bool_]
 
-_BLOCK = 4096  # frames looked at together
 _RECENT = 4  # kept frames that a frame is compared with: several objects may take turns
 _HOPELESS = 0.25  # share of a frame's visible points that may be outliers
 _EXAMPLES = 12  # worst frames that are kept for show
@@ -208,11 +208,11 @@ def novel(points: NDArray[np.float32], visible: Bools, least: float) -> Bools:
     """
     kept = np.zeros(len(points), bool)
     recent: deque[_Kept] = deque(maxlen=_RECENT)
-    for start in range(0, len(points), _BLOCK):
-        seen = visible[start : start + _BLOCK]
-        fitted = _fitted(points[start : start + _BLOCK], seen)
+    for part in blocks(len(points)):
+        seen = visible[part]
+        fitted = _fitted(points[part], seen)
         patterns = (int.from_bytes(row) for row in np.packbits(seen, 1))
-        for i, now, pattern in zip(range(start, len(points)), fitted, patterns, strict=False):
+        for i, now, pattern in zip(range(part.start, part.stop), fitted, patterns, strict=True):
             closest = least**2 * pattern.bit_count()
             for before in recent:
                 if pattern & ~before.pattern:

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.blocks import blocks
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
@@ -26,7 +28,6 @@ _QUIET = 0.5  # least typical deviation of a point: nothing within 6 % of the si
 _FREE = 100.0  # variance of where a frame is: the median that centres it is only a guess
 _MISSING = 1e6  # variance of a missing coordinate
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a standard normal vector in the plane
-_BLOCK = 4096  # frames judged together
 _LEAST = 4  # points of a frame that are never doubted
 
 
@@ -152,8 +153,7 @@ def find_outliers(
     """
     model = PointModel.fit(points, visible, threshold)
     outliers, worst = np.zeros_like(visible), np.zeros(len(points))
-    for start in range(0, len(points), _BLOCK):
-        part = slice(start, start + _BLOCK)
+    for part in blocks(len(points)):
         outliers[part], worst[part] = _judge(model, points[part], visible[part], threshold)
     return outliers, worst
 

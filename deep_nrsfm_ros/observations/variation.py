@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.nrsfm.blocks import blocks
 from deep_nrsfm_ros.nrsfm.geometry import on_one_line, polar
 from deep_nrsfm_ros.observations.ensemble import Ensemble
 
@@ -26,7 +27,6 @@ _NARROW = 20.0  # degrees of view span below which depth is hardly seen
 _STIFF = 0.02  # share of the extent beyond a rigid object that may be noise
 _RARELY = 0.01  # share of the frames below which a keypoint does not count
 _SAMPLE = 4000  # frames whose spectrum is looked at
-_BLOCK = 4096  # frames looked at together
 _ROUNDS = 10  # of filling missing points, for each rank
 
 
@@ -74,8 +74,7 @@ def examine(ensemble: Ensemble) -> Variation:
             "least 4, better 8; check the layout and lower --min-confidence",
         )
     lines = np.zeros(len(ensemble), bool)
-    for start in range(0, len(ensemble), _BLOCK):
-        part = slice(start, start + _BLOCK)
+    for part in blocks(len(ensemble)):
         seen_there = ensemble.visible[part][:, counts]
         lines[part] = on_one_line(ensemble.points[part][:, counts], seen_there)
     usable = (ensemble.visible[:, counts].sum(1) >= 3) & ~lines

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
 from deep_nrsfm_ros.nrsfm import pool as pools
+from deep_nrsfm_ros.nrsfm.blocks import blocks
 from deep_nrsfm_ros.nrsfm.pool import Pool
 
 F, P = 50, 4
@@ -48,7 +50,7 @@ def test_a_batch_has_the_usable_frames_and_zeros_for_missing_points(pool: Pool) 
 
 
 def test_blocks_are_all_usable_frames_once(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pools, "_BLOCK", 10)
+    monkeypatch.setattr(pools, "blocks", partial(blocks, size=10))
     parts = list(pool.blocks())
     assert [len(part.points) for part in parts] == [10, 10, 5]
     whole = pool.batch(slice(None))
