@@ -39,7 +39,7 @@ LOSSLESS = {
 """Parameters of a node that shall lose nothing."""
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 PROMPT_DISCOVERY = Path(__file__).parents[1] / "config" / "prompt_discovery.xml"
-"""What the client is read from: a start would else be 3 s longer or not, by luck (see there)."""
+"""By which the client makes itself known: else a start takes 3 s longer, or not, by luck."""
 
 
 class Played(NamedTuple):

@@ -21,7 +21,7 @@ from deep_nrsfm_ros.nrsfm.network import (
     unwhiten,
     whiten,
 )
-from deep_nrsfm_ros.nrsfm.recording import Recorded
+from deep_nrsfm_ros.nrsfm.tracing import Traced
 
 
 class Descent:
@@ -31,8 +31,8 @@ class Descent:
         """Prepare for networks like `net`."""
         self._objective, self._architecture = objective, net.architecture
         self._names = [name for name, _ in net.named()]
-        # What the layout knows of the object has its gradient from torch, which no record keeps.
-        self._answer = self._answer_of if objective.anatomy else Recorded(self._answer_of)
+        # What the layout knows of the object has its gradient from torch, which no trace keeps.
+        self._answer = self._answer_of if objective.anatomy else Traced(self._answer_of)
 
     def __call__(
         self, net: Network, frames: Frames, known: Tensor | None, generator: torch.Generator

@@ -1,4 +1,4 @@
-"""A record does what the function does, to the last bit, without calling it."""
+"""A trace does what the function does, to the last bit, without calling it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from deep_nrsfm_ros.nrsfm import recording
+from deep_nrsfm_ros.nrsfm import tracing
 from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
 from deep_nrsfm_ros.nrsfm.keypoints import CMU31
 from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Anatomy
-from deep_nrsfm_ros.nrsfm.recording import Recorded
+from deep_nrsfm_ros.nrsfm.tracing import Traced
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
 
 STEPS = 6
@@ -31,27 +31,27 @@ class Counted:
         return (x @ y).relu_(), (x + y.mT).sum(0) / len(x)
 
 
-def test_a_record_takes_over_and_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording, "OFTEN", 2)
+def test_a_trace_takes_over_and_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracing, "OFTEN", 2)
     function = Counted()
-    recorded = Recorded(function.call)
+    traced = Traced(function.call)
     for i in range(5):
         for rows in (3, 7):
             given = torch.randn(rows, 4), torch.randn(4, rows)
             expected = Counted().call(*given)
-            for found, wanted in zip(recorded(*given), expected, strict=True):
+            for found, wanted in zip(traced(*given), expected, strict=True):
                 assert torch.equal(found, wanted)
-        # Twice by itself, once for the record, of each number of rows.
+        # Twice by itself, once for the trace, of each number of rows.
         assert function.calls == 2 * min(i + 1, 3)
 
 
-def test_a_torch_without_records_does_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording, "OFTEN", 0)
+def test_a_torch_without_traces_does_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracing, "OFTEN", 0)
     monkeypatch.delattr(torch.jit, "trace")
     function = Counted()
-    recorded = Recorded(function.call)
+    traced = Traced(function.call)
     for _ in range(3):
-        recorded(torch.ones(2, 2), torch.ones(2, 2))
+        traced(torch.ones(2, 2), torch.ones(2, 2))
     assert function.calls == 3
 
 
@@ -69,7 +69,7 @@ def test_a_training_is_the_same_to_the_last_bit(
     anatomy = AnatomyLoss(Anatomy(bones=1.0, flat=0.1), CMU31) if known_object else None
 
     def weights(often: int) -> Tensor:
-        monkeypatch.setattr(recording, "OFTEN", often)
+        monkeypatch.setattr(tracing, "OFTEN", often)
         trainer = Trainer(
             Pool.of(points, visible), preset._replace(recipe=recipe), 0, anatomy=anatomy
         )
