@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 OFTEN = 100
-"""Calls after which a function is traced: that takes as long as some hundred and fifty calls save."""
+"""Calls after which a function is traced: that costs what some hundred and fifty calls save."""
 
 Function = Callable[..., tuple[Tensor, ...]]
 
