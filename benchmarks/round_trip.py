@@ -6,7 +6,6 @@ never hear each other.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
@@ -23,7 +22,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
-from benchmarks.speed import fresh_domain
+from benchmarks.speed import environment, fresh_domain
 from deep_nrsfm_ros.commands.demo.client import node
 from deep_nrsfm_ros.node.publishing import point_cloud
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
@@ -37,7 +36,6 @@ LOSSLESS = {
     "qos_overrides./keypoints.subscription.history": "keep_all",
 }
 """Parameters of a node that shall lose nothing."""
-PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
 PROMPT_DISCOVERY = Path(__file__).parents[1] / "config" / "prompt_discovery.xml"
 """By which the client makes itself known: else a start takes 3 s longer, or not, by luck."""
 
@@ -70,15 +68,15 @@ class Client:
 
     def __init__(self, name: str, domain: int) -> None:
         """Talk to the node called `name` in a domain."""
-        os.environ[PROFILES] = str(PROMPT_DISCOVERY)
         self._context = rclpy.Context()
         rclpy.init(
             context=self._context,
             domain_id=domain,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self._node = rclpy.create_node(f"client_of_{name}", context=self._context)
-        del os.environ[PROFILES]  # the node that is measured is as its users have it
+        # For the client alone: the node that is measured is as its users have it.
+        with environment(FASTRTPS_DEFAULT_PROFILES_FILE=str(PROMPT_DISCOVERY)):
+            self._node = rclpy.create_node(f"client_of_{name}", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._publisher = self._node.create_publisher(PointCloud2, "keypoints", KEEP_ALL)
@@ -176,11 +174,12 @@ def started(
     module, name, own = NODES[what]
     domain = fresh_domain()
     client = Client(name, domain)
-    os.environ["ROS_DOMAIN_ID"] = str(domain)
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # what pip installs is compiled: so be this
+    # What pip installs is compiled: so be this.
+    variables = {"ROS_DOMAIN_ID": str(domain), "PYTHONDONTWRITEBYTECODE": None}
     try:
-        began = time.perf_counter()
-        with node(module, own | dict(parameters or {}), folder / f"{what}.log") as process:
-            yield Contender(process, client, client.meet(raw) - began)
+        with environment(**variables):
+            began = time.perf_counter()
+            with node(module, own | dict(parameters or {}), folder / f"{what}.log") as process:
+                yield Contender(process, client, client.meet(raw) - began)
     finally:
         client.close()

@@ -11,7 +11,8 @@ import os
 import random
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,25 @@ def fresh_domain(*others: int) -> int:
     """Return a DDS domain at random, none of the others; let nothing leave this machine."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     return random.choice([number for number in range(1, 102) if number not in others])
+
+
+@contextmanager
+def environment(**values: str | None) -> Iterator[None]:
+    """Set variables of this process, and of those that it starts, for a while; None: unset."""
+    before = {name: os.environ.get(name) for name in values}
+    _set_variables(values)
+    try:
+        yield
+    finally:
+        _set_variables(before)
+
+
+def _set_variables(values: Mapping[str, str | None]) -> None:
+    for name, value in values.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
 
 
 def arguments(description: str | None) -> argparse.ArgumentParser:

@@ -55,11 +55,11 @@ def correct(
     n, p, _ = S.shape
     noise = np.broadcast_to(noise, n)
     if n > _BLOCK:
-        parts = (
+        parts = [
             correct(S[b], M[b], W[b], visible[b], covariance, noise[b], bones)
             for b in blocks(n, _BLOCK)
-        )
-        return np.concatenate([*parts])
+        ]
+        return np.concatenate(parts)
     M = (M if M.ndim == 4 else M[:, None]).astype(np.float64)
     H: Floats = np.zeros((n, p, 2, p, 3))
     H[:, range(p), :, range(p)] = np.broadcast_to(M, (n, p, 3, 2)).transpose(1, 0, 3, 2)

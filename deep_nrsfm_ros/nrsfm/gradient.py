@@ -7,7 +7,7 @@ recipe does not use take torch's own gradient.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -62,13 +62,13 @@ class Descent:
         D_bar, b__bar, psi_bar = _through_decoder(net, psi, S_bar)
         heads_bar, Psi_bar = _through_recovery(net, Psi[-1], M, psi_bar, M_bar)
         b_bar = _through_encoder(net, task.x, Psi, Psi_bar, D_bar)
-        gradient = _joined([*D_bar, *b_bar, *b__bar, *heads_bar])
+        gradient = joined([*D_bar, *b_bar, *b__bar, *heads_bar])
         return *self._objective.losses(net, S, M, left), gradient
 
 
-def _joined(bars: Sequence[Tensor]) -> Tensor:
-    """Return gradients by several weights as one vector."""
-    return torch.cat([bar.flatten() for bar in bars])
+def joined(parts: Iterable[Tensor]) -> Tensor:
+    """Return weights, or gradients by them, as one vector."""
+    return torch.cat([part.flatten() for part in parts])
 
 
 def _by_torch(
@@ -84,7 +84,7 @@ def _by_torch(
     net = Network.from_named(net.architecture, weights)
     losses = objective(net, frames, known, generator)
     bars = torch.autograd.grad(losses.total, learned, materialize_grads=True)
-    return Losses(*(term.detach() for term in losses)), _joined(bars)
+    return Losses(*(term.detach() for term in losses)), joined(bars)
 
 
 def _through_decoder(

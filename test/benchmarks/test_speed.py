@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import os
 import random
 from pathlib import Path
 from types import ModuleType
@@ -212,3 +213,12 @@ def test_domains_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     random.seed(0)
     assert speed.fresh_domain(*range(1, 101)) == 101
+
+
+def test_variables_are_as_they_were_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("THERE", "before")
+    monkeypatch.delenv("NEW", raising=False)
+    with pytest.raises(ZeroDivisionError), speed.environment(THERE=None, NEW="now"):
+        assert "THERE" not in os.environ and os.environ["NEW"] == "now"
+        raise ZeroDivisionError
+    assert os.environ["THERE"] == "before" and "NEW" not in os.environ

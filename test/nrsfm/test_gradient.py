@@ -43,9 +43,11 @@ def task(p: int, seed: int) -> tuple[Frames, torch.Tensor]:
     return Frames(points * mask, mask), known - known.mean(1, keepdim=True)
 
 
-def parts(net: Network, gradient: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Return the gradient by each weight."""
-    return gradient.split([weight.numel() for _, weight in net.learned()])
+def parts(net: Network, gradient: torch.Tensor) -> list[torch.Tensor]:
+    """Return the gradient by each weight, in its shape."""
+    weights = [weight for _, weight in net.learned()]
+    bars = gradient.split([weight.numel() for weight in weights])
+    return [bar.view(weight.shape) for bar, weight in zip(bars, weights, strict=True)]
 
 
 @some
@@ -91,7 +93,8 @@ def test_it_is_the_gradient_that_torch_finds(
     for ours, theirs in zip(losses, expected, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
     bars = zip(net.learned(), parts(net, gradient), parts(net, by_torch), strict=True)
-    for (name, _), ours, theirs in bars:
+    for (name, weight), ours, theirs in bars:
+        assert ours.shape == weight.shape
         torch.testing.assert_close(ours, theirs, rtol=1e-7, atol=1e-7, msg=name)
 
 
@@ -105,7 +108,7 @@ def test_every_option_has_a_gradient() -> None:
         torch.testing.assert_close(losses.total, expected.total)
         heads = {"code_head", "camera_head"} if "closed_form" in options else set()
         for (name, weight), bar in zip(net.learned(), parts(net, gradient), strict=True):
-            assert bool(bar.any()) == (name not in heads), name
+            assert bar.shape == weight.shape and bool(bar.any()) == (name not in heads), name
             assert not weight.requires_grad
 
 
