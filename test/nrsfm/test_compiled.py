@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -26,6 +27,15 @@ pytestmark = pytest.mark.skipif(
 NUMBERED = KeypointLayout("five", tuple("abcde"))
 MORE_THAN_A_BLOCK = 7  # objects, of those that the kernel takes together, at four or five turns
 ONE_LINE = np.outer(np.arange(17), [3, 4]).astype(np.float32)
+
+
+@pytest.fixture(params=[16, 32, 64], autouse=True)
+def vectors(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Try vectors of all lengths, as far as the processor has them."""
+    if _kernel.choose_vectors(request.param) != request.param:
+        pytest.skip(f"this processor has no vectors of {request.param} bytes")
+    yield
+    _kernel.choose_vectors(64)
 
 
 def model(
@@ -59,7 +69,11 @@ def objects(
     return points, confidence
 
 
-@settings(max_examples=60, deadline=None)
+# The vectors are the same for all examples of a test.
+each_vectors = [HealthCheck.function_scoped_fixture]
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=each_vectors)
 @given(
     seed=st.integers(0, 2**32 - 1),
     layout=st.sampled_from([HUMAN17, NUMBERED]),
@@ -107,7 +121,7 @@ def test_lifts_as_numpy_does(
             np.testing.assert_allclose(ours, numpy, rtol=0, atol=1e-4 * size + unsure + 1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, suppress_health_check=each_vectors)
 @given(
     seed=st.integers(0, 2**32 - 1),
     layout=st.sampled_from([HUMAN17, NUMBERED]),

@@ -12,7 +12,26 @@
 #define FOR(name) name##_avx2
 #define TARGET AVX2
 #include "vectors.h"
+#define BYTES 64
+#define FOR(name) name##_avx512
+#define TARGET AVX512
+#define FOUR(name) name##_avx2
+#include "vectors.h"
 #endif
+
+int vector_bytes = 16;
+
+int choose_vectors(int bytes) {
+    vector_bytes = 16;
+#ifdef __x86_64__
+    if (bytes >= 32 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) vector_bytes = 32;
+    if (bytes >= 64 && vector_bytes == 32 && __builtin_cpu_supports("avx512f") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512vl"))
+        vector_bytes = 64;
+#endif
+    return vector_bytes;
+}
 
 void product(int rows, const float *X, int stride, Matrix A, const float *b, int relu, float *out) {
     CHOSEN(product)(rows, X, stride, A, b, relu, out);

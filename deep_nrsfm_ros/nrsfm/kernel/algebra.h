@@ -10,25 +10,31 @@
 #define FLOATS_OF(n) (((n) + FLOATS - 1) / FLOATS * FLOATS)
 #define DOUBLES_OF(n) (((n) + DOUBLES - 1) / DOUBLES * DOUBLES)
 
-/* Of the function `name`, the one for this processor. */
+/* Take vectors of 64, 32 or 16 bytes, or of the next fewer that this processor has; return of how many. */
+int choose_vectors(int bytes);
+extern int vector_bytes;
+
+/* Of the function `name`, the one for these vectors. */
 #ifdef __x86_64__
 #define AVX2 __attribute__((target("avx2,fma")))
+#define AVX512 __attribute__((target("avx512f,avx512dq,avx512bw,avx512vl,avx2,fma")))
 #define CHOSEN(name) \
-    (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") ? name##_avx2 : name##_anywhere)
+    (vector_bytes == 64 ? name##_avx512 : vector_bytes == 32 ? name##_avx2 : name##_anywhere)
 #else
 #define CHOSEN(name) name##_anywhere
 #endif
 
-/* Define `name`, whose plain loops are `name_inline`, for any processor and for those with AVX2. */
+/* Define `name`, whose plain loops are `name_inline`, for vectors of any length. */
 #define FAST(name, parameters, arguments)                               \
     static void name##_anywhere parameters { name##_inline arguments; } \
-    FAST_WITH_AVX2(name, parameters, arguments)                         \
+    FAST_ON_X86(name, parameters, arguments)                            \
     static void name parameters { CHOSEN(name) arguments; }
 #ifdef __x86_64__
-#define FAST_WITH_AVX2(name, parameters, arguments) \
-    AVX2 static void name##_avx2 parameters { name##_inline arguments; }
+#define FAST_ON_X86(name, parameters, arguments)                         \
+    AVX2 static void name##_avx2 parameters { name##_inline arguments; } \
+    AVX512 static void name##_avx512 parameters { name##_inline arguments; }
 #else
-#define FAST_WITH_AVX2(name, parameters, arguments)
+#define FAST_ON_X86(name, parameters, arguments)
 #endif
 #define INLINE static inline __attribute__((always_inline))
 

@@ -74,13 +74,22 @@ static PyObject *lift_objects(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_RETURN_NONE;
 }
 
+/* choose_vectors(bytes) -> bytes: for tests, which try them all. */
+static PyObject *choose(PyObject *Py_UNUSED(module), PyObject *bytes) {
+    long asked = PyLong_AsLong(bytes);
+    if (asked == -1 && PyErr_Occurred()) return NULL;
+    return PyLong_FromLong(choose_vectors(asked < 64 ? (int)asked : 64));
+}
+
 static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
                                 {"lift", lift_objects, METH_VARARGS, NULL},
+                                {"choose_vectors", choose, METH_O, NULL},
                                 {NULL, NULL, 0, NULL}};
 static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", NULL, -1, methods, NULL, NULL, NULL, NULL};
 
 PyMODINIT_FUNC PyInit__kernel(void) {
     PyObject *made = PyModule_Create(&module);
+    choose_vectors(64);
     if (made && (PyModule_AddIntMacro(made, FLOATS) || PyModule_AddIntMacro(made, DOUBLES)))
         Py_CLEAR(made);
     return made;

@@ -1,10 +1,12 @@
 /* `product` and `solve` for processors with vectors of BYTES; `algebra.c` includes it once for each.
 
-   FOR(name) is what `name` is called there, TARGET what the compiler needs to know.
+   FOR(name) is what `name` is called there, TARGET what the compiler needs to know. What is four doubles
+   wide takes vectors of 32 bytes at most: FOUR(name).
 */
 #define HERE TARGET static inline __attribute__((always_inline))
 #define A_PANEL (4 * FLOATS / BYTES) /* vectors of a panel's row */
 #define LANES (BYTES / 8)            /* doubles of a vector */
+#define ABREAST (BYTES == 64 ? 2 : 1) /* panels for which there are registers beside six rows */
 
 typedef float FOR(singles) __attribute__((vector_size(BYTES), aligned(4), may_alias));
 typedef int FOR(bits) __attribute__((vector_size(BYTES)));
@@ -43,9 +45,14 @@ HERE void FOR(tile)(const int rows, const int panels, const float *X, int stride
 TARGET static void FOR(product)(int rows, const float *X, int stride, Matrix A, const float *b,
                                 int relu, float *out) {
     int sixes = rows / 6 * 6;
-    for (int j = 0; j < A.n; j += FLOATS)
+    for (int j = 0, columns; j < A.n; j += columns) {
+        columns = j + ABREAST * FLOATS <= A.n ? ABREAST * FLOATS : FLOATS;
         for (int r = 0; r < sixes; r += 6)
-            FOR(tile)(6, 1, X + r * stride, stride, A, j, b, relu, out + (size_t)r * A.n);
+            if (columns == FLOATS)
+                FOR(tile)(6, 1, X + r * stride, stride, A, j, b, relu, out + (size_t)r * A.n);
+            else
+                FOR(tile)(6, 2, X + r * stride, stride, A, j, b, relu, out + (size_t)r * A.n);
+    }
     X += sixes * stride, out += (size_t)sixes * A.n, rows -= sixes;
     for (int done; rows > 0; rows -= done, X += done * stride, out += (size_t)done * A.n) {
         int j = 0;
@@ -92,6 +99,8 @@ HERE void FOR(eliminate)(const int vectors, int k, int stride, double *A, int j,
         }
 }
 
+#if BYTES < 64
+#define FOUR FOR
 /* The corner k ... k + 3 of U in place of A's, and one over its diagonal. */
 HERE void FOR(factor)(int k, int stride, double *A, double scale[4]) {
     FOR(doubles) corner[4][3];
@@ -107,22 +116,11 @@ HERE void FOR(factor)(int k, int stride, double *A, double scale[4]) {
     }
 }
 
-/* By Cholesky's U^T U = A, four rows at a time; y of U^T y = b comes out beside U. */
-TARGET static void FOR(solve)(int n, int done, int stride, double *A) {
+/* x of U x = y in place of y. */
+HERE void FOR(substitute)(int n, int stride, double *A) {
     typedef FOR(doubles) vector;
-    int wide = n + DOUBLES;
-    for (int k = 0; k < n; k += 4) {
-        int j = k < done ? done : k + 4;
-        double scale[4];
-        if (k < done)
-            for (int r = 0; r < 4; r++) scale[r] = 1 / A[(size_t)(k + r) * stride + k + r];
-        else
-            FOR(factor)(k, stride, A, scale);
-        for (; j + 3 * LANES <= wide; j += 3 * LANES) FOR(eliminate)(3, k, stride, A, j, scale);
-        for (; j < wide; j += LANES) FOR(eliminate)(1, k, stride, A, j, scale);
-    }
     for (int k = n - 4; k >= 0; k -= 4)
-        for (int c = n; c < wide; c += LANES) {
+        for (int c = n; c < n + DOUBLES; c += LANES) {
             vector x[4];
             for (int r = 0; r < 4; r++) x[r] = *(const vector *)(A + (size_t)(k + r) * stride + c);
             for (int j = k + 4; j < n; j++)
@@ -136,10 +134,30 @@ TARGET static void FOR(solve)(int n, int done, int stride, double *A) {
             }
         }
 }
+#endif
+
+/* By Cholesky's U^T U = A, four rows at a time; y of U^T y = b comes out beside U. */
+TARGET static void FOR(solve)(int n, int done, int stride, double *A) {
+    int wide = n + DOUBLES;
+    for (int k = 0; k < n; k += 4) {
+        int j = k < done ? done : k + 4;
+        double scale[4];
+        if (k < done)
+            for (int r = 0; r < 4; r++) scale[r] = 1 / A[(size_t)(k + r) * stride + k + r];
+        else
+            FOUR(factor)(k, stride, A, scale);
+        for (; j + 3 * LANES <= wide; j += 3 * LANES) FOR(eliminate)(3, k, stride, A, j, scale);
+        for (; j + LANES <= wide; j += LANES) FOR(eliminate)(1, k, stride, A, j, scale);
+        if (j < wide) FOUR(eliminate)(1, k, stride, A, j, scale);
+    }
+    FOUR(substitute)(n, stride, A);
+}
 
 #undef HERE
 #undef A_PANEL
 #undef LANES
+#undef ABREAST
 #undef BYTES
+#undef FOUR
 #undef FOR
 #undef TARGET
