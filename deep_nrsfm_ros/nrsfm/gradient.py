@@ -8,10 +8,12 @@ recipe does not use take torch's own gradient.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor
 
+from deep_nrsfm_ros.nrsfm.compiled_gradient import CompiledGradient, fits, torch_on_one_thread
 from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective, Task
 from deep_nrsfm_ros.nrsfm.network import (
     Network,
@@ -21,7 +23,6 @@ from deep_nrsfm_ros.nrsfm.network import (
     unwhiten,
     whiten,
 )
-from deep_nrsfm_ros.nrsfm.tracing import Traced
 
 
 class Descent:
@@ -29,10 +30,12 @@ class Descent:
 
     def __init__(self, objective: Objective, net: Network) -> None:
         """Prepare for networks like `net`."""
-        self._objective, self._architecture = objective, net.architecture
-        self._names = [name for name, _ in net.named()]
-        # What the layout knows of the object has its gradient from torch, which no trace keeps.
-        self._answer = self._answer_of if objective.anatomy else Traced(self._answer_of)
+        self._objective = objective
+        self._compiled = CompiledGradient(objective, net) if fits(objective, net) else None
+
+    def threads(self) -> AbstractContextManager[None]:
+        """Return a context in which whose threads of torch do not get in the way of a step."""
+        return torch_on_one_thread() if self._compiled else nullcontext()
 
     def __call__(
         self, net: Network, frames: Frames, known: Tensor | None, generator: torch.Generator
@@ -45,25 +48,23 @@ class Descent:
             return _by_torch(self._objective, net, frames, known, generator)
         with torch.inference_mode():
             task = self._objective.task(net, frames, known, generator)
-            tensors = (*(weight for _, weight in net.named()), *task.given())
-            *losses, gradient = self._answer(*tensors)
-            return Losses(*losses), gradient
+            if self._compiled:
+                return self._compiled(joined(weight for _, weight in net.learned()), task)
+            return written_out(self._objective, net, task)
 
-    def _answer_of(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """Return losses and gradient of a network's weights and a task, all of it tensors."""
-        n = len(self._names)
-        weights = dict(zip(self._names, tensors[:n], strict=True))
-        net, task = Network.from_named(self._architecture, weights), Task(*tensors[n:])
-        Psi = encode(net, task.x)
-        psi_n, M = recover(net, Psi[-1])
-        S, psi = decode(net, psi_n)
-        left = self._objective.differences(net, task, S, M)
-        S_bar, M_bar = self._objective.gradient(net, task, S, M, left)
-        D_bar, b__bar, psi_bar = _through_decoder(net, psi, S_bar)
-        heads_bar, Psi_bar = _through_recovery(net, Psi[-1], M, psi_bar, M_bar)
-        b_bar = _through_encoder(net, task.x, Psi, Psi_bar, D_bar)
-        gradient = joined([*D_bar, *b_bar, *b__bar, *heads_bar])
-        return *self._objective.losses(net, S, M, left), gradient
+
+def written_out(objective: Objective, net: Network, task: Task) -> tuple[Losses, Tensor]:
+    """Return the losses of an answer to a task and their gradient, as `Descent` does."""
+    Psi = encode(net, task.x)
+    psi_n, M = recover(net, Psi[-1])
+    S, psi = decode(net, psi_n)
+    left = objective.differences(net, task, S, M)
+    S_bar, M_bar = objective.gradient(net, task, S, M, left)
+    D_bar, b__bar, psi_bar = _through_decoder(net, psi, S_bar)
+    heads_bar, Psi_bar = _through_recovery(net, Psi[-1], M, psi_bar, M_bar)
+    b_bar = _through_encoder(net, task.x, Psi, Psi_bar, D_bar)
+    gradient = joined([*D_bar, *b_bar, *b__bar, *heads_bar])
+    return objective.losses(net, S, M, left), gradient
 
 
 def joined(parts: Iterable[Tensor]) -> Tensor:

@@ -43,10 +43,6 @@ class Task(NamedTuple):
     mask: Tensor  # (b, p, 1)
     T: Tensor | None = None  # (c, p, 3) the known shapes
 
-    def given(self) -> list[Tensor]:
-        """Return what there is of it, of which `Task` makes it again."""
-        return [part for part in self if part is not None]
-
 
 class Relative(NamedTuple):
     """||E|| / ||X|| of each of a batch."""

@@ -101,6 +101,10 @@ class Trainer:
 
     def advance(self) -> None:
         """Take one gradient step."""
+        with self.descent.threads():
+            self._advance()
+
+    def _advance(self) -> None:
         began = time.process_time()
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.preset.recipe, self.step, self.time_gone)

@@ -37,4 +37,8 @@ void product(int rows, const float *X, int stride, Matrix A, const float *b, int
     CHOSEN(product)(rows, X, stride, A, b, relu, out);
 }
 
+void accumulate(int n, int k, const float *X, int stride, int wide, const float *Y, float *out, int apart) {
+    CHOSEN(accumulate)(n, k, X, stride, wide, Y, out, apart);
+}
+
 void solve(int n, int done, int stride, double *A) { CHOSEN(solve)(n, done, stride, A); }

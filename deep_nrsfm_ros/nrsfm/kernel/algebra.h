@@ -48,6 +48,10 @@ typedef struct {
    `relu`: what is negative becomes 0. A row of out does not depend on how many there are. */
 void product(int rows, const float *X, int stride, Matrix A, const float *b, int relu, float *out);
 
+/* out (k, wide) += X^T Y for X (n, k) and Y (n, wide), wide a multiple of FLOATS; rows of X are `stride` apart,
+   those of out `apart`. */
+void accumulate(int n, int k, const float *X, int stride, int wide, const float *Y, float *out, int apart);
+
 /* Solve A x = b for a symmetric positive definite A (n, n), of which the upper half is read and spoilt.
 
    n is a multiple of DOUBLES. b (n, DOUBLES) stands beside A, as columns n, n + 1 ... of its rows, which

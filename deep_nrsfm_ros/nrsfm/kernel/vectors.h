@@ -69,6 +69,42 @@ TARGET static void FOR(product)(int rows, const float *X, int stride, Matrix A, 
     }
 }
 
+/* The part of out += X^T Y that is `rows`, columns of X, by `panels`, of Y; both constants where it is called. */
+HERE void FOR(outer)(const int rows, const int panels, int n, const float *X, int stride, const float *Y,
+                     int wide, float *out, int apart) {
+    typedef FOR(singles) vector;
+    vector sums[6][2 * A_PANEL];
+    for (int r = 0; r < rows; r++)
+        for (int h = 0; h < A_PANEL * panels; h++) sums[r][h] = ((vector *)(out + (size_t)r * apart))[h];
+    for (int i = 0; i < n; i++, X += stride, Y += wide)
+        for (int h = 0; h < A_PANEL * panels; h++) {
+            vector y = ((const vector *)Y)[h];
+            for (int r = 0; r < rows; r++) sums[r][h] += X[r] * y;
+        }
+    for (int r = 0; r < rows; r++)
+        for (int h = 0; h < A_PANEL * panels; h++) ((vector *)(out + (size_t)r * apart))[h] = sums[r][h];
+}
+
+/* Its part of so many panels. */
+HERE void FOR(stripe)(const int panels, int n, int k, const float *X, int stride, const float *Y, int wide,
+                      float *out, int apart) {
+    for (; k >= 6; k -= 6, X += 6, out += 6 * apart)
+        FOR(outer)(6, panels, n, X, stride, Y, wide, out, apart);
+    if (k >= 4) {
+        FOR(outer)(4, panels, n, X, stride, Y, wide, out, apart);
+        k -= 4, X += 4, out += 4 * apart;
+    }
+    for (; k > 0; k--, X++, out += apart) FOR(outer)(1, panels, n, X, stride, Y, wide, out, apart);
+}
+
+TARGET static void FOR(accumulate)(int n, int k, const float *X, int stride, int wide, const float *Y,
+                                   float *out, int apart) {
+    int j = 0;
+    for (; j + ABREAST * FLOATS <= wide; j += ABREAST * FLOATS)
+        FOR(stripe)(ABREAST, n, k, X, stride, Y + j, wide, out + j, apart);
+    if (j < wide) FOR(stripe)(1, n, k, X, stride, Y + j, wide, out + j, apart);
+}
+
 /* Columns j ... of rows k ... k + 3, less what the rows above have in them. */
 HERE void FOR(subtract)(const int vectors, int k, int stride, const double *A, int j,
                         FOR(doubles) left[4][3]) {
