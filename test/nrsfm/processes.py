@@ -65,6 +65,8 @@ def main(folder: Path) -> None:
     train(*data, team=team, checkpoint=file, on_step=lambda trainer: first.append(trainer.step))
     found |= {"resumed": torch.tensor(first[0]), "resumed_to": torch.tensor(first[-1])}
     team.leave()
+    names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
+    found["threads"] = torch.tensor(sum("gloo" in name for name in names))
     save_file(found, folder / f"{rank()}.safetensors")
 
 

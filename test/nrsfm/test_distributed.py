@@ -87,6 +87,12 @@ def test_all_stop_when_one_wants_to_and_all_go_on(found: list[dict[str, torch.Te
         assert part["resumed_to"] == PRESET.recipe.steps
 
 
+def test_who_leaves_has_no_thread_of_the_team_that_could_abort_it(
+    found: list[dict[str, torch.Tensor]],
+) -> None:
+    assert [int(part["threads"]) for part in found] == [0, 0]
+
+
 def test_shares_add_up() -> None:
     class Part(Team):
         def __init__(self, rank: int, size: int) -> None:
