@@ -32,6 +32,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
@@ -96,16 +97,11 @@ class LifterNode(Node):
         self._camera = CameraListener(self, camera)
         self._tf = Broadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._health = Health()
-        self._points = self.create_publisher(PointCloud2, "~/points", 10)
-        self._rotation = self.create_publisher(QuaternionStamped, "~/camera_rotation", 10)
-        rare = publishing.UNWATCHED
-        self._objects = self.create_publisher(
-            MultiDOFJointState, "~/objects", 10, event_callbacks=rare
-        )
-        self._markers = self.create_publisher(MarkerArray, "~/markers", 10, event_callbacks=rare)
-        self._diagnostics = self.create_publisher(
-            DiagnosticArray, "/diagnostics", 10, event_callbacks=rare
-        )
+        self._points = self._unwatched(PointCloud2, "~/points")
+        self._rotation = self._unwatched(QuaternionStamped, "~/camera_rotation")
+        self._objects = self._unwatched(MultiDOFJointState, "~/objects")
+        self._markers = self._unwatched(MarkerArray, "~/markers")
+        self._diagnostics = self._unwatched(DiagnosticArray, "/diagnostics")
         self._training = TrainingService(
             *(self, self._training_request, self._activate, self._fence.models_dir)
         )
@@ -121,6 +117,9 @@ class LifterNode(Node):
         )
         health = self._health
         self._listener = Listener(self, self._inputs, self._lift, health.unheard, health.missed)
+
+    def _unwatched(self, kind: type, topic: str) -> Publisher:
+        return self.create_publisher(kind, topic, 10, event_callbacks=publishing.UNWATCHED)
 
     def close(self) -> None:
         """End a training that runs."""

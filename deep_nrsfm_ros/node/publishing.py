@@ -28,7 +28,7 @@ from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP
 from deep_nrsfm_ros.observations.serialised import Header
 
 UNWATCHED = PublisherEventCallbacks(use_default_callbacks=False)
-"""For publishers beside the hot path: rclpy looks after two events of any other at every message.
+"""For publishers of the lifter: rclpy looks after two events of any other at every message.
 
 They would tell of a subscriber whose quality of service does not fit. Its own node tells it too.
 """

@@ -5,6 +5,7 @@ Functions that say `Array` use only operations that NumPy and torch share and wo
 
 from __future__ import annotations
 
+from math import hypot
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -191,20 +192,18 @@ def rotation_from_vector(v: Floats) -> Floats:
 
 def quaternion(R: Floats) -> Floats:
     """Return the unit quaternion (x, y, z, w), w >= 0, of one rotation matrix R (3, 3)."""
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()  # so few numbers cost less without NumPy
+    trace = a + e + i
     # The largest of the four squares is the pivot: the others would lose digits near zero.
-    diagonal = np.array([R[0, 0], R[1, 1], R[2, 2], R[0, 0] + R[1, 1] + R[2, 2]])
-    pivot = int(diagonal.argmax())
-    q = np.empty(4)
-    if pivot == 3:
-        q[:3] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-        q[3] = 1 + diagonal[3]
+    if trace >= max(a, e, i):
+        q = h - f, c - g, d - b, 1 + trace
+    elif a >= max(e, i):
+        q = 1 + 2 * a - trace, b + d, g + c, h - f
+    elif e >= i:
+        q = b + d, 1 + 2 * e - trace, f + h, c - g
     else:
-        i, j, k = pivot, (pivot + 1) % 3, (pivot + 2) % 3
-        q[i] = 1 + 2 * R[i, i] - diagonal[3]
-        q[j], q[k] = R[j, i] + R[i, j], R[k, i] + R[i, k]
-        q[3] = R[k, j] - R[j, k]
-    q /= np.linalg.norm(q) * (1 if q[3] >= 0 else -1)
-    return q
+        q = g + c, f + h, 1 + 2 * i - trace, d - b
+    return np.array(q) / (hypot(*q) if q[3] >= 0 else -hypot(*q))
 
 
 def rotation_from_quaternion(q: Floats) -> Floats:
