@@ -17,13 +17,15 @@ setup(
     package_data={
         NAME: ["py.typed", "nrsfm/*.pyi", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]
     },
-    # Optional: without a C compiler the lifter does the same in NumPy, some ten times slower.
+    # Optional: without a C compiler NumPy and torch do the same, some ten and three times slower.
     ext_modules=[
         Extension(
             f"{NAME}.nrsfm._kernel",
             glob(f"{NAME}/nrsfm/kernel/*.c"),
             depends=glob(f"{NAME}/nrsfm/kernel/*.h"),
-            extra_compile_args="-O3 -fno-math-errno -fno-trapping-math -fvisibility=hidden".split(),
+            extra_compile_args="-O3 -fno-math-errno -fno-trapping-math -fvisibility=hidden "
+            "-pthread".split(),
+            extra_link_args=["-pthread"],
             optional=True,
         )
     ],

@@ -2,11 +2,24 @@ from typing import Any
 
 FLOATS: int  # columns of a panel
 DOUBLES: int  # to a multiple of which rows of doubles are filled up
+MOST_LAYERS: int  # of a network
 
 def plan(header: Any, floats: Any, doubles: Any, /) -> object: ...
 def lift(
     plan: object, points: Any, confidence: Any, perspective: bool, /, *arrays: Any
 ) -> None: ...
-def descent(header: Any, L: Any, L_inverse: Any, /) -> object: ...
-def descend(descent: object, /, *arrays_and_cycle: Any) -> None: ...
+def workers(header: Any, L: Any, L_inverse: Any, /) -> object: ...
+def gradient(
+    workers: object,
+    weights: Any,
+    x: Any,
+    W: Any,
+    mask: Any,
+    T: Any,
+    cycle: float,
+    losses: Any,
+    shapes: Any,
+    gradient: Any,
+    /,
+) -> None: ...
 def choose_vectors(bytes: int, /) -> int: ...

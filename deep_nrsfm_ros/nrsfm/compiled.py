@@ -28,7 +28,8 @@ AVAILABLE = _kernel is not None
 
 def fits(network: Network) -> bool:
     """Tell whether there is a kernel, and it knows the network's options."""
-    return AVAILABLE and network.architecture.usual
+    options = network.architecture
+    return AVAILABLE and options.usual and len(options.widths) <= _kernel.MOST_LAYERS
 
 
 class Kernel:

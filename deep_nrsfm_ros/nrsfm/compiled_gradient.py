@@ -22,23 +22,25 @@ if compiled.AVAILABLE:
 
 _FRAMES_AT_A_TIME = 16  # so that their codes stay in the cache
 _LEAST_SHARE = 8  # frames of a thread: it also lays out all weights
+_MOST_WEIGHTS = 2_000_000  # that are read anew for every few frames; torch is faster beyond
 
 
 def fits(objective: Objective, net: Network) -> bool:
     """Tell whether there is a kernel, and it knows this loss and this network."""
     known = compiled.fits(net) and net.L.device.type == "cpu" and net.L.dtype == torch.float32
-    return known and objective.whitened and not objective.anatomy
+    small = sum(weight.numel() for _, weight in net.learned()) <= _MOST_WEIGHTS
+    return known and small and objective.whitened and not objective.anatomy
 
 
 class CompiledGradient:
     """The losses of one kind of network and their gradient, shared out to the threads of torch."""
 
-    def __init__(self, objective: Objective, net: Network) -> None:
-        """Prepare for networks like `net`."""
+    def __init__(self, objective: Objective, net: Network, batch: int) -> None:
+        """Prepare for networks like `net` and batches of so many frames, or about."""
         self._cycle, widths = objective.recipe.cycle, net.architecture.widths
-        threads = max(1, min(torch.get_num_threads(), objective.recipe.batch // _LEAST_SHARE))
+        threads = max(1, min(torch.get_num_threads(), batch // _LEAST_SHARE))
         header = [net.p, len(widths), bool(net.architecture.whitening), _FRAMES_AT_A_TIME, threads]
-        self._descent = _kernel.descent(
+        self._workers = _kernel.workers(
             np.array([*header, *widths], np.int32), *_arrays(net.L, net.L_inverse)
         )
 
@@ -50,12 +52,9 @@ class CompiledGradient:
         losses = np.empty(2)
         shapes, gradient = torch.empty((*task.W.shape[:2], 3)), torch.empty_like(weights)
         T = torch.empty(0) if task.T is None else task.T
-        _kernel.descend(
-            self._descent,
-            *_arrays(weights, task.x, task.W, task.mask, T),
-            *(self._cycle, losses),
-            *_arrays(shapes, gradient),
-        )
+        weights_, x, W, mask, T_ = _arrays(weights, task.x, task.W, task.mask, T)
+        out = losses, *_arrays(shapes, gradient)
+        _kernel.gradient(self._workers, weights_, x, W, mask, T_, self._cycle, *out)
         reprojection, cycle = torch.from_numpy(losses).float()
         return Losses(reprojection, cycle, reprojection + self._cycle * cycle, shapes), gradient
 

@@ -63,8 +63,8 @@ class _Torchrun(Team):
         import torch
         import torch.distributed
 
-        # Its functions keep, as their default, the group that there is when they are imported, as
-        # torch.optim does; the group's threads then outlive `leave`, and may abort the process.
+        # Its functions keep, as their default, the group that there is when they are imported, at
+        # the latest by torch.optim; its threads would outlive `leave`, and may abort the process.
         import torch.distributed.nn
 
         self._torch, self._group = torch, torch.distributed

@@ -28,13 +28,13 @@ from deep_nrsfm_ros.nrsfm.network import (
 class Descent:
     """Losses of batches and their gradients, for one objective and one kind of network."""
 
-    def __init__(self, objective: Objective, net: Network) -> None:
-        """Prepare for networks like `net`."""
+    def __init__(self, objective: Objective, net: Network, batch: int) -> None:
+        """Prepare for networks like `net` and batches of so many frames, or about."""
         self._objective = objective
-        self._compiled = CompiledGradient(objective, net) if fits(objective, net) else None
+        self._compiled = CompiledGradient(objective, net, batch) if fits(objective, net) else None
 
     def threads(self) -> AbstractContextManager[None]:
-        """Return a context in which whose threads of torch do not get in the way of a step."""
+        """Return a context to take steps in, where torch has the threads that suit them."""
         return torch_on_one_thread() if self._compiled else nullcontext()
 
     def __call__(

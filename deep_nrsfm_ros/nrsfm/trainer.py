@@ -25,7 +25,8 @@ class Trainer:
     """One initialisation in training: network, optimiser and step, all of it resumable.
 
     The randomness of a step depends on the seed and the step alone, so a training resumed from a
-    checkpoint goes on exactly as if it had not stopped. In a team it depends on the process too,
+    checkpoint goes on exactly as if it had not stopped, on as many threads of such a processor:
+    others add up in another order. In a team it depends on the process too,
     and all go on with the shapes of the first one's last batch.
     """
 
@@ -71,7 +72,7 @@ class Trainer:
         self.net = self._views()
         self.optimiser = torch.optim.Adam([self.weights], lr=recipe.learning_rate, fused=True)
         self.objective = Objective(normaliser, recipe, anatomy=anatomy)
-        self.descent = Descent(self.objective, self.net)
+        self.descent = Descent(self.objective, self.net, self.batch)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)

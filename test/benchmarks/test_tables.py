@@ -92,7 +92,8 @@ def test_nrsfm_on_cmu_has_the_papers_figures_beside_ours(data: Path, output: Pat
     assert found["paper: Deep NRSfM"]["point cm"] == "5.0638"
     assert found["paper: Deep NRSfM"]["proper %"] == ""
     ours = found["default recipe, back-projected"]
-    assert float(ours["shape %"]) <= float(ours["proper %"]) and float(ours["CPU min"]) > 0
+    assert float(ours["shape %"]) <= float(ours["proper %"])
+    assert 0 <= float(ours["CPU min"]) < 1
 
 
 def test_papers_table_is_whole() -> None:

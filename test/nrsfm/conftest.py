@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,17 @@ from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
 from deep_nrsfm_ros.nrsfm.training import train
+
+
+@pytest.fixture(params=[16, 32, 64])
+def vectors(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Try vectors of all lengths in the compiled kernel, as far as the processor has them."""
+    from deep_nrsfm_ros.nrsfm import _kernel
+
+    if _kernel.choose_vectors(request.param) != request.param:
+        pytest.skip(f"this processor has no vectors of {request.param} bytes")
+    yield
+    _kernel.choose_vectors(64)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -17,20 +17,11 @@ from deep_nrsfm_ros.nrsfm.compiled_gradient import CompiledGradient, fits, torch
 from deep_nrsfm_ros.nrsfm.gradient import written_out
 from deep_nrsfm_ros.nrsfm.keypoints import CMU31
 from deep_nrsfm_ros.nrsfm.losses import Objective, Task
-from deep_nrsfm_ros.nrsfm.network import Architecture, Network, initialise, whitening
+from deep_nrsfm_ros.nrsfm.network import Architecture, Network, encode, initialise, whitening
 from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
 from deep_nrsfm_ros.nrsfm.pool import Pool
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Anatomy, Recipe
 from deep_nrsfm_ros.nrsfm.trainer import Trainer
-
-
-@pytest.fixture(params=[16, 32, 64])
-def vectors(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Try vectors of all lengths, as far as the processor has them."""
-    if _kernel.choose_vectors(request.param) != request.param:
-        pytest.skip(f"this processor has no vectors of {request.param} bytes")
-    yield
-    _kernel.choose_vectors(64)
 
 
 @pytest.fixture(autouse=True)
@@ -70,13 +61,13 @@ def in_double(net: Network, task: Task) -> tuple[Network, Task]:
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
-    widths=st.lists(st.integers(1, 40), min_size=1, max_size=4).map(tuple),
-    p=st.integers(3, 35),
+    widths=st.lists(st.integers(1, 60), min_size=1, max_size=4).map(tuple),
+    p=st.integers(1, 35),
     frames=st.tuples(st.integers(1, 70), st.integers(0, 70)),
     missing=st.sampled_from([0.0, 0.3, 1.0]),
     exponent=st.sampled_from([0.0, 1.0]),
     cycle=st.sampled_from([0.0, 2.0]),
-    at_once=st.integers(1, 3),
+    at_once=st.integers(1, 5),
     seed=st.integers(0, 2**32 - 1),
 )
 def test_it_is_what_torch_finds(
@@ -95,17 +86,24 @@ def test_it_is_what_torch_finds(
     torch.set_num_threads(at_once)
     assert fits(objective, net)
     weights = gradient.joined(w for _, w in net.learned())
-    losses, found = CompiledGradient(objective, net)(weights, task)
+    losses, found = CompiledGradient(objective, net, frames[0])(weights, task)
     expected, exact = written_out(objective, *in_double(net, task))
-    # No more can be asked of single precision than torch gets by it.
-    _, by_torch = written_out(objective, net, task)
-    for name, ours, theirs in zip(losses._fields, losses, expected, strict=True):
-        size = max(1.0, float(theirs.abs().max()))
-        torch.testing.assert_close(
-            ours, theirs.float(), rtol=0, atol=1e-4 * size, msg=lambda text, n=name: f"{n}: {text}"
-        )
-    ours, theirs = ((grad - exact).norm() for grad in (found, by_torch))
-    assert ours <= 3 * theirs + 1e-5 * exact.norm() + 1e-9
+    size = torch.linalg.svdvals((encode(net, task.x)[-1] @ net.camera_head)[..., 0])
+    if (size[:, 1] < 1e-3 * size[:, 0]).any():
+        return  # no camera: any finite gradient will do, see `polar_gradient`
+    # Where the last digits of the input matter, no more can be asked of the last of the output.
+    generator = torch.Generator().manual_seed(seed)
+    noise = (1 + 1e-6 * torch.randn(task.x.shape, generator=generator) for _ in range(5))
+    moved = (in_double(net, task._replace(x=task.x * factor)) for factor in noise)
+    nearby = [written_out(objective, *near) for near in moved]
+
+    def check(ours: torch.Tensor, theirs: torch.Tensor, near: list[torch.Tensor]) -> None:
+        unsure = max(float((other - theirs).norm()) for other in near)
+        assert (ours - theirs).norm() <= 1e-4 * theirs.norm() + 10 * unsure + 1e-6
+
+    for i, (ours, theirs) in enumerate(zip(losses, expected, strict=True)):
+        check(ours, theirs, [other[i] for other, _ in nearby])
+    check(found, exact, [other for _, other in nearby])
 
 
 @pytest.mark.parametrize("name", ["default", "paper"])
@@ -164,7 +162,7 @@ def test_torch_has_its_threads_again() -> None:
 def test_arrays_that_do_not_fit_are_refused() -> None:
     net, objective = network((8, 4), 5, 1.0, 0), Objective(Normaliser(), Recipe())
     weights = gradient.joined(w for _, w in net.learned())
-    compiled_gradient, task = CompiledGradient(objective, net), random_task(5, 3, 2, 0.0, 0)
+    compiled_gradient, task = CompiledGradient(objective, net, 3), random_task(5, 3, 2, 0.0, 0)
     for given_weights, given_task in (
         (weights[1:], task),
         (weights, task._replace(T=None)),
@@ -182,7 +180,33 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         [0, 1, 1, 16, 1, 8],
     ):
         with pytest.raises(ValueError, match="not those of a network"):
-            _kernel.descent(np.array(header, np.int32), eye, eye)
+            _kernel.workers(np.array(header, np.int32), eye, eye)
     with pytest.raises(ValueError, match="not those of a network"):
-        _kernel.descent(np.array([5, 1, 1, 16, 1, 8], np.int32), eye[1:], eye)
-    assert _kernel.descent(np.array([5, 1, 1, 16, 1, 8], np.int32), eye, eye)
+        _kernel.workers(np.array([5, 1, 1, 16, 1, 8], np.int32), eye[1:], eye)
+    assert _kernel.workers(np.array([5, 1, 1, 16, 1, 8], np.int32), eye, eye)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0])
+@pytest.mark.parametrize("name", ["D.0", "D.1", "b.0", "b_.1", "code_head", "input"])
+def test_what_is_no_number_shows_and_is_gone_with_its_cause(
+    exponent: float, name: str, vectors: None
+) -> None:
+    net, objective = network((8, 4), 5, exponent, 0), Objective(Normaliser(), Recipe())
+    gradient_of, task = CompiledGradient(objective, net, 3), random_task(5, 3, 2, 0.0, 0)
+    weights, nan = gradient.joined(w for _, w in net.learned()), float("nan")
+    before, grad = gradient_of(weights, task)
+    parts = {key: w * nan if key == name else w for key, w in net.learned()}
+    seen = task._replace(x=task.x * nan, W=task.W * nan) if name == "input" else task
+    losses, _ = gradient_of(gradient.joined(parts.values()), seen)
+    assert losses.total.isnan()
+    after, again = gradient_of(weights, task)
+    assert torch.equal(after.total, before.total) and torch.equal(again, grad)
+
+
+def test_wide_and_deep_networks_are_left_to_torch() -> None:
+    objective = Objective(Normaliser(), Recipe())
+    assert fits(objective, network((512, 256), 31, 1.0, 0))
+    assert not fits(objective, network((1024,), 31, 1.0, 0))
+    most = _kernel.MOST_LAYERS
+    assert fits(objective, network((2,) * most, 5, 1.0, 0))
+    assert not fits(objective, network((2,) * (most + 1), 5, 1.0, 0))

@@ -86,7 +86,7 @@ def test_it_is_the_gradient_that_torch_finds(
         size = torch.linalg.svdvals((encode(net, x)[-1] @ net.camera_head)[..., 0])
         if (size[:, 1] < 0.05 * size[:, 0]).any() or not size.all():
             return  # hardly a camera: its gradient is large, and torch's own not exact
-        losses, gradient = Descent(objective, net)(net, frames, known, torch.Generator())
+        losses, gradient = Descent(objective, net, 5)(net, frames, known, torch.Generator())
         expected, by_torch = _by_torch(objective, net, frames, known, torch.Generator())
     finally:
         torch.set_default_dtype(torch.float32)
@@ -103,7 +103,7 @@ def test_every_option_has_a_gradient() -> None:
     frames, known = (Frames(*(x.float() for x in task(5, 0)[0])), task(5, 0)[1].float())
     for options in (("block",), ("relu", "closed_form"), ("relu", "learned", "free")):
         net = tensors(Architecture((6, 4), *options), 5, 0).map(torch.Tensor.float)
-        losses, gradient = Descent(objective, net)(net, frames, known, torch.Generator())
+        losses, gradient = Descent(objective, net, 5)(net, frames, known, torch.Generator())
         expected = objective(net, frames, known, torch.Generator())
         torch.testing.assert_close(losses.total, expected.total)
         heads = {"code_head", "camera_head"} if "closed_form" in options else set()

@@ -22,15 +22,15 @@
 int vector_bytes = 16;
 
 int choose_vectors(int bytes) {
-    vector_bytes = 16;
+    int most = 16;
 #ifdef __x86_64__
-    if (bytes >= 32 && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) vector_bytes = 32;
-    if (bytes >= 64 && vector_bytes == 32 && __builtin_cpu_supports("avx512f") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512vl"))
-        vector_bytes = 64;
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) most = 32;
+    if (most == 32 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl"))
+        most = 64;
 #endif
-    return vector_bytes;
+    int asked = bytes >= 64 ? 64 : bytes >= 32 ? 32 : 16;
+    return vector_bytes = asked < most ? asked : most;
 }
 
 void product(int rows, const float *X, int stride, Matrix A, const float *b, int relu, float *out) {

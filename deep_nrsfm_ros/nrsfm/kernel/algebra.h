@@ -4,6 +4,8 @@
 
 #include <stddef.h>
 
+#define MOST_LAYERS 64 /* of a network */
+
 /* Columns of matrices are filled up with zeros to a multiple of these. */
 #define FLOATS 16
 #define DOUBLES 4

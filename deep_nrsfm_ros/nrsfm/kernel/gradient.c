@@ -3,7 +3,7 @@
 #include <pthread.h>
 #include <string.h>
 
-#include "descent.h"
+#include "gradient.h"
 
 /* A part of the weights, as they are given: (rows, columns), neighbours so many numbers apart. */
 typedef struct {
@@ -55,7 +55,7 @@ static float *give(const Worker *workers, int n, const float *bar, int rows, int
     for (int i = 0; i < rows; i++, offset += apart, to += columns)
         for (int j = 0; j < columns; j++) {
             float sum = 0;
-            for (int w = 0; w < n; w++) sum += workers[w].bars[offset + j];
+            for (int worker = 0; worker < n; worker++) sum += workers[worker].bars[offset + j];
             to[j] = sum;
         }
     return to;
@@ -78,18 +78,18 @@ static void give_gradient(const Worker *w, int workers, float *to) {
 }
 
 /* sums (n) -= the rows of X (rows, n). */
-INLINE void subtract_inline(ptrdiff_t rows, ptrdiff_t n, const float *restrict X, float *restrict sums) {
+INLINE void subtract_rows_inline(ptrdiff_t rows, ptrdiff_t n, const float *restrict X, float *restrict sums) {
     for (ptrdiff_t i = 0; i < rows; i++)
         for (ptrdiff_t j = 0; j < n; j++) sums[j] -= X[i * n + j];
 }
-FAST(subtract, (ptrdiff_t rows, ptrdiff_t n, const float *X, float *sums), (rows, n, X, sums))
+FAST(subtract_rows, (ptrdiff_t rows, ptrdiff_t n, const float *X, float *sums), (rows, n, X, sums))
 
 /* Put 0 in `bar` (rows, n) where the result of a ReLU is none, and subtract its rows from `sums`. */
 INLINE void relu_gradient_inline(ptrdiff_t rows, ptrdiff_t n, const float *restrict result,
                                  float *restrict bar, float *restrict sums) {
     for (ptrdiff_t i = 0; i < rows; i++)
         for (ptrdiff_t j = 0; j < n; j++) {
-            float kept = result[i * n + j] > 0 ? bar[i * n + j] : 0;
+            float kept = result[i * n + j] <= 0 ? 0 : bar[i * n + j];
             bar[i * n + j] = kept;
             sums[j] -= kept;
         }
@@ -124,11 +124,11 @@ INLINE void dots_inline(ptrdiff_t rows, ptrdiff_t n, const float *restrict X, co
 }
 FAST(dots, (ptrdiff_t rows, ptrdiff_t n, const float *X, const float *x, float *by), (rows, n, X, x, by))
 
-/* network.py, with all codes kept. x: (n, p, 2). */
+/* network.py, x (n, p, 2): not as in network.c, whose shapes of turned objects need no codes but the last. */
 static void forward(Worker *w, int n, const float *x) {
     const Kind *kind = w->kind;
     const int p = kind->p, wide = kind->wide, layers = kind->layers, *filled = kind->filled;
-    float *rows = kind->whitened ? w->spare[0] : w->x, *by = w->spare[0];
+    float *rows = kind->whitened ? w->spare[0] : w->x;
     for (int row = 0; row < 2 * n; row++)
         for (int i = 0; i < p; i++) rows[row * wide + i] = x[2 * (row / 2 * p + i) + row % 2];
     if (kind->whitened) product(2 * n, rows, wide, w->L, NULL, 0, w->x);
@@ -136,9 +136,9 @@ static void forward(Worker *w, int n, const float *x) {
     for (int i = 1; i < layers; i++)
         product(6 * n, w->Psi[i - 1], filled[i - 1], w->encoder[i], w->b[i], 1, w->Psi[i]);
     const float *Psi = w->Psi[layers - 1];
-    dots(6 * n, filled[layers - 1], Psi, w->camera_head, by);
+    dots(6 * n, filled[layers - 1], Psi, w->camera_head, w->rows);
     for (int o = 0; o < n; o++) {
-        for (int row = 0; row < 6; row++) w->A[o][row % 3][row / 3] = by[6 * o + row];
+        for (int row = 0; row < 6; row++) w->A[o][row % 3][row / 3] = w->rows[6 * o + row];
         memcpy(w->M[o], w->A[o], sizeof(camera));
         polar(w->M[o]);
     }
@@ -156,7 +156,7 @@ static float *through_decoder(Worker *w, int n) {
     const int p = kind->p, wide = kind->wide, *filled = kind->filled;
     float *s_bar = w->S_bar, *bar = w->spare[0], *next = w->spare[1];
     if (kind->whitened) product(3 * n, w->S_bar, wide, w->L_inverse, NULL, 0, s_bar = w->spare[1]);
-    subtract(n, 3 * wide, s_bar, w->b__bar[0]);
+    subtract_rows(n, 3 * wide, s_bar, w->b__bar[0]);
     for (int r = 0; r < 3; r++)
         accumulate(n, p, s_bar + r * wide, 3 * wide, filled[0], w->psi[0], w->D_bar[0] + r * filled[0],
                    3 * filled[0]);
@@ -193,13 +193,12 @@ static void polar_gradient(camera A, camera R, camera R_bar, float by[6]) {
 static float *through_recovery(Worker *w, int n, float *psi_bar) {
     const int last = w->kind->layers - 1, filled = w->kind->filled[last];
     const float *Psi = w->Psi[last];
-    float *bar = psi_bar == w->spare[0] ? w->spare[1] : w->spare[0], *by = w->left;
+    float *bar = psi_bar == w->spare[0] ? w->spare[1] : w->spare[0], *by = w->rows;
     for (int o = 0; o < n; o++) polar_gradient(w->A[o], w->M[o], w->M_bar[o], by + 6 * o);
     accumulate(n, 6 * filled, Psi, 6 * filled, filled, psi_bar, w->code_bar, filled);
     combine(6 * n, filled, by, Psi, w->camera_bar);
     product(n, psi_bar, filled, w->code_back, NULL, 0, bar);
     spread(6 * n, filled, by, w->camera_head, bar);
-    memset(by, 0, 6 * n * sizeof(float));
     return bar;
 }
 
@@ -250,8 +249,8 @@ static void *work(void *given) {
     return NULL;
 }
 
-void descend(Worker *workers, int n, const float *weights, const Task *task, double losses[2], float *shapes,
-             float *gradient) {
+void gradient_of(Worker *workers, int n, const float *weights, const Task *task, double losses[2], float *shapes,
+                 float *gradient) {
     Share shares[n];
     pthread_t threads[n];
     int started[n];
@@ -331,6 +330,7 @@ size_t employ(Worker *w, const Kind *kind, char *at) {
     ROOM(w->left, float, 3 * n * wide)
     ROOM(w->weighed, float, 3 * n * wide)
     ROOM(w->target, float, 3 * n * wide)
+    ROOM(w->rows, float, 6 * n)
     ROOM(w->spare[0], float, n * widest)
     ROOM(w->spare[1], float, n * widest)
     ROOM(w->A, camera, n)

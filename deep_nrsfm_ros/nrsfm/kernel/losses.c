@@ -2,7 +2,7 @@
 #include <math.h>
 #include <string.h>
 
-#include "descent.h"
+#include "gradient.h"
 
 /* L X of the rows of X. */
 static const float *weigh(Worker *w, int rows, const float *X, float *out) {
@@ -28,14 +28,16 @@ static double frobenius(ptrdiff_t n, const float *X) {
 /* Put in place of n differences `left` (n, size) the gradient by them of the sum over n of `weight` ||L left|| /
    ||L target||; return that sum without its weight. */
 static double relative(Worker *w, int n, int rows, double weight) {
-    int size = rows * w->kind->wide;
+    int p = w->kind->p, wide = w->kind->wide, size = rows * wide;
     const float *target = weigh(w, n * rows, w->target, w->spare[0]);
     float *E = (float *)weigh(w, n * rows, w->left, w->weighed);
     double sum = 0;
     for (int o = 0; o < n; o++) {
         double error = frobenius(size, E + (size_t)o * size), extent = frobenius(size, target + (size_t)o * size);
         float scale = (float)(weight / (error * extent));
-        for (int j = 0; j < size; j++) E[(size_t)o * size + j] *= scale;
+        /* Not what fills them up: NaN would stay there. */
+        for (int row = o * rows; row < (o + 1) * rows; row++)
+            for (int i = 0; i < p; i++) E[row * wide + i] *= scale;
         sum += error / extent;
     }
     weigh(w, n * rows, E, w->left);
@@ -57,10 +59,10 @@ static void centre(int p, float *row) {
     for (int i = 0; i < p; i++) row[i] -= mean;
 }
 
-void frames_loss(Worker *w, const Task *task, ptrdiff_t at, int n, float *shapes) {
+void frames_loss(Worker *w, const Task *task, ptrdiff_t first, int n, float *shapes) {
     int p = w->kind->p, wide = w->kind->wide;
     for (int o = 0; o < n; o++) {
-        const float *W = task->W + 2 * p * (at + o), *mask = task->mask + p * (at + o), *S = w->S + 3 * wide * o;
+        const float *W = task->W + 2 * p * (first + o), *mask = task->mask + p * (first + o), *S = w->S + 3 * wide * o;
         for (int c = 0; c < 2; c++) {
             float *left = w->left + (2 * o + c) * wide, *target = w->target + (2 * o + c) * wide;
             float m[3] = {(float)w->M[o][0][c], (float)w->M[o][1][c], (float)w->M[o][2][c]};
@@ -72,16 +74,16 @@ void frames_loss(Worker *w, const Task *task, ptrdiff_t at, int n, float *shapes
             }
         }
         for (int r = 0; r < 3; r++) {
-            float m[2] = {(float)w->M[o][r][0], (float)w->M[o][r][1]}, *to = w->S_bar + (3 * o + r) * wide;
+            float m[2] = {(float)w->M[o][r][0], (float)w->M[o][r][1]}, *to = w->spare[0];
             const float *left = w->left + 2 * o * wide;
             for (int i = 0; i < p; i++) to[i] = S[r * wide + i] + m[0] * left[i] + m[1] * left[wide + i];
             centre(p, to);
-            for (int i = 0; i < p; i++) shapes[3 * (p * (at + o) + i) + r] = to[i];
+            for (int i = 0; i < p; i++) shapes[3 * (p * (first + o) + i) + r] = to[i];
         }
     }
     w->reprojection += relative(w, n, 2, 1.0 / task->b);
     for (int o = 0; o < n; o++) {
-        const float *mask = task->mask + p * (at + o), *S = w->S + 3 * wide * o;
+        const float *mask = task->mask + p * (first + o), *S = w->S + 3 * wide * o;
         float *bar = w->left + 2 * o * wide;
         for (int c = 0; c < 2; c++) {
             centre_visible(p, mask, bar + c * wide);
@@ -98,7 +100,7 @@ void frames_loss(Worker *w, const Task *task, ptrdiff_t at, int n, float *shapes
     }
 }
 
-void known_loss(Worker *w, const Task *task, ptrdiff_t at, int n) {
+void known_loss(Worker *w, const Task *task, ptrdiff_t first, int n) {
     int p = w->kind->p, wide = w->kind->wide;
     for (int o = 0; o < n; o++)
         for (int r = 0; r < 3; r++) {
@@ -106,7 +108,7 @@ void known_loss(Worker *w, const Task *task, ptrdiff_t at, int n) {
             memcpy(left, w->S + (3 * o + r) * wide, p * sizeof(float));
             centre(p, left);
             for (int i = 0; i < p; i++) {
-                target[i] = task->T[3 * (p * (at + o) + i) + r];
+                target[i] = task->T[3 * (p * (first + o) + i) + r];
                 left[i] -= target[i];
             }
         }

@@ -4,7 +4,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#include "descent.h"
+#include "gradient.h"
 #include "plan.h"
 
 #define LINE 64 /* bytes of the cache, at whose borders all parts begin */
@@ -81,18 +81,18 @@ typedef struct {
     int threads;
     char *memory;
     Worker *workers;
-} Descent;
+} Staff;
 
-static const char DESCENT[] = "deep_nrsfm_ros.nrsfm._kernel.descent";
+static const char STAFF[] = "deep_nrsfm_ros.nrsfm._kernel.workers";
 
 static void dismiss(PyObject *capsule) {
-    Descent *d = PyCapsule_GetPointer(capsule, DESCENT);
+    Staff *d = PyCapsule_GetPointer(capsule, STAFF);
     if (d) PyMem_Free(d->memory), PyMem_Free(d->workers), PyMem_Free(d);
 }
 
-/* descent(header int32, L, L_inverse float32) -> capsule; header: p, layers, whitened, frames at a time,
+/* workers(header int32, L, L_inverse float32) -> capsule; header: p, layers, whitened, frames at a time,
    threads, widths. */
-static PyObject *descent(PyObject *Py_UNUSED(module), PyObject *args) {
+static PyObject *workers(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_buffer parts[3];
     if (!PyArg_ParseTuple(args, "y*y*y*", &parts[0], &parts[1], &parts[2])) return NULL;
     const int *h = parts[0].buf;
@@ -100,7 +100,7 @@ static PyObject *descent(PyObject *Py_UNUSED(module), PyObject *args) {
     int sound = n > 5 && h[0] > 0 && h[1] > 0 && h[1] <= MOST_LAYERS && n == 5 + h[1] && h[3] > 0 && h[4] > 0;
     for (int i = 0; sound && i < h[1]; i++) sound = h[5 + i] > 0;
     for (int i = 1; i < 3; i++) sound = sound && parts[i].len == (Py_ssize_t)4 * h[0] * h[0];
-    Descent *d = sound ? PyMem_Calloc(1, sizeof(Descent)) : NULL;
+    Staff *d = sound ? PyMem_Calloc(1, sizeof(Staff)) : NULL;
     if (d) {
         Kind *kind = &d->kind;
         kind->p = h[0], kind->layers = h[1], kind->whitened = h[2], kind->block = h[3], d->threads = h[4];
@@ -108,8 +108,8 @@ static PyObject *descent(PyObject *Py_UNUSED(module), PyObject *args) {
         d->workers = PyMem_Calloc(d->threads, sizeof(Worker));
         size_t each = d->workers ? (employ(d->workers, kind, NULL) + LINE - 1) / LINE * LINE : 0;
         d->memory = each ? PyMem_Calloc(d->threads * each + LINE, 1) : NULL;
-        char *at = d->memory + (LINE - (uintptr_t)d->memory % LINE);
-        for (int i = 0; d->memory && i < d->threads; i++, at += each) {
+        char *at = d->memory ? d->memory + (LINE - (uintptr_t)d->memory % LINE) : NULL;
+        for (int i = 0; at && i < d->threads; i++, at += each) {
             employ(d->workers + i, kind, at);
             whiten_by(d->workers + i, parts[1].buf, parts[2].buf);
         }
@@ -123,19 +123,19 @@ static PyObject *descent(PyObject *Py_UNUSED(module), PyObject *args) {
         PyErr_SetString(PyExc_ValueError, "the arrays are not those of a network");
         return NULL;
     }
-    return PyCapsule_New(d, DESCENT, dismiss);
+    return PyCapsule_New(d, STAFF, dismiss);
 }
 
-/* descend(descent, weights, x, W, mask, T, cycle, losses float64, shapes, gradient): fill the last three,
-   arrays as in `descent.h`; T may be empty. */
-static PyObject *descend_once(PyObject *Py_UNUSED(module), PyObject *args) {
+/* gradient(workers, weights, x, W, mask, T, cycle, losses float64, shapes, gradient): fill the last three,
+   arrays as in `gradient.h`; T may be empty. For one thread of Python at a time. */
+static PyObject *gradient(PyObject *Py_UNUSED(module), PyObject *args) {
     PyObject *capsule;
     Py_buffer b[8];
     double cycle;
     if (!PyArg_ParseTuple(args, "Oy*y*y*y*y*dw*w*w*", &capsule, &b[0], &b[1], &b[2], &b[3], &b[4], &cycle,
                           &b[5], &b[6], &b[7]))
         return NULL;
-    Descent *d = PyCapsule_GetPointer(capsule, DESCENT);
+    Staff *d = PyCapsule_GetPointer(capsule, STAFF);
     int sound = d != NULL;
     if (d) {
         Py_ssize_t p = d->kind.p, weights = 4 * d->kind.learned, frames = b[3].len / (4 * p);
@@ -146,7 +146,7 @@ static PyObject *descend_once(PyObject *Py_UNUSED(module), PyObject *args) {
         Task task = {frames, known, b[1].buf, b[2].buf, b[3].buf, b[4].buf, cycle};
         if (sound && frames) {
             Py_BEGIN_ALLOW_THREADS
-            descend(d->workers, d->threads, b[0].buf, &task, b[5].buf, b[6].buf, b[7].buf);
+            gradient_of(d->workers, d->threads, b[0].buf, &task, b[5].buf, b[6].buf, b[7].buf);
             Py_END_ALLOW_THREADS
         } else {
             sound = 0;
@@ -167,8 +167,8 @@ static PyObject *choose(PyObject *Py_UNUSED(module), PyObject *bytes) {
 
 static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
                                 {"lift", lift_objects, METH_VARARGS, NULL},
-                                {"descent", descent, METH_VARARGS, NULL},
-                                {"descend", descend_once, METH_VARARGS, NULL},
+                                {"workers", workers, METH_VARARGS, NULL},
+                                {"gradient", gradient, METH_VARARGS, NULL},
                                 {"choose_vectors", choose, METH_O, NULL},
                                 {NULL, NULL, 0, NULL}};
 static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", NULL, -1, methods, NULL, NULL, NULL, NULL};
@@ -176,7 +176,8 @@ static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", NULL, -1, methods
 PyMODINIT_FUNC PyInit__kernel(void) {
     PyObject *made = PyModule_Create(&module);
     choose_vectors(64);
-    if (made && (PyModule_AddIntMacro(made, FLOATS) || PyModule_AddIntMacro(made, DOUBLES)))
+    if (made && (PyModule_AddIntMacro(made, FLOATS) || PyModule_AddIntMacro(made, DOUBLES) ||
+                 PyModule_AddIntMacro(made, MOST_LAYERS)))
         Py_CLEAR(made);
     return made;
 }

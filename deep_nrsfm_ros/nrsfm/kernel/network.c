@@ -37,7 +37,7 @@ INLINE void turn_inline(ptrdiff_t n, float c, float s, const float *restrict V, 
     for (int r = 0; r < 3; r++)
         for (ptrdiff_t j = 0; j < n; j++) {
             float v = c * V[r * n + j] + s * V[(3 + r) * n + j] - b[j];
-            Psi[r * n + j] = v > 0 ? v : 0;
+            Psi[r * n + j] = v <= 0 ? 0 : v;
         }
 }
 FAST(turn, (ptrdiff_t n, float c, float s, const float *V, const float *b, float *Psi),

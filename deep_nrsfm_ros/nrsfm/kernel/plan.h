@@ -11,8 +11,6 @@
 #include "algebra.h"
 #include "geometry.h"
 
-#define MOST_LAYERS 64
-
 /* An object that is being lifted. */
 typedef struct {
     const float *given, *confidence; /* (p, 2), (p) */

@@ -1,4 +1,4 @@
-/* `product` and `solve` for processors with vectors of BYTES; `algebra.c` includes it once for each.
+/* `product`, `accumulate` and `solve` for processors with vectors of BYTES; `algebra.c` includes it once for each.
 
    FOR(name) is what `name` is called there, TARGET what the compiler needs to know. What is four doubles
    wide takes vectors of 32 bytes at most: FOUR(name).
@@ -35,7 +35,7 @@ HERE void FOR(tile)(const int rows, const int panels, const float *X, int stride
     for (int r = 0; r < rows; r++)
         for (int h = 0; h < A_PANEL * panels; h++) {
             vector sum = sums[r][h];
-            if (relu) sum = (vector)((FOR(bits))sum & (sum > 0));
+            if (relu) sum = (vector)((FOR(bits))sum & ~(sum <= 0)); /* NaN stays what it is */
             ((vector *)(out + (size_t)r * A.n + column))[h] = sum;
         }
 }
