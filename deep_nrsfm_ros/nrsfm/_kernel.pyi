@@ -11,12 +11,12 @@ def lift(
 def workers(header: Any, L: Any, L_inverse: Any, /) -> object: ...
 def gradient(
     workers: object,
+    cycle: float,
     weights: Any,
     x: Any,
     W: Any,
     mask: Any,
     T: Any,
-    cycle: float,
     losses: Any,
     shapes: Any,
     gradient: Any,

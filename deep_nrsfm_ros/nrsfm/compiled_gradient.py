@@ -52,9 +52,9 @@ class CompiledGradient:
         losses = np.empty(2)
         shapes, gradient = torch.empty((*task.W.shape[:2], 3)), torch.empty_like(weights)
         T = torch.empty(0) if task.T is None else task.T
-        weights_, x, W, mask, T_ = _arrays(weights, task.x, task.W, task.mask, T)
-        out = losses, *_arrays(shapes, gradient)
-        _kernel.gradient(self._workers, weights_, x, W, mask, T_, self._cycle, *out)
+        given = _arrays(weights, task.x, task.W, task.mask, T)
+        found = losses, *_arrays(shapes, gradient)
+        _kernel.gradient(self._workers, self._cycle, *given, *found)
         reprojection, cycle = torch.from_numpy(losses).float()
         return Losses(reprojection, cycle, reprojection + self._cycle * cycle, shapes), gradient
 

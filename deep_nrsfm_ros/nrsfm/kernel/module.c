@@ -126,13 +126,13 @@ static PyObject *workers(PyObject *Py_UNUSED(module), PyObject *args) {
     return PyCapsule_New(d, STAFF, dismiss);
 }
 
-/* gradient(workers, weights, x, W, mask, T, cycle, losses float64, shapes, gradient): fill the last three,
+/* gradient(workers, cycle, weights, x, W, mask, T, losses float64, shapes, gradient): fill the last three,
    arrays as in `gradient.h`; T may be empty. For one thread of Python at a time. */
 static PyObject *gradient(PyObject *Py_UNUSED(module), PyObject *args) {
     PyObject *capsule;
     Py_buffer b[8];
     double cycle;
-    if (!PyArg_ParseTuple(args, "Oy*y*y*y*y*dw*w*w*", &capsule, &b[0], &b[1], &b[2], &b[3], &b[4], &cycle,
+    if (!PyArg_ParseTuple(args, "Ody*y*y*y*y*w*w*w*", &capsule, &cycle, &b[0], &b[1], &b[2], &b[3], &b[4],
                           &b[5], &b[6], &b[7]))
         return NULL;
     Staff *d = PyCapsule_GetPointer(capsule, STAFF);
