@@ -22,4 +22,15 @@ def gradient(
     gradient: Any,
     /,
 ) -> None: ...
+def observe(
+    data: bytes,
+    messages: tuple[int, int],
+    objects: tuple[int, int],
+    steps: tuple[int, int],
+    offsets: tuple[int, ...],
+    least: float,
+    points: Any,
+    confidence: Any,
+    /,
+) -> None: ...
 def choose_vectors(bytes: int, /) -> int: ...

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 # No image is this large, and sums of squares stay far below the largest float32.
 _FARTHEST = 1e9
 _CERTAIN, _MISSING = np.float32(1), np.float32(0)
-_LEAST = np.nextafter(np.float32(0), np.float32(1))
+LEAST = np.nextafter(np.float32(0), np.float32(1))
 
 Ids = tuple[str | None, ...]
 
@@ -48,7 +48,7 @@ def observation(
     seen = np.logical_and.reduce(np.abs(planes) < _FARTHEST)
     seen &= np.logical_or(planes[0], planes[1])
     if len(planes) == 3:
-        seen &= planes[2] >= max(np.float32(min_confidence), _LEAST)
+        seen &= planes[2] >= max(np.float32(min_confidence), LEAST)
         confidence = np.where(seen, np.minimum(planes[2], _CERTAIN), _MISSING)
     else:
         confidence = np.where(seen, _CERTAIN, _MISSING)

@@ -28,6 +28,11 @@ class CloudMake(NamedTuple):
     row_step: int
     point_step: int
 
+    @property
+    def plain(self) -> bool:
+        """Tell whether all numbers are little-endian float32."""
+        return set(self.formats) == {"<f4"}
+
     def values(
         self, data: bytes | memoryview, start: int = 0, messages: int = 1, apart: int = 0
     ) -> NDArray[np.float32]:

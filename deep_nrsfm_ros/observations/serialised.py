@@ -11,10 +11,16 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from deep_nrsfm_ros.nrsfm import compiled
 from deep_nrsfm_ros.observations.field_mapping import Size
 from deep_nrsfm_ros.observations.messages import POINT_CLOUD, InputType, read
-from deep_nrsfm_ros.observations.observation import Observation, observation
+from deep_nrsfm_ros.observations.observation import LEAST, Observation, observation
 from deep_nrsfm_ros.observations.point_cloud import CloudMake, make_of
+
+if compiled.AVAILABLE:
+    from deep_nrsfm_ros.nrsfm import _kernel
 
 _LITTLE_ENDIAN = b"\x00\x01"  # how plain CDR of that order begins
 _STAMP = struct.Struct("<iI")
@@ -73,8 +79,28 @@ class SerialisedMake(NamedTuple):
 
     def observation(self, raws: Sequence[bytes], min_confidence: float) -> Observation:
         """Return the objects of messages of this make, one after the other."""
-        values = self.cloud.values(b"".join(raws), self.start, len(raws), self.length)
+        data = b"".join(raws)
+        if compiled.AVAILABLE and self.cloud.plain:
+            return self._compiled(data, len(raws), min_confidence)
+        values = self.cloud.values(data, self.start, len(raws), self.length)
         return observation(values, min_confidence)
+
+    def _compiled(self, data: bytes, messages: int, min_confidence: float) -> Observation:
+        # Fifteen calls of NumPy cost three times as much, and more yet after a pause.
+        cloud, shape = self.cloud, (messages * self.cloud.height, self.cloud.width)
+        points, confidence = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
+        x, y, *sure = (self.start + offset for offset in cloud.offsets)
+        _kernel.observe(
+            data,
+            (messages, self.length),
+            (cloud.height, cloud.width),
+            (cloud.row_step, cloud.point_step),
+            (x, y, *(sure or (-1,))),
+            max(np.float32(min_confidence), LEAST),
+            points,
+            confidence,
+        )
+        return Observation(points, confidence)
 
 
 class Reader:

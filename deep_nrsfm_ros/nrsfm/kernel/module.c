@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "gradient.h"
+#include "observation.h"
 #include "plan.h"
 
 #define LINE 64 /* bytes of the cache, at whose borders all parts begin */
@@ -86,8 +87,8 @@ typedef struct {
 static const char STAFF[] = "deep_nrsfm_ros.nrsfm._kernel.workers";
 
 static void dismiss(PyObject *capsule) {
-    Staff *d = PyCapsule_GetPointer(capsule, STAFF);
-    if (d) PyMem_Free(d->memory), PyMem_Free(d->workers), PyMem_Free(d);
+    Staff *staff = PyCapsule_GetPointer(capsule, STAFF);
+    if (staff) PyMem_Free(staff->memory), PyMem_Free(staff->workers), PyMem_Free(staff);
 }
 
 /* workers(header int32, L, L_inverse float32) -> capsule; header: p, layers, whitened, frames at a time,
@@ -100,30 +101,30 @@ static PyObject *workers(PyObject *Py_UNUSED(module), PyObject *args) {
     int sound = n > 5 && h[0] > 0 && h[1] > 0 && h[1] <= MOST_LAYERS && n == 5 + h[1] && h[3] > 0 && h[4] > 0;
     for (int i = 0; sound && i < h[1]; i++) sound = h[5 + i] > 0;
     for (int i = 1; i < 3; i++) sound = sound && parts[i].len == (Py_ssize_t)4 * h[0] * h[0];
-    Staff *d = sound ? PyMem_Calloc(1, sizeof(Staff)) : NULL;
-    if (d) {
-        Kind *kind = &d->kind;
-        kind->p = h[0], kind->layers = h[1], kind->whitened = h[2], kind->block = h[3], d->threads = h[4];
+    Staff *staff = sound ? PyMem_Calloc(1, sizeof(Staff)) : NULL;
+    if (staff) {
+        Kind *kind = &staff->kind;
+        kind->p = h[0], kind->layers = h[1], kind->whitened = h[2], kind->block = h[3], staff->threads = h[4];
         describe(kind, h + 5);
-        d->workers = PyMem_Calloc(d->threads, sizeof(Worker));
-        size_t each = d->workers ? (employ(d->workers, kind, NULL) + LINE - 1) / LINE * LINE : 0;
-        d->memory = each ? PyMem_Calloc(d->threads * each + LINE, 1) : NULL;
-        char *at = d->memory ? d->memory + (LINE - (uintptr_t)d->memory % LINE) : NULL;
-        for (int i = 0; at && i < d->threads; i++, at += each) {
-            employ(d->workers + i, kind, at);
-            whiten_by(d->workers + i, parts[1].buf, parts[2].buf);
+        staff->workers = PyMem_Calloc(staff->threads, sizeof(Worker));
+        size_t each = staff->workers ? (employ(staff->workers, kind, NULL) + LINE - 1) / LINE * LINE : 0;
+        staff->memory = each ? PyMem_Calloc(staff->threads * each + LINE, 1) : NULL;
+        char *at = staff->memory ? staff->memory + (LINE - (uintptr_t)staff->memory % LINE) : NULL;
+        for (int i = 0; at && i < staff->threads; i++, at += each) {
+            employ(staff->workers + i, kind, at);
+            whiten_by(staff->workers + i, parts[1].buf, parts[2].buf);
         }
     }
     for (int i = 0; i < 3; i++) PyBuffer_Release(&parts[i]);
-    if (d && !d->memory) {
-        PyMem_Free(d->workers), PyMem_Free(d);
+    if (staff && !staff->memory) {
+        PyMem_Free(staff->workers), PyMem_Free(staff);
         return PyErr_NoMemory();
     }
-    if (!d) {
+    if (!staff) {
         PyErr_SetString(PyExc_ValueError, "the arrays are not those of a network");
         return NULL;
     }
-    return PyCapsule_New(d, STAFF, dismiss);
+    return PyCapsule_New(staff, STAFF, dismiss);
 }
 
 /* gradient(workers, cycle, weights, x, W, mask, T, losses float64, shapes, gradient): fill the last three,
@@ -135,10 +136,10 @@ static PyObject *gradient(PyObject *Py_UNUSED(module), PyObject *args) {
     if (!PyArg_ParseTuple(args, "Ody*y*y*y*y*w*w*w*", &capsule, &cycle, &b[0], &b[1], &b[2], &b[3], &b[4],
                           &b[5], &b[6], &b[7]))
         return NULL;
-    Staff *d = PyCapsule_GetPointer(capsule, STAFF);
-    int sound = d != NULL;
-    if (d) {
-        Py_ssize_t p = d->kind.p, weights = 4 * d->kind.learned, frames = b[3].len / (4 * p);
+    Staff *staff = PyCapsule_GetPointer(capsule, STAFF);
+    int sound = staff != NULL;
+    if (staff) {
+        Py_ssize_t p = staff->kind.p, weights = 4 * staff->kind.learned, frames = b[3].len / (4 * p);
         Py_ssize_t known = b[4].len / (12 * p);
         const Py_ssize_t lengths[8] = {weights,       8 * p * (frames + known), 8 * p * frames, 4 * p * frames,
                                        12 * p * known, 16,                       12 * p * frames, weights};
@@ -146,7 +147,7 @@ static PyObject *gradient(PyObject *Py_UNUSED(module), PyObject *args) {
         Task task = {frames, known, b[1].buf, b[2].buf, b[3].buf, b[4].buf, cycle};
         if (sound && frames) {
             Py_BEGIN_ALLOW_THREADS
-            gradient_of(d->workers, d->threads, b[0].buf, &task, b[5].buf, b[6].buf, b[7].buf);
+            gradient_of(staff->workers, staff->threads, b[0].buf, &task, b[5].buf, b[6].buf, b[7].buf);
             Py_END_ALLOW_THREADS
         } else {
             sound = 0;
@@ -155,6 +156,33 @@ static PyObject *gradient(PyObject *Py_UNUSED(module), PyObject *args) {
     }
     for (int i = 0; i < 8; i++) PyBuffer_Release(&b[i]);
     if (!sound) return NULL;
+    Py_RETURN_NONE;
+}
+
+/* observe(data, (messages, apart), (height, width), (row_step, point_step), (x, y, confidence), least, points,
+   confidence): fill the last two; what begins at x, y and confidence in the first message does so `apart` bytes
+   later in the next. */
+static PyObject *observe_raw(PyObject *Py_UNUSED(module), PyObject *args) {
+    Py_buffer data, points, confidence;
+    Py_ssize_t messages, apart, height, width, row_step, point_step, offset[3], most = -1;
+    float least;
+    if (!PyArg_ParseTuple(args, "y*(nn)(nn)(nn)(nnn)fw*w*", &data, &messages, &apart, &height, &width, &row_step,
+                          &point_step, &offset[0], &offset[1], &offset[2], &least, &points, &confidence))
+        return NULL;
+    for (int i = 0; i < 3; i++) most = offset[i] > most ? offset[i] : most;
+    Py_ssize_t n = messages * height * width;
+    int sound = apart >= 0 && row_step >= 0 && point_step >= 0 && offset[0] >= 0 && offset[1] >= 0;
+    sound = sound && points.len == 8 * n && confidence.len == 4 * n;
+    sound = sound && (n == 0 || (messages - 1) * apart + (height - 1) * row_step + (width - 1) * point_step + most + 4 <=
+                                    data.len);
+    for (Py_ssize_t m = 0; sound && m < messages; m++) {
+        Places at = {height, width, {offset[0], offset[1], offset[2]}, point_step, row_step};
+        observe_keypoints((const char *)data.buf + m * apart, &at, least,
+                          (float *)points.buf + 2 * m * height * width,
+                          (float *)confidence.buf + m * height * width);
+    }
+    PyBuffer_Release(&data), PyBuffer_Release(&points), PyBuffer_Release(&confidence);
+    if (!sound) return PyErr_Format(PyExc_ValueError, "the arrays do not fit the data");
     Py_RETURN_NONE;
 }
 
@@ -169,6 +197,7 @@ static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
                                 {"lift", lift_objects, METH_VARARGS, NULL},
                                 {"workers", workers, METH_VARARGS, NULL},
                                 {"gradient", gradient, METH_VARARGS, NULL},
+                                {"observe", observe_raw, METH_VARARGS, NULL},
                                 {"choose_vectors", choose, METH_O, NULL},
                                 {NULL, NULL, 0, NULL}};
 static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", NULL, -1, methods, NULL, NULL, NULL, NULL};
