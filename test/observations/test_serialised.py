@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray
 
+from deep_nrsfm_ros.nrsfm import compiled
 from deep_nrsfm_ros.observations.messages import MULTI_ARRAY, POINT_CLOUD, read
 from deep_nrsfm_ros.observations.serialised import Header, Reader, header_of
 
@@ -150,6 +151,32 @@ def test_bytes_between_numbers_do_not_matter() -> None:
     reader._decode = forbidden
     raw[18:20] = b"\xab\xcd"
     assert raw[16:18] == b"a\0" and reader(bytes(raw), Q)[0] == reader(plain(frame_id="a"), Q)[0]
+
+
+@pytest.mark.skipif(not compiled.AVAILABLE, reason="no C compiler")
+@pytest.mark.parametrize(
+    ("messages", "steps", "offsets", "room"),
+    [
+        ((2, 49), (24, 12), (0, 4, 8), 4),  # the second message ends beyond the data
+        ((2, 48), (25, 12), (0, 4, 8), 4),
+        ((2, 48), (24, 13), (0, 4, 8), 4),
+        ((2, 48), (24, 12), (0, 4, 9), 4),
+        ((2, 48), (24, 12), (-1, 4, 8), 4),
+        ((2, -48), (24, 12), (0, 4, 8), 4),
+        ((2, 48), (24, 12), (0, 4, 8), 5),
+    ],
+)
+def test_nothing_is_read_beyond_the_data(
+    messages: tuple[int, int], steps: tuple[int, int], offsets: tuple[int, ...], room: int
+) -> None:
+    from deep_nrsfm_ros.nrsfm import _kernel
+
+    points, confidence = np.empty((4, 2, 2), np.float32), np.empty((4, 2), np.float32)
+    _kernel.observe(*(bytes(96), (2, 48), (2, 2), (24, 12), (0, 4, 8), 0.1, points, confidence))
+    assert not points.any() and not confidence.any()
+    confidence = np.empty((room, 2), np.float32)
+    with pytest.raises(ValueError, match="do not fit the data"):
+        _kernel.observe(bytes(96), messages, (2, 2), steps, offsets, 0.1, points, confidence)
 
 
 def test_makes_that_take_turns_are_all_remembered_but_not_without_end() -> None:
