@@ -28,6 +28,7 @@ def observe(
     objects: tuple[int, int],
     steps: tuple[int, int],
     offsets: tuple[int, ...],
+    farthest: float,
     least: float,
     points: Any,
     confidence: Any,

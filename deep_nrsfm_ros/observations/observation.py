@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # No image is this large, and sums of squares stay far below the largest float32.
-_FARTHEST = 1e9
+FARTHEST = 1e9
 _CERTAIN, _MISSING = np.float32(1), np.float32(0)
 LEAST = np.nextafter(np.float32(0), np.float32(1))
 
@@ -45,7 +45,7 @@ def observation(
             values = values.astype(np.float32)
     planes = values.transpose(2, 0, 1)
     # NaN compares false, so the first test drops it together with infinity.
-    seen = np.logical_and.reduce(np.abs(planes) < _FARTHEST)
+    seen = np.logical_and.reduce(np.abs(planes) < FARTHEST)
     seen &= np.logical_or(planes[0], planes[1])
     if len(planes) == 3:
         seen &= planes[2] >= max(np.float32(min_confidence), LEAST)

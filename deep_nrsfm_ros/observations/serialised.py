@@ -16,7 +16,7 @@ import numpy as np
 from deep_nrsfm_ros.nrsfm import compiled
 from deep_nrsfm_ros.observations.field_mapping import Size
 from deep_nrsfm_ros.observations.messages import POINT_CLOUD, InputType, read
-from deep_nrsfm_ros.observations.observation import LEAST, Observation, observation
+from deep_nrsfm_ros.observations.observation import FARTHEST, LEAST, Observation, observation
 from deep_nrsfm_ros.observations.point_cloud import CloudMake, make_of
 
 if compiled.AVAILABLE:
@@ -96,6 +96,7 @@ class SerialisedMake(NamedTuple):
             (cloud.height, cloud.width),
             (cloud.row_step, cloud.point_step),
             (x, y, *(sure or (-1,))),
+            FARTHEST,
             max(np.float32(min_confidence), LEAST),
             points,
             confidence,

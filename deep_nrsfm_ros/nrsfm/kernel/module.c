@@ -159,15 +159,15 @@ static PyObject *gradient(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_RETURN_NONE;
 }
 
-/* observe(data, (messages, apart), (height, width), (row_step, point_step), (x, y, confidence), least, points,
-   confidence): fill the last two; what begins at x, y and confidence in the first message does so `apart` bytes
+/* observe(data, (messages, apart), (height, width), (row_step, point_step), (x, y, confidence), farthest, least,
+   points, confidence): fill the last two; what begins at x, y and confidence in the first message does so `apart` bytes
    later in the next. */
 static PyObject *observe_raw(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_buffer data, points, confidence;
     Py_ssize_t messages, apart, height, width, row_step, point_step, offset[3], most = -1;
-    float least;
-    if (!PyArg_ParseTuple(args, "y*(nn)(nn)(nn)(nnn)fw*w*", &data, &messages, &apart, &height, &width, &row_step,
-                          &point_step, &offset[0], &offset[1], &offset[2], &least, &points, &confidence))
+    float farthest, least;
+    if (!PyArg_ParseTuple(args, "y*(nn)(nn)(nn)(nnn)ffw*w*", &data, &messages, &apart, &height, &width, &row_step,
+                          &point_step, &offset[0], &offset[1], &offset[2], &farthest, &least, &points, &confidence))
         return NULL;
     for (int i = 0; i < 3; i++) most = offset[i] > most ? offset[i] : most;
     Py_ssize_t n = messages * height * width;
@@ -177,7 +177,7 @@ static PyObject *observe_raw(PyObject *Py_UNUSED(module), PyObject *args) {
                                     data.len);
     for (Py_ssize_t m = 0; sound && m < messages; m++) {
         Places at = {height, width, {offset[0], offset[1], offset[2]}, point_step, row_step};
-        observe_keypoints((const char *)data.buf + m * apart, &at, least,
+        observe_keypoints((const char *)data.buf + m * apart, &at, farthest, least,
                           (float *)points.buf + 2 * m * height * width,
                           (float *)confidence.buf + m * height * width);
     }

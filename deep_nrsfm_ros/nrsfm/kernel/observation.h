@@ -10,7 +10,9 @@ typedef struct {
     ptrdiff_t n, q, offsets[3], point_step, object_step;
 } Places;
 
-/* Write points (n, q, 2) and confidence (n, q), 0 where a keypoint is missing or has less than `least`. */
-void observe_keypoints(const char *data, const Places *at, float least, float *points, float *confidence);
+/* Write points (n, q, 2) and confidence (n, q), 0 where a keypoint is missing, `farthest` away or more, or has less
+   confidence than `least`. */
+void observe_keypoints(const char *data, const Places *at, float farthest, float least, float *points,
+                       float *confidence);
 
 #endif
