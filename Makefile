@@ -17,10 +17,12 @@ LOCK_PYTHON ?= python3.10
 LOCK_TORCH ?= torch==2.13.0
 
 # In order: what an earlier one has trained, the later ones find in the output folder.
-BENCHMARKS := nrsfm_on_cmu mirror ablation unseen noise missing structure_from_category classic_sequences \
-    coherence perspective reliability steadiness spoiled
+BENCHMARKS := paper.nrsfm_on_cmu paper.mirror paper.ablation paper.unseen robustness.noise robustness.missing \
+    paper.structure_from_category paper.classic_sequences paper.coherence robustness.perspective \
+    robustness.reliability robustness.smoothing robustness.spoiled
 # In order: what is quick comes first; the machine should have nothing else to do.
-SPEED := where_time_goes forward bag_reading latency while_training training_speed training_scale
+SPEED := speed.where_time_goes speed.forward speed.bag_reading speed.latency speed.while_training \
+    speed.training_speed speed.training_scale
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
@@ -53,7 +55,7 @@ benchmark: $(READY)
 
 benchmark-speed: $(READY)
 	set -e; for name in $(SPEED); do $(PYTHON) -m benchmarks.$$name; done
-	test -z "$(DATA)" || $(PYTHON) -m benchmarks.time_to_error --data $(DATA)
+	test -z "$(DATA)" || $(PYTHON) -m benchmarks.speed.time_to_error --data $(DATA)
 
 # Editable, so that a stale copy never shadows the source; the tests install real copies elsewhere.
 $(READY): requirements.lock setup.py

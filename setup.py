@@ -15,14 +15,14 @@ setup(
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={
-        NAME: ["py.typed", "nrsfm/*.pyi", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]
+        NAME: ["py.typed", "kernel/*.pyi", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]
     },
     # Optional: without a C compiler NumPy and torch do the same, some ten and three times slower.
     ext_modules=[
         Extension(
-            f"{NAME}.nrsfm._kernel",
-            glob(f"{NAME}/nrsfm/kernel/*.c"),
-            depends=glob(f"{NAME}/nrsfm/kernel/*.h"),
+            f"{NAME}.kernel._kernel",
+            glob(f"{NAME}/kernel/*.c"),
+            depends=glob(f"{NAME}/kernel/*.h"),
             extra_compile_args="-O3 -fno-math-errno -fno-trapping-math -fvisibility=hidden "
             "-pthread".split(),
             extra_link_args=["-pthread"],
@@ -72,7 +72,7 @@ setup(
             "matplotlib",  # the demo's picture and the benchmarks' plots
             "scipy",  # the demo's ground truth: triangulation from four calibrated cameras
         ],
-        # Not in requirements.lock: only the table of benchmarks.forward has a row for it.
+        # Not in requirements.lock: only the table of benchmarks.speed.forward has a row for it.
         "speed": [
             "onnxruntime",  # what the forward pass is measured against
             "onnx",  # the format, for torch's exporter

@@ -18,14 +18,14 @@ from tqdm import tqdm
 from benchmarks.table import Table
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.commands.evaluate import evaluate, figures, read_split
-from deep_nrsfm_ros.nrsfm.keypoints import CMU31
-from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
-from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, load_model, save_model
-from deep_nrsfm_ros.nrsfm.progress import Progress
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
-from deep_nrsfm_ros.nrsfm.trainer import Trainer
-from deep_nrsfm_ros.nrsfm.training import finish, train
-from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.training.loop import finish, train
+from deep_nrsfm_ros.training.progress import Progress
+from deep_nrsfm_ros.training.trainer import Trainer
 
 SNAPSHOTS = 10
 """Models kept of each training, evenly spaced; the last is its result."""
@@ -34,8 +34,8 @@ CHECKPOINT_SECONDS = 30.0
 LIFTING_LEGEND = {
     "network alone": "one pass of the network, nothing after it",
     "back-projected": "one pass, then moved within the image plane onto the keypoints",
-    "without bones": f"averaged over {LiftingOptions().turns} turns of the image, then corrected "
-    "by what the model knows of its own errors",
+    "without bones": f"averaged over {LiftingOptions().test_time_rotations} in-plane rotations, then "
+    "corrected by what the model knows of its own errors",
     "as shipped": "the same, and by how long the model knows the object's bones to be",
     "as shipped, noise 0": "the same, told that the keypoints are without noise, as they are here: "
     "they are met exactly",
@@ -53,7 +53,7 @@ class Session:
     steps: int | None  # instead of the presets'
     stride: int  # every n-th frame
 
-    def mocap(self, subjects: Sequence[str], split: str) -> Ensemble:
+    def mocap(self, subjects: Sequence[str], split: str) -> Dataset:
         """Return the trials "train", "held-out" or "all" of CMU subjects, with ground truth."""
         return _mocap(self.data / "cmu", tuple(subjects), split, self.stride)
 
@@ -64,34 +64,34 @@ class Session:
         base = PRESETS[name]
         return base._replace(recipe=dataclasses.replace(base.recipe, seed=seed, **recipe))
 
-    def trained(self, title: str, ensemble: Ensemble, preset: Preset) -> Model:
+    def trained(self, title: str, dataset: Dataset, preset: Preset) -> Model:
         """Return the trained model, from the output folder if it is there."""
-        return self.snapshots(title, ensemble, preset)[-1]
+        return self.snapshots(title, dataset, preset)[-1]
 
-    def snapshots(self, title: str, ensemble: Ensemble, preset: Preset) -> list[Model]:
+    def snapshots(self, title: str, dataset: Dataset, preset: Preset) -> list[Model]:
         """Return the model along its training, its result last; what is there is not trained again.
 
         An interrupted training goes on from its checkpoint. The folder's name tells everything
         that shapes the model: `title` for people, a hash of frames, preset and version.
         """
-        folder = self.output / "models" / f"{title.replace(' ', '-')}-{_hash(ensemble, preset)}"
+        folder = self.output / "models" / f"{title.replace(' ', '-')}-{_hash(dataset, preset)}"
         folder.mkdir(parents=True, exist_ok=True)
         steps = preset.recipe.steps
         wanted = sorted({-(-steps * i // SNAPSHOTS) for i in range(1, SNAPSHOTS + 1)})
         paths = {step: folder / f"{step:07}{MODEL_SUFFIX}" for step in wanted}
         if not all(path.exists() for path in paths.values()):
-            self._train(title, ensemble, preset, paths, folder / "checkpoint")
+            self._train(title, dataset, preset, paths, folder / "checkpoint")
         return [load_model(path) for path in paths.values()]
 
     @staticmethod
     def _train(
-        title: str, ensemble: Ensemble, preset: Preset, paths: dict[int, Path], checkpoint: Path
+        title: str, dataset: Dataset, preset: Preset, paths: dict[int, Path], checkpoint: Path
     ) -> None:
         """Train, and save the model at every step of `paths`."""
 
         def keep(trainer: Trainer) -> None:
             if trainer.step in paths:
-                model = finish(trainer, title, ensemble.layout, ensemble.source)
+                model = finish(trainer, title, dataset.layout, dataset.source)
                 save_model(paths[trainer.step], model)
 
         with tqdm(total=preset.recipe.steps, desc=title, dynamic_ncols=True) as bar:
@@ -102,8 +102,8 @@ class Session:
                 bar.update(progress.step - bar.n)
 
             train(
-                ensemble.points,
-                ensemble.visible,
+                dataset.points,
+                dataset.visible,
                 preset,
                 on_step=keep,
                 on_progress=show,
@@ -114,7 +114,7 @@ class Session:
 
 
 @cache
-def _mocap(folder: Path, subjects: tuple[str, ...], split: str, stride: int) -> Ensemble:
+def _mocap(folder: Path, subjects: tuple[str, ...], split: str, stride: int) -> Dataset:
     with tqdm(desc=f"reading {' '.join(subjects)}", leave=False) as bar:
 
         def show(done: int, total: int) -> None:
@@ -124,11 +124,11 @@ def _mocap(folder: Path, subjects: tuple[str, ...], split: str, stride: int) -> 
         return read_split(folder, subjects, split, CMU31, stride=stride, on_progress=show)
 
 
-def _hash(ensemble: Ensemble, preset: Preset) -> str:
+def _hash(dataset: Dataset, preset: Preset) -> str:
     """Return what tells a training from all others, in ten digits."""
     digest = hashlib.sha256(f"{__version__} {preset}".encode())
-    digest.update(ensemble.points.tobytes())
-    digest.update(ensemble.visible.tobytes())
+    digest.update(dataset.points.tobytes())
+    digest.update(dataset.visible.tobytes())
     return digest.hexdigest()[:10]
 
 
@@ -137,13 +137,11 @@ def in_pairs(columns: Iterable[str]) -> list[str]:
     return [name for column in columns for name in (column, f"{column} proper")]
 
 
-def across(
-    tests: Mapping[str, tuple[Model, Ensemble]], options: LiftingOptions
-) -> dict[str, float]:
+def across(tests: Mapping[str, tuple[Model, Dataset]], options: LiftingOptions) -> dict[str, float]:
     """Return shape error and proper error (%) of a model on a test for each column."""
     row: dict[str, float] = {}
-    for column, (model, ensemble) in tests.items():
-        found = figures(evaluate(model, ensemble, options))
+    for column, (model, dataset) in tests.items():
+        found = figures(evaluate(model, dataset, options))
         row |= {column: found["shape %"], f"{column} proper": found["proper %"]}
     return row
 

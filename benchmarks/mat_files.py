@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import centre
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 
 class Sequence(NamedTuple):
     """A sequence of images with ground truth, both centred."""
 
-    ensemble: Ensemble
+    dataset: Dataset
     in_camera_axes: bool  # of the ground truth: x, y and depth of each frame, not of a fixed world
 
 
@@ -53,11 +53,11 @@ def read_category(path: Path) -> NDArray[np.float64]:
     return np.asarray(X, np.float64).transpose(2, 1, 0)
 
 
-def observed(W: NDArray[Any], S: NDArray[Any], source: str) -> Ensemble:
-    """Return images W (f, p, 2) with their truth S (f, p, 3) as an ensemble of nameless points."""
+def observed(W: NDArray[Any], S: NDArray[Any], source: str) -> Dataset:
+    """Return images W (f, p, 2) with their truth S (f, p, 3) as an dataset of nameless points."""
     layout = KeypointLayout.numbered(W.shape[1])
     points, shapes = (centre(X).astype(np.float32) for X in (W, S))
-    return Ensemble(points, np.ones(W.shape[:2], bool), layout, source, shapes)
+    return Dataset(points, np.ones(W.shape[:2], bool), layout, source, shapes)
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from deep_nrsfm_ros.commands.demo.__main__ import fetch_wheel
-from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
-from deep_nrsfm_ros.nrsfm.keypoints import MEDIAPIPE33
-from deep_nrsfm_ros.observations.cameras import triangulate
-from deep_nrsfm_ros.observations.pose2sim import JOINTS, View, extract_videos, read_session
+from deep_nrsfm_ros.data.cameras import triangulate
+from deep_nrsfm_ros.data.pose2sim import JOINTS, View, extract_videos, read_session
+from deep_nrsfm_ros.layouts.keypoint_layout import MEDIAPIPE33
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 
 Floats = NDArray[Any]
 

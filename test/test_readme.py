@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 
 from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.layouts.keypoint_layout import LAYOUTS, KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
 from deep_nrsfm_ros.node.parameters import name_of
-from deep_nrsfm_ros.node.pipeline import InputOptions
-from deep_nrsfm_ros.node.training_request import TrainingOptions
-from deep_nrsfm_ros.nrsfm.keypoints import LAYOUTS, KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
-from deep_nrsfm_ros.nrsfm.limits import Limits
-from deep_nrsfm_ros.nrsfm.recipe import Anatomy, Recipe
-from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
-from deep_nrsfm_ros.observations.curation import Curation
+from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
+from deep_nrsfm_ros.training.limits import Limits
+from deep_nrsfm_ros.training.request import TrainingOptions
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
@@ -41,10 +41,10 @@ def parameter_rows(cls: type, prefix: str) -> list[str]:
         (InputOptions, ""),
         (LiftingOptions, ""),
         (CameraOptions, ""),
-        (SteadyingOptions, "steady."),
+        (SmoothingOptions, "smoothing."),
         (TrainingOptions, "train."),
         (Recipe, "train."),
-        (Anatomy, "train."),
+        (LayoutLossWeights, "train."),
         (Limits, "train."),
         (Curation, "train."),
     ],

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from deep_nrsfm_ros.commands.program import program
-from deep_nrsfm_ros.nrsfm.limits import Limits
+from deep_nrsfm_ros.training.limits import Limits
 
 NEEDED = ("numpy", "safetensors", "yaml", "rosbags", "rclpy", "sensor_msgs", "diagnostic_msgs")
 TO_TRAIN = ("torch", "jinja2", "tqdm")
@@ -112,10 +112,10 @@ def check_model(name: str, models_dir: Path) -> Finding:
     """Load a model and lift with it."""
     import numpy as np
 
-    from deep_nrsfm_ros.node.model_folders import model_folders
-    from deep_nrsfm_ros.nrsfm import compiled
-    from deep_nrsfm_ros.nrsfm.lifting import Lifter
-    from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
+    from deep_nrsfm_ros.lifting import compiled_backend as compiled
+    from deep_nrsfm_ros.lifting.lifter import Lifter
+    from deep_nrsfm_ros.model_files.folders import model_folders
+    from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 
     mend = "install the package anew; its models belong in share/deep_nrsfm_ros/models"
     try:
@@ -139,15 +139,15 @@ def check_bags() -> Finding:
     """Write and read a bag in both storages."""
     import numpy as np
 
-    from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
-    from deep_nrsfm_ros.observations.bags import STORAGES, frames, read_bags, write_bag
+    from deep_nrsfm_ros.data.bags import STORAGES, frames, read_bags, write_bag
+    from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
 
     points = np.random.default_rng(0).uniform(50, 600, (10, 17, 2))
     for storage in STORAGES:
         with tempfile.TemporaryDirectory() as folder:
             bag = Path(folder) / "bag"
             write_bag(bag, "/keypoints", frames(points, np.ones((10, 17))), storage)
-            read = read_bags([bag], "/keypoints", HUMAN17, HUMAN17).ensemble
+            read = read_bags([bag], "/keypoints", HUMAN17, HUMAN17).dataset
             if not np.allclose(read.points, points, rtol=1e-4):
                 mend = "pip install --force-reinstall rosbags"
                 return Finding(f"{storage}: what was read is not what was written", mend)
@@ -158,9 +158,9 @@ def check_dds(name: str, models_dir: Path, seconds: float) -> Finding:
     """Ask a lifter in another process for an answer."""
     import numpy as np
 
-    from deep_nrsfm_ros.node.loopback import LoopbackError, ask_a_lifter
-    from deep_nrsfm_ros.node.model_folders import model_folders
-    from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
+    from deep_nrsfm_ros.model_files.folders import model_folders
+    from deep_nrsfm_ros.model_files.model_file import find_model, load_model
+    from deep_nrsfm_ros.node.self_test import LoopbackError, ask_a_lifter
 
     path = find_model(name, model_folders(models_dir))
     points = np.random.default_rng(0).uniform(50, 600, (len(load_model(path).layout), 2))
@@ -201,7 +201,7 @@ def examine(given: argparse.Namespace) -> bool:
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Examine this installation."""
-    from deep_nrsfm_ros.node.model_folders import default_models_dir
+    from deep_nrsfm_ros.model_files.folders import default_models_dir
 
     parser = argparse.ArgumentParser(prog="doctor", description=__doc__)
     parser.add_argument("--model", default="human", help="model to lift with (default: human)")

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.commands.program import program
-from deep_nrsfm_ros.node.model_folders import model_folders
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.mocap import HEIGHT_18, protocol_split, read_trials, trials
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
-from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
-from deep_nrsfm_ros.observations.ensemble import Ensemble
-from deep_nrsfm_ros.observations.mocap import HEIGHT_18, protocol_split, read_trials, trials
 
 CONVENTIONS = {
     "shape %": "the paper's: each frame rescaled to the norm of the truth and aligned by O(3), "
@@ -28,10 +28,12 @@ CONVENTIONS = {
     "unscaled %": "as proper, without rescaling",
 }
 """What each figure of `figures` means."""
-ALONE = LiftingOptions(correction="none", turns=1, mirror=False)
+ALONE = LiftingOptions(correction="none", test_time_rotations=1, mirror=False)
 LIFTING = {
     "network alone": ALONE,
-    "back-projected": LiftingOptions(correction="back_projection", turns=1, mirror=False),
+    "back-projected": LiftingOptions(
+        correction="back_projection", test_time_rotations=1, mirror=False
+    ),
     "without bones": LiftingOptions(correction="learned"),
     "as shipped": LiftingOptions(),
     "as shipped, noise 0": LiftingOptions(noise=0.0),
@@ -76,7 +78,7 @@ def read_split(
     seed: int = 0,
     stride: int = 1,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Ensemble:
+) -> Dataset:
     """Return the trials "train", "held-out" (by the paper's protocol) or "all" of the subjects.
 
     The rest is as in `read_trials`.
@@ -89,21 +91,21 @@ def read_split(
     return read_trials(paths, layout, seed=seed, stride=stride, on_progress=on_progress)
 
 
-def reconstruct(lifter: Lifter, ensemble: Ensemble) -> NDArray[np.float32]:
+def reconstruct(lifter: Lifter, dataset: Dataset) -> NDArray[np.float32]:
     """Return the shapes (f, p, 3) of every frame, in the units of its points.
 
     A frame that cannot be lifted comes out as a point, which is an error of 100 %.
     """
-    lifted = lift_all(lifter, ensemble.points, ensemble.visible.astype(np.float32))
+    lifted = lift_all(lifter, dataset.points, dataset.visible.astype(np.float32))
     S: NDArray[np.float32] = np.nan_to_num(lifted.shapes * lifted.scale[:, None, None])
     return S
 
 
-def evaluate(model: Model, ensemble: Ensemble, options: LiftingOptions) -> ShapeErrors:
-    """Lift every frame of an ensemble with ground truth and compare."""
-    if ensemble.shapes is None:
-        raise ValueError(f"{ensemble.source} has no ground truth to compare with")
-    return shape_errors(reconstruct(Lifter(model, options), ensemble), ensemble.shapes)
+def evaluate(model: Model, dataset: Dataset, options: LiftingOptions) -> ShapeErrors:
+    """Lift every frame of an dataset with ground truth and compare."""
+    if dataset.shapes is None:
+        raise ValueError(f"{dataset.source} has no ground truth to compare with")
+    return shape_errors(reconstruct(Lifter(model, options), dataset), dataset.shapes)
 
 
 def figures(errors: ShapeErrors) -> dict[str, float]:
@@ -117,7 +119,7 @@ def compare_cameras(given: argparse.Namespace) -> None:
     try:
         # Here, because motion capture needs no SciPy.
         from deep_nrsfm_ros.commands.four_cameras import CAMERA_CONVENTIONS, camera_table
-        from deep_nrsfm_ros.observations.pose2sim import read_session
+        from deep_nrsfm_ros.data.pose2sim import read_session
     except ModuleNotFoundError as error:
         print(f"failed: {error}; install deep_nrsfm_ros[benchmarks]", file=sys.stderr)
         sys.exit(2)
@@ -143,13 +145,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         for name in given.models:
             model = load_model(find_model(name, model_folders(given.models_dir)))
-            ensemble = read_split(
+            dataset = read_split(
                 *(given.cmu, given.subjects, given.split, model.layout),
                 seed=given.camera_seed,
                 stride=given.stride,
             )
             for word, lifting in LIFTING.items():
-                errors = evaluate(model, ensemble, lifting)
+                errors = evaluate(model, dataset, lifting)
                 cells = " | ".join(f"{figure:.2f}" for figure in figures(errors).values())
                 print(f"| {model.name} | {word} | {cells} |", flush=True)
     except (ValueError, OSError) as error:

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.node.pipeline import InputOptions
-from deep_nrsfm_ros.nrsfm.keypoints import BODY25B, KeypointMap
-from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
+from deep_nrsfm_ros.data.pose2sim import JOINTS, Session, View
+from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, KeypointMap
+from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.observation import observation
+from deep_nrsfm_ros.lifting.perspective import lift_at_place
+from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
-from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.nrsfm.placement import lift_at_place
-from deep_nrsfm_ros.observations.observation import observation
-from deep_nrsfm_ros.observations.pose2sim import JOINTS, Session, View
 
 Floats = NDArray[Any]
 

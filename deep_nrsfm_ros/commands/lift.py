@@ -12,18 +12,18 @@ from tqdm import tqdm
 
 from deep_nrsfm_ros.commands.program import program
 from deep_nrsfm_ros.configuration import add_arguments, override
-from deep_nrsfm_ros.node.model_folders import model_folders
-from deep_nrsfm_ros.node.pipeline import MODEL_ORDER, InputOptions
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import Lifter, LiftingOptions
-from deep_nrsfm_ros.nrsfm.model_file import Model, find_model, load_model
-from deep_nrsfm_ros.nrsfm.object_file import find_layout
-from deep_nrsfm_ros.observations.camera_file import read_camera_file
-from deep_nrsfm_ros.observations.detections import Detections
-from deep_nrsfm_ros.observations.keypoint_files import KINDS, read_keypoints
-from deep_nrsfm_ros.observations.lifted_files import check_output, write_recording
-from deep_nrsfm_ros.observations.mapping_file import read_mapping
-from deep_nrsfm_ros.observations.recording import Recording, lift_recording
+from deep_nrsfm_ros.data.camera_file import read_camera_file
+from deep_nrsfm_ros.data.detections import Detections
+from deep_nrsfm_ros.data.keypoint_files import KINDS, read_keypoints
+from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
+from deep_nrsfm_ros.data.recording import Recording, lift_recording
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.messages.mapping_file import read_mapping
+from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER, InputOptions
+from deep_nrsfm_ros.model_files.find_layout import find_layout
+from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 
 
 def arguments() -> argparse.ArgumentParser:

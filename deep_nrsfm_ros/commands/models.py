@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from deep_nrsfm_ros.commands.program import program
-from deep_nrsfm_ros.node.model_folders import default_models_dir, model_folders
-from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
+from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 
 COLUMNS = ("model", "object", "keypoints", "reprojection", "cycle", "date")
 QUALITY = ("reprojection_error", "cycle_error")

@@ -19,13 +19,13 @@ from deep_nrsfm_ros.commands.lift import (
 )
 from deep_nrsfm_ros.commands.program import program
 from deep_nrsfm_ros.configuration import override
-from deep_nrsfm_ros.node.pipeline import InputOptions
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.nrsfm.model_file import Model
-from deep_nrsfm_ros.observations.answers import has_answers, read_answers
-from deep_nrsfm_ros.observations.bag_files import BagError
-from deep_nrsfm_ros.observations.keypoint_files import KINDS, is_bag
-from deep_nrsfm_ros.observations.recording import Recording, lifted_before
+from deep_nrsfm_ros.data.bag_files import BagError
+from deep_nrsfm_ros.data.keypoint_files import KINDS, is_bag
+from deep_nrsfm_ros.data.lifted_bags import has_answers, read_answers
+from deep_nrsfm_ros.data.recording import Recording, lifted_before
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.reporting.player import (
     MOST_FRAMES,
     Stage,
@@ -115,7 +115,7 @@ def watch(given: argparse.Namespace, model: Model, source: KeypointLayout) -> No
         import rclpy  # only here: files need no ROS
         from rclpy.executors import ExternalShutdownException
 
-        from deep_nrsfm_ros.node.watching import Watcher
+        from deep_nrsfm_ros.node.lifter_client import Watcher
     except ImportError as error:
         raise ValueError(f"no ROS here ({error}); name a BAG to look at") from None
     inputs, stage = override(InputOptions(), given), Stage()

@@ -19,18 +19,18 @@ from pathlib import Path
 from safetensors import SafetensorError
 
 from deep_nrsfm_ros.commands.evaluate import read_split
-from deep_nrsfm_ros.commands.preparation import chosen_curation, prepare
 from deep_nrsfm_ros.commands.program import program
-from deep_nrsfm_ros.commands.reporter import CancelledError, Reporter, SilentReporter
-from deep_nrsfm_ros.commands.resuming import as_asked_before
 from deep_nrsfm_ros.configuration import add_arguments, override
-from deep_nrsfm_ros.node.model_folders import model_folders
-from deep_nrsfm_ros.node.unfinished import check_room, checkpoint_file, under_way, unwritable
-from deep_nrsfm_ros.nrsfm.distributed import join, rank
-from deep_nrsfm_ros.nrsfm.fine_tuning import inherit, keep_what_is_fixed, start_from
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
-from deep_nrsfm_ros.nrsfm.limits import WHOLE, Limits
-from deep_nrsfm_ros.nrsfm.model_file import (
+from deep_nrsfm_ros.data.bags import most_keypoints, read_bags
+from deep_nrsfm_ros.data.curation import Curated, Curation
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.sufficiency import Variation
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.messages.field_mapping import FieldMapping
+from deep_nrsfm_ros.messages.mapping_file import read_mapping
+from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
+from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.model_file import (
     MODEL_SUFFIX,
     Model,
     check_name,
@@ -39,17 +39,17 @@ from deep_nrsfm_ros.nrsfm.model_file import (
     save_model,
 )
 from deep_nrsfm_ros.nrsfm.network import Architecture
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.nrsfm.object_file import NUMBERED, find_layout
-from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Anatomy, Preset, Recipe
-from deep_nrsfm_ros.observations.bags import most_keypoints, read_bags
-from deep_nrsfm_ros.observations.curation import Curated, Curation
-from deep_nrsfm_ros.observations.ensemble import Ensemble
-from deep_nrsfm_ros.observations.field_mapping import FieldMapping
-from deep_nrsfm_ros.observations.mapping_file import read_mapping
-from deep_nrsfm_ros.observations.variation import Variation
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Preset, Recipe
 from deep_nrsfm_ros.reporting.page import Training, write_report
 from deep_nrsfm_ros.reporting.shapes import doubt
+from deep_nrsfm_ros.training.distributed import join, rank
+from deep_nrsfm_ros.training.fine_tuning import inherit, keep_what_is_fixed, start_from
+from deep_nrsfm_ros.training.limits import WHOLE, Limits
+from deep_nrsfm_ros.training.preparation import chosen_curation, prepare
+from deep_nrsfm_ros.training.record import check_room, checkpoint_file, keep_record, unwritable
+from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
+from deep_nrsfm_ros.training.resume import resumed_arguments
 
 NOT_ASKED = ("name", "output", "resume", "json_progress")
 """Arguments that say which training is meant and how to show it, not what is asked of it."""
@@ -110,13 +110,13 @@ def arguments() -> argparse.ArgumentParser:
         "data and options",
     )
     run.add_argument("--json-progress", action="store_true", help="one JSON object a line")
-    for config in (Recipe, Anatomy, Limits, Architecture, Normaliser, Curation):
+    for config in (Recipe, LayoutLossWeights, Limits, Architecture, Normaliser, Curation):
         add_arguments(parser, config)
     return parser
 
 
-def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
-    """Return the ensemble that the arguments name; raise ValueError if there is none."""
+def read_data(given: argparse.Namespace, report: Reporter) -> Dataset:
+    """Return the dataset that the arguments name; raise ValueError if there is none."""
     if bool(given.bag) == bool(given.cmu):
         raise ValueError("name what to train on: --bag (repeatable), or --cmu with --subjects")
     source, target = read_layouts(given)
@@ -133,7 +133,7 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Ensemble:
         if reading.unreadable:
             count = f"{reading.unreadable} of {reading.messages}"
             report.warn(f"{count} messages could not be read: {reading.reason}")
-        return reading.ensemble
+        return reading.dataset
     return read_split(
         *(given.cmu, given.subjects, "all" if given.all_trials else "train", target),
         seed=given.camera_seed,
@@ -230,11 +230,11 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         raise ValueError("training needs torch, which is not installed: pip install torch")
     curated, variation = prepare(given, read_data(given, report), report.say)
     asked = {name: value for name, value in vars(given).items() if name not in NOT_ASKED}
-    for options in (*preset, override(Anatomy(), given), limits, chosen_curation(given)):
+    for options in (*preset, override(LayoutLossWeights(), given), limits, chosen_curation(given)):
         asked |= dataclasses.asdict(options)
     # Of several processes the first keeps the record; the others only know where it is.
     others = nullcontext(checkpoint_file(given.output, given.name))
-    first = under_way(given.output, given.name, asked, resume=given.resume)
+    first = keep_record(given.output, given.name, asked, resume=given.resume)
     with others if rank() else first as checkpoint:
         learn(given, preset, limits, start, curated, variation, checkpoint, report, should_stop)
 
@@ -251,29 +251,29 @@ def learn(
     should_stop: Callable[[], bool],
 ) -> None:
     """Train on what `run` has read and save the model with its report."""
-    ensemble = curated.ensemble
-    if ensemble.layout.warning and not start:
-        report.warn(ensemble.layout.warning)
-    network = start_from(start, ensemble.layout) if start else None
-    weights = override(Anatomy(), given)
-    weights.check(ensemble.layout)
-    seen = ensemble.visible.sum(0)
-    unseen = [name for i, name in enumerate(ensemble.layout.keypoints) if not seen[i]]
+    dataset = curated.dataset
+    if dataset.layout.warning and not start:
+        report.warn(dataset.layout.warning)
+    network = start_from(start, dataset.layout) if start else None
+    weights = override(LayoutLossWeights(), given)
+    weights.check(dataset.layout)
+    seen = dataset.visible.sum(0)
+    unseen = [name for i, name in enumerate(dataset.layout.keypoints) if not seen[i]]
     if unseen:
         report.warn(f"no frame shows {', '.join(unseen)}: the model will only guess them")
-    report.say(f"{len(ensemble)} frames of {len(ensemble.layout)} keypoints ({ensemble.source})")
+    report.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
     import torch  # seconds to import: bad arguments should not wait for it
 
-    from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
-    from deep_nrsfm_ros.nrsfm.training import finish, train
+    from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
+    from deep_nrsfm_ros.training.loop import finish, train
 
     if given.threads:
         torch.set_num_threads(given.threads)
     team = join()
     model_path = given.output / f"{given.name}{MODEL_SUFFIX}"
     trainer = train(
-        ensemble.points,
-        ensemble.visible,
+        dataset.points,
+        dataset.visible,
         preset,
         limits=limits,
         on_progress=report.training,
@@ -281,7 +281,7 @@ def learn(
         checkpoint=checkpoint,
         start=network,
         team=team,
-        anatomy=AnatomyLoss(weights, ensemble.layout) if weights != Anatomy() else None,
+        layout_loss=LayoutLoss(weights, dataset.layout) if weights != LayoutLossWeights() else None,
     )
     team.leave()
     if team.rank:
@@ -289,16 +289,16 @@ def learn(
     if not trainer.step:
         checkpoint.unlink(missing_ok=True)
         raise CancelledError
-    model = finish(trainer, given.name, ensemble.layout, ensemble.source)
+    model = finish(trainer, given.name, dataset.layout, dataset.source)
     model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
     if start:
         model = inherit(model, start)
     save_model(model_path, model)
-    depth = doubt(model, ensemble)
+    depth = doubt(model, dataset)
     if depth:
         report.warn(depth)
     whole = Training(
-        *(model, model_path, ensemble, curated, variation, report.curves, report.warnings)
+        *(model, model_path, dataset, curated, variation, report.curves, report.warnings)
     )
     html = write_page(whole, report, compare=bool(trainer.ended))
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"
@@ -325,7 +325,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     report = (SilentReporter if rank() else Reporter)(given.json_progress, should_stop)
     try:
         if given.resume:
-            given = as_asked_before(arguments(), argv, given, report.say)
+            given = resumed_arguments(arguments(), argv, given, report.say)
         check_name("--name", given.name)
         run(given, report, should_stop)
     except CancelledError:

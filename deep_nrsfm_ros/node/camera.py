@@ -10,10 +10,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
-from deep_nrsfm_ros.observations.camera_info import read_camera_info
-from deep_nrsfm_ros.observations.field_mapping import Size
-from deep_nrsfm_ros.observations.observation import MessageError
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.observation import MessageError
+from deep_nrsfm_ros.messages.camera_info import read_camera_info
+from deep_nrsfm_ros.messages.field_mapping import Size
 
 # Drivers send it with every image; a simulator or a bag may send it once and keep it.
 _STREAM = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

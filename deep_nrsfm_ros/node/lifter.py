@@ -36,33 +36,33 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER, InputOptions, Pipeline
+from deep_nrsfm_ros.messages.serialised import Header
+from deep_nrsfm_ros.model_files.find_layout import find_layout
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
+from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameters, publishing
 from deep_nrsfm_ros.node.camera import CameraListener, CameraOptions
-from deep_nrsfm_ros.node.fence import Fence
-from deep_nrsfm_ros.node.health import Health
-from deep_nrsfm_ros.node.listening import LOG_PERIOD, Listener, Source
-from deep_nrsfm_ros.node.pipeline import MODEL_ORDER, InputOptions, Pipeline
-from deep_nrsfm_ros.node.training_request import (
+from deep_nrsfm_ros.node.diagnostics import Health
+from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, Listener, Source
+from deep_nrsfm_ros.node.training_service import TrainingService
+from deep_nrsfm_ros.node.transforms import Broadcaster
+from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
+from deep_nrsfm_ros.training.limits import Limits
+from deep_nrsfm_ros.training.request import (
     TrainingOptions,
     TrainingRequest,
-    fenced,
     layouts,
     limited,
     paths_of,
+    sandboxed,
 )
-from deep_nrsfm_ros.node.training_service import TrainingService
-from deep_nrsfm_ros.node.transforms import Broadcaster
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
-from deep_nrsfm_ros.nrsfm.limits import Limits
-from deep_nrsfm_ros.nrsfm.model_file import Model, load_model
-from deep_nrsfm_ros.nrsfm.object_file import find_layout
-from deep_nrsfm_ros.nrsfm.recipe import Anatomy, Recipe
-from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
-from deep_nrsfm_ros.observations.curation import Curation
-from deep_nrsfm_ros.observations.serialised import Header
 
-_STEADY = "steady."
+_STEADY = "smoothing."
 _TRAIN = "train."
 _REPORT_PERIOD = 1.0
 _ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -81,13 +81,13 @@ class LifterNode(Node):
         self._inputs = parameters.declare(self, InputOptions)
         parameters.declare(self, LiftingOptions)
         camera = parameters.declare(self, CameraOptions)
-        parameters.declare(self, SteadyingOptions, _STEADY)
+        parameters.declare(self, SmoothingOptions, _STEADY)
         training = parameters.declare(self, TrainingOptions, _TRAIN)
         parameters.declare(self, Recipe, _TRAIN)
-        parameters.declare(self, Anatomy, _TRAIN)
+        parameters.declare(self, LayoutLossWeights, _TRAIN)
         parameters.declare(self, Limits, _TRAIN)
         parameters.declare(self, Curation, _TRAIN)
-        self._fence = Fence(
+        self._fence = PathSandbox(
             Path(self._inputs.models_dir).expanduser(),
             Path(self._inputs.bags_dir).expanduser(),
             (self._inputs.model, self._inputs.keypoint_layout, *paths_of(training)),
@@ -188,8 +188,8 @@ class LifterNode(Node):
         """Return the pipeline as it will be with `changes`; raise ValueError if it cannot be."""
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
-        steadying = parameters.read(self, SteadyingOptions, _STEADY, changes)
-        for checked in (TrainingOptions, Recipe, Anatomy, Limits, Curation):
+        steadying = parameters.read(self, SmoothingOptions, _STEADY, changes)
+        for checked in (TrainingOptions, Recipe, LayoutLossWeights, Limits, Curation):
             parameters.read(self, checked, _TRAIN, changes)
         # Files are read again only when they are named again: they may be gone by now.
         changed = {change.name for change in changes} or {"model", "keypoint_layout"}
@@ -225,7 +225,7 @@ class LifterNode(Node):
     def _training_request(self) -> TrainingRequest:
         """Return what ~/train is to do, as the parameters stand."""
         inputs = parameters.read(self, InputOptions)
-        wanted = fenced(parameters.read(self, TrainingOptions, _TRAIN), self._fence)
+        wanted = sandboxed(parameters.read(self, TrainingOptions, _TRAIN), self._fence)
         heard = self._fence.layout("keypoint_layout", inputs.keypoint_layout)
         topics, model = self._listener.topics, self._fence.model("model", inputs.model)
         source, target = layouts(wanted, heard, model, wanted.from_)
@@ -242,7 +242,7 @@ class LifterNode(Node):
             min_confidence=inputs.min_confidence,
             output=self._fence.models_dir,
             curation=parameters.read(self, Curation, _TRAIN),
-            anatomy=parameters.read(self, Anatomy, _TRAIN),
+            layout_loss=parameters.read(self, LayoutLossWeights, _TRAIN),
             limits=limited(parameters.read(self, Limits, _TRAIN), wanted.max_minutes),
         )
 

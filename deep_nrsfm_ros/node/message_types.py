@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message
 
-from deep_nrsfm_ros.observations.observation import MessageError
+from deep_nrsfm_ros.lifting.observation import MessageError
 
 
 def message_class(name: str) -> Any:

@@ -22,10 +22,10 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 from std_msgs import msg as std_msgs
 from visualization_msgs.msg import Marker, MarkerArray
 
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP
+from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.nrsfm.geometry import centre, quaternion
-from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP
-from deep_nrsfm_ros.observations.serialised import Header
 
 UNWATCHED = PublisherEventCallbacks(use_default_callbacks=False)
 """For publishers of the lifter: rclpy looks after two events of any other at every message.

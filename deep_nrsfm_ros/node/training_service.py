@@ -12,10 +12,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from deep_nrsfm_ros.node import publishing
-from deep_nrsfm_ros.node.health import ERROR, OK
-from deep_nrsfm_ros.node.training_job import Progress, TrainingJob
-from deep_nrsfm_ros.node.training_request import TrainingOptions, TrainingRequest
-from deep_nrsfm_ros.node.unfinished import find_unfinished, look
+from deep_nrsfm_ros.node.diagnostics import ERROR, OK
+from deep_nrsfm_ros.training.job import Progress, TrainingJob
+from deep_nrsfm_ros.training.record import find_records, look
+from deep_nrsfm_ros.training.request import TrainingOptions, TrainingRequest
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -62,7 +62,7 @@ class TrainingService:
     def _tell_of_unfinished(self) -> None:
         """Say what was cut off before the lifter started, and how to go on."""
         message = "no training since the lifter started"
-        found = find_unfinished(self._folder)
+        found = find_records(self._folder)
         for one in found:
             text = f"{one}: {one.advice}"
             self._node.get_logger().warning(text)

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.node import publishing
-from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.observations.serialised import Header
 
 
 class Broadcaster:

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deep_nrsfm_ros.nrsfm.anatomy import AnatomyLoss
 from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
+from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Network, forward, whiten
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser, observe
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, observe
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
 
@@ -91,15 +91,15 @@ class Objective:
         recipe: Recipe,
         *,
         whitened: bool = True,
-        anatomy: AnatomyLoss | None = None,
+        layout_loss: LayoutLoss | None = None,
     ) -> None:
         """Take what the loss depends on besides network and data.
 
         Differences are weighed by the network's whitening, or by plain distance if not `whitened`.
-        `anatomy` is a term of its own, of the shapes of the frames.
+        `layout_loss` is a term of its own, of the shapes of the frames.
         """
         self.normaliser, self.recipe, self.whitened = normaliser, recipe, whitened
-        self.anatomy = anatomy
+        self.layout_loss = layout_loss
 
     def __call__(
         self, net: Network, frames: Frames, known: Tensor | None, generator: torch.Generator
@@ -151,8 +151,8 @@ class Objective:
         if left.cycle is not None:
             cycle = left.cycle.mean()
             total = total + self.recipe.cycle * cycle
-        if self.anatomy:
-            total = total + self.anatomy(S[: len(M)], M)
+        if self.layout_loss:
+            total = total + self.layout_loss(S[: len(M)], M)
         with torch.no_grad():
             shapes = S[: len(M)] + left.residual @ M.mT
             # Contiguous, as a checkpoint keeps it: the layout decides the last bit of a product.
@@ -169,8 +169,8 @@ class Objective:
         P_bar = visible_centre(residual_bar, task.mask).neg_()
         torch.matmul(P_bar, M[:b].mT, out=S_bar[:b])
         torch.matmul(S[:b].mT, P_bar, out=M_bar[:b])
-        if self.anatomy:
-            S_bar[:b] += self.anatomy.gradient(S[:b], M[:b])
+        if self.layout_loss:
+            S_bar[:b] += self.layout_loss.gradient(S[:b], M[:b])
         if left.cycle is not None:
             again_bar = self._weighed(net, self.recipe.cycle * left.cycle.gradient())
             torch.sub(again_bar, again_bar.mean(-2, keepdim=True), out=S_bar[b:])

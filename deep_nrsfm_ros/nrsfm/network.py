@@ -63,7 +63,7 @@ class Architecture:
             raise ValueError("widths is empty; give the width of at least one dictionary")
 
     @property
-    def usual(self) -> bool:
+    def is_default_variant(self) -> bool:
         """Tell whether it is of the kind that is written out by hand: its gradient, the kernel."""
         usual = type(self)
         ours = self.threshold, self.recovery, self.camera
@@ -127,18 +127,22 @@ def weight_shapes(architecture: Architecture, p: int) -> dict[str, tuple[int, ..
 
 
 def initialise(
-    architecture: Architecture, p: int, rng: np.random.Generator, *, as_released: bool = False
+    architecture: Architecture,
+    p: int,
+    rng: np.random.Generator,
+    *,
+    paper_initialisation: bool = False,
 ) -> Network:
     """Return a float32 network of Glorot-uniform dictionaries and heads, not yet whitened.
 
-    Thresholds and biases start at zero. `as_released` starts as the authors' release does: it
+    Thresholds and biases start at zero. `paper_initialisation` starts as the authors' release: it
     draws them too, which silences 20-40 % of the narrowest layer from the start, and its fans
     are those of the convolutions ("Variation of implementation").
     """
     weights = {}
     for name, shape in weight_shapes(architecture, p).items():
-        fan = _convolution_fan(name, shape) if as_released else _matrix_fan(shape)
-        limit = 0.0 if name.startswith("b") and not as_released else (6 / fan) ** 0.5
+        fan = _convolution_fan(name, shape) if paper_initialisation else _matrix_fan(shape)
+        limit = 0.0 if name.startswith("b") and not paper_initialisation else (6 / fan) ** 0.5
         weights[name] = rng.uniform(-limit, limit, shape).astype(np.float32)
     weights |= {name: np.eye(p, dtype=np.float32) for name in ("L", "L_inverse")}
     return Network.from_named(architecture, weights)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Recipe:
         0.0, "highest noise added to the input, relative to its size", low=0.0, high=1.0
     )
     mask: float = option(0.0, "highest share of points hidden in the input", low=0.0, high=0.9)
-    as_released: bool = option(
+    paper_initialisation: bool = option(
         False, "start as the paper's release: random biases, convolutions' fans"
     )
     seeds: int = option(
@@ -44,27 +44,27 @@ class Recipe:
 
 
 @dataclass(frozen=True)
-class Anatomy:
+class LayoutLossWeights:
     """What the layout knows of the object.
 
     All is off by default, as in the paper, which knows nothing of bones and fronts.
     """
 
-    bones: float = option(
+    bone_length_weight: float = option(
         0.0,
         "weight of bones that keep their lengths, left ones as long as right ones, for an object "
         "whose edges are rigid that was seen from one side only; 3 is much; 0: none",
         low=0.0,
         high=1000.0,
     )
-    front: float = option(
+    handedness_weight: float = option(
         0.0,
         "weight of the handedness while training: the keypoints that the layout says are in front "
         "should be; for the same objects, 1 is much; 0: none",
         low=0.0,
         high=1000.0,
     )
-    flat: float = option(
+    depth_penalty: float = option(
         0.0,
         "weight of depth, so that there is no more of it than the rest asks for, bones that keep "
         "their lengths above all; for the same objects, 0.3 is much; 0: none",
@@ -74,7 +74,7 @@ class Anatomy:
 
     def check(self, layout: KeypointLayout) -> None:
         """Raise ValueError if the layout has nothing of what is asked for."""
-        for weight, field in (("bones", "edges"), ("front", "handedness")):
+        for weight, field in (("bone_length_weight", "edges"), ("handedness_weight", "handedness")):
             asked = getattr(self, weight)
             if asked and not getattr(layout, field):
                 raise ValueError(
@@ -102,7 +102,7 @@ PRESETS: dict[str, Preset] = {
             learning_rate=1e-3,
             schedule="exponential",
             cycle=0.0,
-            as_released=True,
+            paper_initialisation=True,
             seeds=1,
         ),
     ),

@@ -13,16 +13,16 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.nrsfm.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
-from deep_nrsfm_ros.observations.curation import Curated, apart
-from deep_nrsfm_ros.observations.ensemble import Ensemble
-from deep_nrsfm_ros.observations.variation import Variation
+from deep_nrsfm_ros.data.curation import Curated, apart
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.sufficiency import Variation
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
 from deep_nrsfm_ros.reporting.shapes import LiftedFrames, fit, lift_sample, shape_space
 from deep_nrsfm_ros.reporting.template import embedded, render
 
 if TYPE_CHECKING:
-    from deep_nrsfm_ros.nrsfm.progress import Progress
+    from deep_nrsfm_ros.training.progress import Progress
 
 REPORT_SUFFIX = ".html"
 
@@ -42,14 +42,14 @@ _CAMERA_TO_SCREEN = np.array([1, -1, -1])  # x right, y down, z forward to x rig
 class Training:
     """What there is to report.
 
-    model: as it was saved at `path`. ensemble: what it was trained on, of which `curated` tells
+    model: as it was saved at `path`. dataset: what it was trained on, of which `curated` tells
     where it comes from. progress: every report of the training, in order. warnings: whatever else
     its user should know.
     """
 
     model: Model
     path: Path
-    ensemble: Ensemble
+    dataset: Dataset
     curated: Curated
     variation: Variation
     progress: Sequence[Progress]
@@ -74,12 +74,12 @@ def write_report(training: Training, folders: Sequence[Path]) -> Path:
 
 def page(training: Training, folders: Sequence[Path] = ()) -> str:
     """Return the report as HTML; names and other data are escaped."""
-    model, ensemble, variation = training.model, training.ensemble, training.variation
-    found = lift_sample(model, ensemble)
+    model, dataset, variation = training.model, training.dataset, training.variation
+    found = lift_sample(model, dataset)
     scenes: list[dict[str, Any]] = []
-    shapes = _shapes(model, found, ensemble.visible.sum(0) > 0, scenes)
+    shapes = _shapes(model, found, dataset.visible.sum(0) > 0, scenes)
     order = np.argsort(found.lifted.residual, kind="stable")
-    gap = _APART * len(ensemble)
+    gap = _APART * len(dataset)
     frames = {
         "Best": _frames(apart(order, found.frames, gap, _FRAMES), found, training, scenes),
         "Worst": _frames(apart(order[::-1], found.frames, gap, _FRAMES), found, training, scenes),
@@ -135,9 +135,9 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
     rows = []
     for model in models:
         here = None
-        if model.layout.keypoints == training.ensemble.layout.keypoints:
+        if model.layout.keypoints == training.dataset.layout.keypoints:
             try:
-                here = fit(model, training.ensemble)
+                here = fit(model, training.dataset)
             except ValueError:
                 pass  # it lifts none of these frames
         quality = [model.quality.get(key) for key in _QUALITY]
@@ -163,11 +163,11 @@ def _frames(
 ) -> list[Any]:
     """Return (frame, residual, detections, index of the lifted scene) of the chosen places."""
     shown = []
-    ensemble, layout = training.ensemble, training.model.layout
+    dataset, layout = training.dataset, training.model.layout
     for k in chosen:
         frame = int(found.frames[k])
-        visible = ensemble.visible[frame]
-        drawing = skeleton(ensemble.points[frame], visible, layout)
+        visible = dataset.visible[frame]
+        drawing = skeleton(dataset.points[frame], visible, layout)
         place = int(training.curated.frames[frame])
         shown.append((place, float(found.lifted.residual[k]), drawing, len(scenes)))
         lifted = found.lifted.shapes[k] * _CAMERA_TO_SCREEN

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.observations.observation import Observation
-from deep_nrsfm_ros.observations.recording import Recording
+from deep_nrsfm_ros.data.recording import Recording
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.reporting.drawing import edge_colours
 from deep_nrsfm_ros.reporting.template import embedded, render
 

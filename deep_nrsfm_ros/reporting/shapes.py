@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
+from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import (
     align,
     centre,
@@ -14,11 +17,8 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     rotation_from_camera,
 )
 from deep_nrsfm_ros.nrsfm.handedness import disagreement
-from deep_nrsfm_ros.nrsfm.lifting import Lifted, Lifter, lift_all
-from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import forward
-from deep_nrsfm_ros.nrsfm.normaliser import observe
-from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.nrsfm.normalisation import observe
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ class ShapeSpace(NamedTuple):
 
 
 class LiftedFrames(NamedTuple):
-    """Frames (n,) of an ensemble as a model lifts them, the ones that cannot be lifted left out."""
+    """Frames (n,) of an dataset as a model lifts them, the ones that cannot be lifted left out."""
 
     frames: NDArray[np.int64]
     lifted: Lifted
@@ -57,10 +57,10 @@ class Fit(NamedTuple):
     turned: float
 
 
-def lift_sample(model: Model, ensemble: Ensemble, most: int = _SAMPLE) -> LiftedFrames:
+def lift_sample(model: Model, dataset: Dataset, most: int = _SAMPLE) -> LiftedFrames:
     """Lift up to `most` frames, evenly spread; raise ValueError if none can be lifted."""
-    frames = np.unique(np.linspace(0, len(ensemble) - 1, min(most, len(ensemble))).astype(int))
-    chosen = ensemble[frames]
+    frames = np.unique(np.linspace(0, len(dataset) - 1, min(most, len(dataset))).astype(int))
+    chosen = dataset[frames]
     lifted = lift_all(Lifter(model), chosen.points, chosen.visible.astype(np.float32))
     sound = np.isfinite(lifted.shapes).all((1, 2)) & np.isfinite(lifted.residual)
     if not sound.any():
@@ -68,16 +68,16 @@ def lift_sample(model: Model, ensemble: Ensemble, most: int = _SAMPLE) -> Lifted
     return LiftedFrames(frames[sound], Lifted(*(array[sound] for array in lifted)))
 
 
-def doubt(model: Model, ensemble: Ensemble) -> str:
+def doubt(model: Model, dataset: Dataset) -> str:
     """Return what the lifted frames say against the model's depth, "" if nothing.
 
     See `handedness.disagreement`; only keypoints that were seen count.
     """
     try:
-        frames, lifted = lift_sample(model, ensemble)
+        frames, lifted = lift_sample(model, dataset)
     except ValueError:
         return ""  # no frame is lifted: there is no depth to doubt
-    return disagreement(lifted.shapes, model.layout, ensemble.visible[frames])
+    return disagreement(lifted.shapes, model.layout, dataset.visible[frames])
 
 
 def shape_space(model: Model, lifted: Lifted, modes: int = 4) -> ShapeSpace:
@@ -116,12 +116,12 @@ def _to_screen(model: Model, mean: Floats) -> Floats:
     return turn
 
 
-def fit(model: Model, ensemble: Ensemble, most: int = 128) -> Fit:
+def fit(model: Model, dataset: Dataset, most: int = 128) -> Fit:
     """Return how well a model explains up to `most` frames of its own layout.
 
     Raises ValueError if it lifts none of them.
     """
-    frames, found = lift_sample(model, ensemble, most)
+    frames, found = lift_sample(model, dataset, most)
     T = centre(found.shapes) @ _turns(len(frames))
     views, confidence = T[..., :2].astype(np.float32), np.ones(T.shape[:2], np.float32)
     again = lift_all(Lifter(model), views, confidence)
@@ -129,15 +129,15 @@ def fit(model: Model, ensemble: Ensemble, most: int = 128) -> Fit:
     after = again.shapes[sound] * again.scale[sound, None, None]
     return Fit(
         float(found.residual.mean()),
-        cycle_error(model, ensemble[frames]),
+        cycle_error(model, dataset[frames]),
         _difference(after, T[sound]),
     )
 
 
-def cycle_error(model: Model, ensemble: Ensemble) -> float:
+def cycle_error(model: Model, dataset: Dataset) -> float:
     """Return the mean of ||S' - S|| / ||S||: S' is the network's shape of S seen from elsewhere."""
-    mask = ensemble.visible[..., None].astype(np.float32)
-    seen = observe(model.network, model.normaliser, ensemble.points, mask)
+    mask = dataset.visible[..., None].astype(np.float32)
+    seen = observe(model.network, model.normaliser, dataset.points, mask)
     S, M = forward(model.network, seen.W * seen.gain)
     residual = (seen.W - S @ M) * mask
     residual -= mask * residual.sum(1, keepdims=True) / np.maximum(mask.sum(1, keepdims=True), 1)

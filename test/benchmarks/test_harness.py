@@ -14,11 +14,11 @@ from benchmarks import harness
 from benchmarks.harness import Session, across, command, in_pairs
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE
-from deep_nrsfm_ros.nrsfm import training
-from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.recipe import Preset
-from deep_nrsfm_ros.nrsfm.trainer import Trainer
-from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.training import loop as training
+from deep_nrsfm_ros.training.trainer import Trainer
 
 STEPS = 23  # snapshots do not divide it
 
@@ -33,7 +33,7 @@ def session(data: Path, tmp_path: Path) -> Session:
 
 
 @pytest.fixture
-def ensemble(session: Session) -> Ensemble:
+def dataset(session: Session) -> Dataset:
     return session.mocap(["01"], "train")
 
 
@@ -84,44 +84,44 @@ def test_preset_has_seed_steps_and_options(session: Session) -> None:
 
 
 def test_snapshots_are_those_of_one_uninterrupted_training(
-    session: Session, ensemble: Ensemble, preset: Preset
+    session: Session, dataset: Dataset, preset: Preset
 ) -> None:
-    models = session.snapshots("a title", ensemble, preset)
+    models = session.snapshots("a title", dataset, preset)
     steps = [model.provenance["step"] for model in models]
     assert steps == [3, 5, 7, 10, 12, 14, 17, 19, 21, 23]
     seconds = [model.provenance["cpu_seconds"] for model in models]
     assert seconds == sorted(seconds) and seconds[-1] > 0
-    whole = training.train(ensemble.points, ensemble.visible, preset)
-    assert same(models[-1], training.finish(whole, "x", ensemble.layout, ensemble.source))
+    whole = training.train(dataset.points, dataset.visible, preset)
+    assert same(models[-1], training.finish(whole, "x", dataset.layout, dataset.source))
     assert not same(models[-2], models[-1])
 
 
 def test_what_is_trained_is_not_trained_again(
-    session: Session, ensemble: Ensemble, preset: Preset, count_steps: Callable[..., list[int]]
+    session: Session, dataset: Dataset, preset: Preset, count_steps: Callable[..., list[int]]
 ) -> None:
     steps = count_steps()
-    first = session.trained("a title", ensemble, preset)
+    first = session.trained("a title", dataset, preset)
     assert steps == [0, 1, 0, 1, 0, 1, *range(2, STEPS)]  # three seeds, of which one goes on
-    again = session.trained("a title", ensemble, preset)
+    again = session.trained("a title", dataset, preset)
     assert len(steps) == 6 + STEPS - 2 and same(first, again)
     assert first.provenance == again.provenance
 
 
 def test_goes_on_where_it_stopped(
     session: Session,
-    ensemble: Ensemble,
+    dataset: Dataset,
     preset: Preset,
     count_steps: Callable[..., list[int]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(harness, "CHECKPOINT_SECONDS", 0.0)
-    whole = session.trained("a title", ensemble, preset)
+    whole = session.trained("a title", dataset, preset)
     elsewhere = dataclasses.replace(session, output=session.output / "elsewhere")
     count_steps(limit=11)
     with pytest.raises(StoppedError):
-        elsewhere.trained("a title", ensemble, preset)
+        elsewhere.trained("a title", dataset, preset)
     steps = count_steps()
-    resumed = elsewhere.trained("a title", ensemble, preset)
+    resumed = elsewhere.trained("a title", dataset, preset)
     assert steps[0] == 7 and same(whole, resumed)  # 3 x 2 to choose the seed, 5 to go on
     assert not list(elsewhere.output.glob("models/*/checkpoint"))
 
@@ -143,18 +143,18 @@ def test_goes_on_where_it_stopped(
     ids=["seed", "recipe", "architecture", "normaliser", "frames", "points", "visible"],
 )
 def test_another_training_is_another(
-    session: Session, ensemble: Ensemble, preset: Preset, change: Any
+    session: Session, dataset: Dataset, preset: Preset, change: Any
 ) -> None:
-    session.trained("a title", ensemble, preset)
-    session.trained("a title", *change(ensemble, preset))
+    session.trained("a title", dataset, preset)
+    session.trained("a title", *change(dataset, preset))
     assert len(list(session.output.glob("models/a-title-*"))) == 2
 
 
 def test_across_gives_both_errors_of_every_test(
-    session: Session, ensemble: Ensemble, preset: Preset
+    session: Session, dataset: Dataset, preset: Preset
 ) -> None:
-    model = session.trained("a title", ensemble, preset)
-    row = across({"x": (model, ensemble), "y": (model, ensemble)}, ALONE)
+    model = session.trained("a title", dataset, preset)
+    row = across({"x": (model, dataset), "y": (model, dataset)}, ALONE)
     assert list(row) == in_pairs(["x", "y"]) == ["x", "x proper", "y", "y proper"]
     assert 0 < row["x"] <= row["x proper"] and row["x"] == row["y"]
 

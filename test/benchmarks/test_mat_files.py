@@ -27,11 +27,11 @@ def test_sequence_with_a_world_is_centred_images_and_truth(tmp_path, shapes):
     savemat(tmp_path / "walk.mat", {"W": rows(shapes @ cameras), "S": rows(shapes)})
     sequence = read_sequence(tmp_path / "walk.mat")
     assert not sequence.in_camera_axes
-    assert sequence.ensemble.shapes is not None
-    np.testing.assert_allclose(sequence.ensemble.shapes, centred(shapes), atol=1e-5)
-    np.testing.assert_allclose(sequence.ensemble.points, centred(shapes) @ cameras, atol=1e-5)
-    assert sequence.ensemble.visible.all()
-    assert sequence.ensemble.source == "walk"
+    assert sequence.dataset.shapes is not None
+    np.testing.assert_allclose(sequence.dataset.shapes, centred(shapes), atol=1e-5)
+    np.testing.assert_allclose(sequence.dataset.points, centred(shapes) @ cameras, atol=1e-5)
+    assert sequence.dataset.visible.all()
+    assert sequence.dataset.source == "walk"
 
 
 def test_sequence_without_a_world_has_its_truth_in_camera_axes(tmp_path, shapes):
@@ -39,8 +39,8 @@ def test_sequence_without_a_world_has_its_truth_in_camera_axes(tmp_path, shapes)
     savemat(tmp_path / "face.mat", {"W": rows(shapes[..., :2]), "GT": truth})
     sequence = read_sequence(tmp_path / "face.mat")
     assert sequence.in_camera_axes
-    assert sequence.ensemble.shapes is not None
-    np.testing.assert_allclose(sequence.ensemble.shapes[..., :2], sequence.ensemble.points)
+    assert sequence.dataset.shapes is not None
+    np.testing.assert_allclose(sequence.dataset.shapes[..., :2], sequence.dataset.points)
 
 
 def test_category_is_a_shape_an_object(tmp_path, shapes):

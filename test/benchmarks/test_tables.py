@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import ablation, batches, coherence, mirror, missing, noise, nrsfm_on_cmu, unseen
+from benchmarks.baselines import batches
 from benchmarks.harness import Session
+from benchmarks.paper import ablation, coherence, mirror, nrsfm_on_cmu, unseen
+from benchmarks.robustness import missing, noise
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import ALONE, LIFTING
+from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
-from deep_nrsfm_ros.observations.ensemble import Ensemble
 
 LONE = ("--subjects", "01", "--seeds", "0", "1", "--steps", "3")
 ALL_TABLES = [nrsfm_on_cmu, mirror, ablation, unseen, noise, missing, coherence]
@@ -44,14 +46,14 @@ def session(data: Path, tmp_path: Path) -> Session:
 
 
 @pytest.fixture
-def ensemble(session: Session) -> Ensemble:
+def dataset(session: Session) -> Dataset:
     return session.mocap(["01"], "train")
 
 
-def known(ensemble: Ensemble) -> dict[bytes, Any]:
+def known(dataset: Dataset) -> dict[bytes, Any]:
     """Return the true shape of each frame's points."""
-    assert ensemble.shapes is not None
-    frames = zip(ensemble.points, ensemble.shapes, strict=True)
+    assert dataset.shapes is not None
+    frames = zip(dataset.points, dataset.shapes, strict=True)
     return {points.tobytes(): shape for points, shape in frames}
 
 
@@ -101,12 +103,10 @@ def test_papers_table_is_whole() -> None:
     assert all(len(subjects) == 10 for subjects in nrsfm_on_cmu.PAPER.values())
 
 
-def test_batches_are_compared_one_by_one(
-    ensemble: Ensemble, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_batches_are_compared_one_by_one(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "BATCH", 8)
-    monkeypatch.setattr("benchmarks.baselines.BATCH", 8)
-    S = known(ensemble)
+    monkeypatch.setattr("benchmarks.baselines.methods.BATCH", 8)
+    S = known(dataset)
     turns = iter([1, -1, 1, -1])
 
     def mirrors_every_other_batch(W: Any) -> Any:
@@ -114,24 +114,24 @@ def test_batches_are_compared_one_by_one(
         shapes = np.stack([S[points.tobytes()] for points in W])
         return 3 * shapes * np.array([1, 1, next(turns)])
 
-    errors = batches.batch_errors(mirrors_every_other_batch, ensemble)
+    errors = batches.batch_errors(mirrors_every_other_batch, dataset)
     assert errors.shape == pytest.approx(0, abs=1e-5)
     assert errors.proper == pytest.approx(0, abs=1e-5) and errors.mirrored == 0
     assert errors.unscaled == pytest.approx(2, abs=1e-5)
 
 
 def test_baselines_are_solved_once(
-    session: Session, ensemble: Ensemble, monkeypatch: pytest.MonkeyPatch
+    session: Session, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = batches.solve(session, "rigid factorisation (Tomasi-Kanade)", ensemble)
+    first = batches.solve(session, "rigid factorisation (Tomasi-Kanade)", dataset)
     monkeypatch.setattr(batches, "_solve", None)
-    assert batches.solve(session, "rigid factorisation (Tomasi-Kanade)", ensemble) == first
+    assert batches.solve(session, "rigid factorisation (Tomasi-Kanade)", dataset) == first
 
 
 def test_rank_is_the_one_of_lowest_error(
-    session: Session, ensemble: Ensemble, monkeypatch: pytest.MonkeyPatch
+    session: Session, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    S = known(ensemble)
+    S = known(dataset)
 
     def best_at_five(W: Any, K: int) -> Any:
         shapes = np.stack([S[points.tobytes()] for points in W])
@@ -139,32 +139,32 @@ def test_rank_is_the_one_of_lowest_error(
         return shapes + 0.01 * abs(K - 5) * noise
 
     monkeypatch.setitem(batches.BASELINES, "known", best_at_five)
-    solved = batches.solve(session, "known", ensemble)
+    solved = batches.solve(session, "known", dataset)
     assert solved.rank == 5 and solved.errors.shape < 1e-5
 
 
-def test_noise_has_the_ratio_asked_for(ensemble: Ensemble) -> None:
-    added = noise.disturbed(ensemble, 0.2).points - ensemble.points
-    ratio = np.linalg.norm(added, axis=(1, 2)) / np.linalg.norm(ensemble.points, axis=(1, 2))
+def test_noise_has_the_ratio_asked_for(dataset: Dataset) -> None:
+    added = noise.disturbed(dataset, 0.2).points - dataset.points
+    ratio = np.linalg.norm(added, axis=(1, 2)) / np.linalg.norm(dataset.points, axis=(1, 2))
     np.testing.assert_allclose(ratio, 0.2, rtol=1e-5)
-    assert noise.disturbed(ensemble, 0.0) is ensemble
+    assert noise.disturbed(dataset, 0.0) is dataset
 
 
 @pytest.mark.parametrize(("what", "count"), [("0", 0), ("1", 1), ("9", 9), ("arm", 6), ("leg", 4)])
-def test_hides_points(ensemble: Ensemble, what: str, count: int) -> None:
-    test = missing.hidden(ensemble, what)
+def test_hides_points(dataset: Dataset, what: str, count: int) -> None:
+    test = missing.hidden(dataset, what)
     assert ((~test.visible).sum(1) == count).all()
     assert (test.points[~test.visible] == 0).all()
-    np.testing.assert_array_equal(test.points[test.visible], ensemble.points[test.visible])
+    np.testing.assert_array_equal(test.points[test.visible], dataset.points[test.visible])
     if what in missing.LIMBS:
         sides = {tuple(np.flatnonzero(~frame)) for frame in test.visible}
-        names = {"".join(ensemble.layout.keypoints[i][0] for i in side) for side in sides}
+        names = {"".join(dataset.layout.keypoints[i][0] for i in side) for side in sides}
         assert names == {"l" * count, "r" * count}
 
 
-def test_similarity_forgives_the_scale_only(session: Session, ensemble: Ensemble) -> None:
-    model = session.trained("a title", ensemble, session.preset("default", 0))
-    found = unseen.errors(model, ensemble, ALONE)
+def test_similarity_forgives_the_scale_only(session: Session, dataset: Dataset) -> None:
+    model = session.trained("a title", dataset, session.preset("default", 0))
+    found = unseen.errors(model, dataset, ALONE)
     assert 0 < found["similarity %"] < found["proper %"] + 1e-6 or found["mirrored %"] > 0
 
 
@@ -186,9 +186,9 @@ def test_correlation_has_its_sign_and_choice_its_error() -> None:
 
 @pytest.mark.parametrize("name", list(ablation.VARIANTS))
 def test_a_variant_is_the_default_but_for_what_it_changes(
-    few: None, session: Session, ensemble: Ensemble, name: str
+    few: None, session: Session, dataset: Dataset, name: str
 ) -> None:
-    model = ablation.trained(session, "01", ensemble, name, 0)
+    model = ablation.trained(session, "01", dataset, name, 0)
     architecture, recipe = ablation.VARIANTS[name]
     default = session.preset("default", 0)
     assert model.network.architecture == dataclasses.replace(default.architecture, **architecture)

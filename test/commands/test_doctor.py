@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from deep_nrsfm_ros.commands import doctor
-from deep_nrsfm_ros.nrsfm import compiled
+from deep_nrsfm_ros.lifting import compiled_backend as compiled
 
 
 def test_a_sound_installation_has_nothing_to_mend(tmp_path: Path) -> None:

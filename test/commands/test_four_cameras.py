@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.commands.evaluate import main
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
-from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
+from deep_nrsfm_ros.data.cameras import Camera
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.observations.cameras import Camera
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 WHEEL = "pose2sim-0.6.0-py3-none-any.whl"
 

@@ -10,9 +10,9 @@ import pytest
 
 from deep_nrsfm_ros.commands.lift import arguments, main
 from deep_nrsfm_ros.configuration import options
-from deep_nrsfm_ros.nrsfm.keypoints import COCO17
-from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
-from deep_nrsfm_ros.observations.keypoint_files import read_keypoints
+from deep_nrsfm_ros.data.keypoint_files import read_keypoints
+from deep_nrsfm_ros.layouts.keypoint_layout import COCO17
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 
 HEIGHTS = {
     "nose": 0,
@@ -101,7 +101,7 @@ def test_a_bag_of_it_can_be_lifted_again(people: Path, tmp_path: Path) -> None:
         (["--model", "nobody"], "no model 'nobody'"),
         (["--output", "out.bvh"], "suffix '.bvh'"),
         (["--output", "nowhere/out.npz"], "nowhere"),
-        (["--turns", "0"], "turns is 0; it must be at least 1"),
+        (["--test-time-rotations", "0"], "test_time_rotations is 0; it must be at least 1"),
     ],
 )
 def test_what_is_wrong_is_said(

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.commands import models
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
-from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 PROVENANCE = {"data": "bags kitchen, yard", "frames": 321, "step": 4000, "date": "2025-03-04"}
 QUALITY = {"reprojection_error": 0.1234, "cycle_error": 0.5678}

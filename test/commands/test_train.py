@@ -19,14 +19,14 @@ import torch
 
 import deep_nrsfm_ros
 from deep_nrsfm_ros.commands import train
+from deep_nrsfm_ros.data.bags import frames, write_bag
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.layouts.keypoint_layout import COCO17, HUMAN17
+from deep_nrsfm_ros.layouts.object_file import read_object
+from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
-from deep_nrsfm_ros.nrsfm.keypoints import COCO17, HUMAN17
-from deep_nrsfm_ros.nrsfm.lifting import Lifter
-from deep_nrsfm_ros.nrsfm.model_file import Model, load_model, save_model
-from deep_nrsfm_ros.nrsfm.object_file import read_object
-from deep_nrsfm_ros.nrsfm.trainer import Trainer
-from deep_nrsfm_ros.observations.bags import frames, write_bag
-from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.training.trainer import Trainer
 
 DEADLINE = 90.0
 QUICK = ("--widths", "8", "4", "--batch", "8", "--threads", "1", "--name", "mine")
@@ -361,8 +361,8 @@ def test_the_ground_truth_is_not_read(
     points, confidence = people()
     found = []
     for shapes in (None, np.full((60, 17, 3), np.nan, np.float32)):
-        ensemble = Ensemble(points, confidence > 0, COCO17, "made up", shapes)
-        monkeypatch.setattr(train, "read_data", lambda given, report, e=ensemble: e)
+        dataset = Dataset(points, confidence > 0, COCO17, "made up", shapes)
+        monkeypatch.setattr(train, "read_data", lambda given, report, e=dataset: e)
         assert in_process(*arguments, "--steps", "5") == 0
         found.append(load_model(models / "mine.safetensors"))
     assert found[0].quality == found[1].quality
@@ -482,7 +482,7 @@ def test_data_that_cannot_work_is_refused_before_training(
     flat = people(1)[0][0] * rng.uniform(0.5, 2, (60, 1, 1))
     flat += rng.standard_normal(flat.shape)
     words = write_people(tmp_path / "flat", flat.astype(np.float32))
-    assert in_process(*words, "--thin", "0") == 2
+    assert in_process(*words, "--min-change", "0") == 2
     assert "the views are flat" in capsys.readouterr().err
     assert in_process(*words) == 2  # thinned to next to nothing
     assert "at least 10 that differ are needed" in capsys.readouterr().err
@@ -499,7 +499,7 @@ def test_what_the_data_was_spared_is_said_and_an_option_turns_it_off(
     assert "warning: 60 frames are few" in said.err
     assert "60 frames are few" in (tmp_path / "mine.html").read_text()
     assert load_model(tmp_path / "mine.safetensors").provenance["frames"] == 60
-    assert in_process(*words, "--steps", "2", "--thin", "0") == 0
+    assert in_process(*words, "--steps", "2", "--min-change", "0") == 0
     assert load_model(tmp_path / "mine.safetensors").provenance["frames"] == 120
 
 
@@ -513,7 +513,7 @@ def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
     monkeypatch.setattr(train, "stop_with_parent", lambda stopped: stopped)
     words = (*arguments, "--steps", "3")
     for told in ("", "no depth in mine"):
-        monkeypatch.setattr(train, "doubt", lambda model, ensemble, told=told: told)
+        monkeypatch.setattr(train, "doubt", lambda model, dataset, told=told: told)
         assert in_process(*words, "--json-progress") == 0
         *_, end = map(json.loads, capsys.readouterr().out.splitlines())
         assert (end["state"], end.get("warning", "")) == ("finished", told)

@@ -21,9 +21,9 @@ from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 
-from deep_nrsfm_ros.nrsfm.keypoints import BODY25B, MEDIAPIPE33
-from deep_nrsfm_ros.observations.messages import POINT_CLOUD, MessageError, read
-from deep_nrsfm_ros.observations.pose2sim import JOINTS, extract_videos, read_session
+from deep_nrsfm_ros.data.pose2sim import JOINTS, extract_videos, read_session
+from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, MEDIAPIPE33
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, MessageError, read
 
 SIZE = (40, 60)  # height and width
 DEADLINE = 60.0

@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.node.pipeline import InputOptions, Pipeline
-from deep_nrsfm_ros.nrsfm.keypoints import KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import Lifted, LiftingOptions
-from deep_nrsfm_ros.nrsfm.model_file import Model
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifted, LiftingOptions
+from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.decoding import InputType
+from deep_nrsfm_ros.messages.pipeline import InputOptions, Pipeline
+from deep_nrsfm_ros.messages.serialised import Reader
+from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
-from deep_nrsfm_ros.observations.messages import InputType
-from deep_nrsfm_ros.observations.serialised import Reader
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 INPUTS = int(os.environ.get("FUZZ", "200"))
 FIRST = int(os.environ.get("FUZZ_FIRST", "0"))
@@ -149,9 +149,9 @@ class Bench:
     def pipeline(self, model: Model | None = None, quick: bool = False) -> Pipeline:
         """Return a pipeline; `quick`: that lifts only once, as is."""
         inputs = InputOptions(image_width=640, image_height=480)
-        plain = LiftingOptions(correction="none", refill=0, turns=1)
+        plain = LiftingOptions(correction="none", refill=0, test_time_rotations=1)
         lifting = plain if quick else LiftingOptions()
-        return Pipeline(model or self.model, None, inputs, lifting, SteadyingOptions())
+        return Pipeline(model or self.model, None, inputs, lifting, SmoothingOptions())
 
     @staticmethod
     def lift(

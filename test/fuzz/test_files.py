@@ -11,13 +11,13 @@ from types import SimpleNamespace
 import apsw
 import numpy as np
 
-from deep_nrsfm_ros.nrsfm.model_file import ModelFileError, load_model, save_model
-from deep_nrsfm_ros.nrsfm.object_file import ObjectFileError, read_object
-from deep_nrsfm_ros.observations import bags
-from deep_nrsfm_ros.observations.bags import BagError, frames, read_bags, write_bag
-from deep_nrsfm_ros.observations.keypoint_files import KeypointFileError, read_keypoints
-from deep_nrsfm_ros.observations.mapping_file import MappingError, read_mapping
-from deep_nrsfm_ros.observations.messages import POINT_CLOUD
+from deep_nrsfm_ros.data import bags
+from deep_nrsfm_ros.data.bags import BagError, frames, read_bags, write_bag
+from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
+from deep_nrsfm_ros.layouts.object_file import ObjectFileError, read_object
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
+from deep_nrsfm_ros.messages.mapping_file import MappingError, read_mapping
+from deep_nrsfm_ros.model_files.model_file import ModelFileError, load_model, save_model
 
 ROOT = Path(__file__).resolve().parents[2]
 YAML = (b"*a", b"&a", b"!!int ''", b"<<: ", b"[", b"{", b"? ", b": ", b"\n- ", b"'", b"\x00",
@@ -48,7 +48,7 @@ def test_a_bag_is_read_or_refused(bench, fuzz, tmp_path):
         try:
             named = [path if with_metadata else path / data]
             reading = read_bags(named, "", layout, layout, max_frames=1000)
-            assert len(reading.ensemble) <= 1000
+            assert len(reading.dataset) <= 1000
         except BagError as refusal:
             assert str(refusal)
             return "refused"

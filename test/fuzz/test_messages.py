@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from deep_nrsfm_ros.observations import bags
-from deep_nrsfm_ros.observations.bags import frames
-from deep_nrsfm_ros.observations.camera_info import read_camera_info
-from deep_nrsfm_ros.observations.field_mapping import SKELETON_2D, YOLO, FieldMapping
-from deep_nrsfm_ros.observations.messages import MULTI_ARRAY, POINT_CLOUD, POLYGON, read
-from deep_nrsfm_ros.observations.serialised import Reader
+from deep_nrsfm_ros.data import bags
+from deep_nrsfm_ros.data.bags import frames
+from deep_nrsfm_ros.messages.camera_info import read_camera_info
+from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY, POINT_CLOUD, POLYGON, read
+from deep_nrsfm_ros.messages.field_mapping import SKELETON_2D, YOLO, FieldMapping
+from deep_nrsfm_ros.messages.serialised import Reader
 
 KINDS = (POINT_CLOUD, MULTI_ARRAY, POLYGON)
 BY_NUMBER = FieldMapping(

@@ -9,23 +9,23 @@ import numpy as np
 from rclpy.parameter import Parameter
 
 from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.data import bags
+from deep_nrsfm_ros.data.bags import frames
+from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
+from deep_nrsfm_ros.messages.pipeline import InputOptions, Pipeline
+from deep_nrsfm_ros.model_files.model_file import save_model
+from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameters as ros_parameters
-from deep_nrsfm_ros.node.fence import Fence
 from deep_nrsfm_ros.node.lifter import LifterNode
 from deep_nrsfm_ros.node.parameters import name_of
-from deep_nrsfm_ros.node.pipeline import InputOptions, Pipeline
-from deep_nrsfm_ros.node.training_job import parse_progress
-from deep_nrsfm_ros.node.training_request import TrainingOptions, fenced
-from deep_nrsfm_ros.node.unfinished import look, record_file
-from deep_nrsfm_ros.nrsfm.lifting import LiftingOptions
-from deep_nrsfm_ros.nrsfm.limits import Limits
-from deep_nrsfm_ros.nrsfm.model_file import save_model
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
-from deep_nrsfm_ros.nrsfm.steadying import SteadyingOptions
-from deep_nrsfm_ros.observations import bags
-from deep_nrsfm_ros.observations.bags import frames
-from deep_nrsfm_ros.observations.curation import Curation
-from deep_nrsfm_ros.observations.messages import POINT_CLOUD
+from deep_nrsfm_ros.training.job import parse_progress
+from deep_nrsfm_ros.training.limits import Limits
+from deep_nrsfm_ros.training.record import look, record_file
+from deep_nrsfm_ros.training.request import TrainingOptions, sandboxed
 
 PATHS = ("thing", "link", "link.safetensors", "/etc/passwd", "~", "~x/y.yaml", "coco17", "model",
          "thing.safetensors", "../" * 9, "numbered", "a.yaml", "x" * 5000)  # fmt: skip
@@ -51,8 +51,8 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(bench, fuzz, tmp_
     (tmp_path / "link.safetensors").symlink_to("/etc/passwd")
     inputs = InputOptions(model="thing", models_dir=str(tmp_path), bags_dir=str(tmp_path))
     stub = SimpleNamespace(get_parameter_or=lambda name, default: default)
-    stub._fence = Fence(tmp_path, tmp_path, ["thing"])
-    stub._pipeline = Pipeline(bench.model, None, inputs, LiftingOptions(), SteadyingOptions())
+    stub._fence = PathSandbox(tmp_path, tmp_path, ["thing"])
+    stub._pipeline = Pipeline(bench.model, None, inputs, LiftingOptions(), SmoothingOptions())
     stub._prepare = lambda changes: LifterNode._prepare(stub, changes)
     p = len(bench.layout)
     points = np.random.default_rng(0).uniform(50, 600, (1, p, 2))
@@ -60,7 +60,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(bench, fuzz, tmp_
     expected = bench.lift(stub._pipeline, valid, POINT_CLOUD)
     known = [(c, "") for c in (InputOptions, LiftingOptions)]
     known += [(c, "train.") for c in (TrainingOptions, Recipe, Limits, Curation)]
-    known += [(SteadyingOptions, "steady.")]
+    known += [(SmoothingOptions, "smoothing.")]
     defaults = [(name_of(f, prefix), f.default) for c, prefix in known for f, _, _ in options(c)]
 
     def value(spoiler, default: Any) -> Any:
@@ -88,7 +88,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(bench, fuzz, tmp_
             Parameter(name, value=given[name]) if name in given else default
         )
         try:
-            fenced(ros_parameters.read(stub, TrainingOptions, "train."), stub._fence)
+            sandboxed(ros_parameters.read(stub, TrainingOptions, "train."), stub._fence)
         except (ValueError, OSError) as refusal:
             assert str(refusal)
         finally:

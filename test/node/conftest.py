@@ -30,10 +30,10 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 import deep_nrsfm_ros
-from deep_nrsfm_ros.nrsfm.keypoints import CMU31, HUMAN17, KeypointLayout
-from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
+from deep_nrsfm_ros.layouts.keypoint_layout import CMU31, HUMAN17, KeypointLayout
+from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 DEADLINE = float(os.environ.get("DEADLINE", "60"))  # seconds; a busy machine may want more
 PROMPT_DISCOVERY = Path(__file__).parents[2] / "config" / "prompt_discovery.xml"
@@ -214,7 +214,7 @@ class Client:
     def exchange(self, publisher: Any, message: Any) -> PointCloud2:
         """Publish until the lifter answers; return its next points.
 
-        Best effort may lose a message, so it is repeated now and then.
+        BestCheckpoint effort may lose a message, so it is repeated now and then.
         """
         points = self.heard["/lifter/points"]
         before, sent = len(points), 0.0

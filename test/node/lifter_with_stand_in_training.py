@@ -5,9 +5,9 @@ import sys
 from pathlib import Path
 
 from deep_nrsfm_ros.node import lifter, training_service
-from deep_nrsfm_ros.node.training_job import TrainingJob
+from deep_nrsfm_ros.training.job import TrainingJob
 
-STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in_training.py")))
+STAND_IN = (sys.executable, str(Path(__file__).parents[1] / "training" / "stand_in_training.py"))
 training_service.TrainingJob = functools.partial(TrainingJob, command=STAND_IN)
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import functools
 import sys
 
 from deep_nrsfm_ros.node import lifter, training_service
-from deep_nrsfm_ros.node.training_job import TrainingJob
+from deep_nrsfm_ros.training.job import TrainingJob
 
 if __name__ == "__main__":
     if "--ros-args" in sys.argv:
@@ -16,7 +16,7 @@ if __name__ == "__main__":
         lifter.main()
     else:
         from deep_nrsfm_ros.commands.train import main
-        from deep_nrsfm_ros.nrsfm import training
+        from deep_nrsfm_ros.training import loop as training
 
         training.train = functools.partial(training.train, checkpoint_seconds=0.2)
         main()

@@ -13,14 +13,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 from std_msgs.msg import Header
 
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.messages import serialised
+from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
 from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.transforms import frames
 from deep_nrsfm_ros.nrsfm.geometry import quaternion
-from deep_nrsfm_ros.nrsfm.intrinsics import Intrinsics
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
-from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.observations import serialised
-from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP, pack_points
 
 P = len(HUMAN17)
 STREAM = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -18,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray
 
-from deep_nrsfm_ros.observations.messages import POINT_FIELDS, POINT_STEP, pack_points
+from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = (str(ROOT / "scripts" / "lifter"),)
@@ -153,9 +153,10 @@ def test_parameter_changes_at_full_rate_cost_no_message(start_lifter, connect):
     client.exchange(publisher, cloud(1))
     heard = client.heard["/lifter/points"]
     heard.clear()
-    wishes = [{"model": "joints"}, {"noise": 0.5}, {"model": "broken"}, {"turns": 1},
+    wishes = [{"model": "joints"}, {"noise": 0.5}, {"model": "broken"}, {"test_time_rotations": 1},
               {"model": "person"}, {"keypoint_layout": "coco17"}, {"min_confidence": 7.0},
-              {"turns": 3}, {"noise": 0.02}, {"keypoint_layout": "model"}]  # fmt: skip
+              {"test_time_rotations": 3}, {"noise": 0.02},
+              {"keypoint_layout": "model"}]  # fmt: skip
     refused = 0
     for second in range(10 * MANY):
         publisher.publish(cloud(second))

@@ -15,8 +15,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension
 
-from deep_nrsfm_ros.nrsfm.keypoints import COCO17, HUMAN17
-from deep_nrsfm_ros.observations.messages import (
+from deep_nrsfm_ros.layouts.keypoint_layout import COCO17, HUMAN17
+from deep_nrsfm_ros.messages.decoding import (
     MULTI_ARRAY,
     POINT_CLOUD,
     POINT_FIELDS,
@@ -207,7 +207,7 @@ def test_markers_come_when_someone_listens(start_lifter, connect):
 
 
 def test_steadied_it_follows_slower_and_bridges_a_gap(start_lifter, connect):
-    start_lifter(**{"steady.enabled": True, "steady.bridge": 5.0})
+    start_lifter(**{"smoothing.enabled": True, "smoothing.bridge": 5.0})
     client = connect()
     publisher = client.publisher(PointCloud2)
     here, there = (cloud(pixels(1, seed=seed)) for seed in (0, 1))

@@ -16,17 +16,17 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.tracking import Tracker
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read
+from deep_nrsfm_ros.messages.decoding import POINT_FIELDS as FIELDS
+from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
+from deep_nrsfm_ros.messages.serialised import Header, Reader
 from deep_nrsfm_ros.node import lifter, publishing
-from deep_nrsfm_ros.node.gaps import Gaps
-from deep_nrsfm_ros.node.listening import Source
 from deep_nrsfm_ros.node.message_types import decoder
+from deep_nrsfm_ros.node.subscriptions import Source
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17
-from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.observations.messages import POINT_CLOUD, read
-from deep_nrsfm_ros.observations.messages import POINT_FIELDS as FIELDS
-from deep_nrsfm_ros.observations.serialised import Header, Reader
-from deep_nrsfm_ros.observations.tracker import Tracker
 
 
 def lifted(n: int, p: int = 5, seed: int = 0) -> Lifted:
@@ -143,7 +143,12 @@ def test_markers_are_not_made_when_nobody_listens(
         heard: list[bytes] = []
         monkeypatch.setattr(node._points, "publish", heard.append)
         node._lift(
-            Source("/keypoints", Reader(POINT_CLOUD, decoder(POINT_CLOUD)), Tracker(), Gaps()),
+            Source(
+                "/keypoints",
+                Reader(POINT_CLOUD, decoder(POINT_CLOUD)),
+                Tracker(),
+                DroppedMessages(),
+            ),
             publishing.point_cloud(Header(), lifted(1, len(HUMAN17))),
         )
         assert heard and not made

@@ -19,14 +19,14 @@ from rclpy.serialization import deserialize_message
 from safetensors.numpy import load_file
 from sensor_msgs.msg import PointCloud2
 
+from deep_nrsfm_ros.data.bags import frames, write_bag
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.messages.serialised import Header
+from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.node.publishing import point_cloud
-from deep_nrsfm_ros.node.unfinished import checkpoint_file, look, record_file
-from deep_nrsfm_ros.nrsfm.checkpoint import read_checkpoint
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
-from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.nrsfm.model_file import load_model
-from deep_nrsfm_ros.observations.bags import frames, write_bag
-from deep_nrsfm_ros.observations.serialised import Header
+from deep_nrsfm_ros.training.checkpoint import read_checkpoint
+from deep_nrsfm_ros.training.record import checkpoint_file, look, record_file
 
 P = 17
 KILLS, MANY_KILLS = 5, int(os.environ.get("KILLS", "50"))
@@ -276,7 +276,7 @@ def test_data_that_cannot_be_trained_on_is_refused_with_advice(
         (good, "/elsewhere", "0 topics called /elsewhere; name one of: /keypoints"),
         (good, "", ""),
     ]:
-        client.set_parameters(train__bags=[bag], train__topic=topic, train__thin=0.0)
+        client.set_parameters(train__bags=[bag], train__topic=topic, train__min_change=0.0)
         client.heard["/lifter/training_status"].clear()
         assert client.call("/lifter/train").success
         if complaint:

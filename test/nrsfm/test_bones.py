@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from deep_nrsfm_ros.lifting.correction import bone_lengths, correct
 from deep_nrsfm_ros.nrsfm.bones import Bones, shares
-from deep_nrsfm_ros.nrsfm.correction import bone_lengths, correct
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 
 some = settings(max_examples=25, deadline=None)

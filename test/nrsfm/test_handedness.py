@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 from deep_nrsfm_ros.nrsfm.handedness import disagreement, mirrored, object_frame, votes
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
 
 some = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 2**32 - 1)

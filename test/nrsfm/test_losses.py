@@ -11,7 +11,7 @@ import torch
 
 from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, complete, forward, initialise
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
 P, BATCH = 8, 6
@@ -22,7 +22,7 @@ both_scales = pytest.mark.parametrize("scale", ["rms", "none"])
 def network(camera: str = "orthonormal", whitening: float = 0.0) -> Network:
     rng = np.random.default_rng(0)
     architecture = Architecture((12, 9), camera=camera, whitening=whitening)
-    net = initialise(architecture, P, rng, as_released=True).map(lambda w: w.astype(float))
+    net = initialise(architecture, P, rng, paper_initialisation=True).map(lambda w: w.astype(float))
     A = 0.2 * rng.standard_normal((P, P))
     L = np.eye(P) + A + A.T
     return dataclasses.replace(net, L=L, L_inverse=np.linalg.inv(L))

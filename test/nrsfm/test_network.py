@@ -44,7 +44,7 @@ whitened = st.sampled_from([0.0, 0.5, 1.0])
 def random_network(architecture: Architecture, p: int, seed: int = 0) -> Network:
     """Return a float64 network of which every array, biases and whitening included, is random."""
     rng = np.random.default_rng(seed)
-    net = initialise(architecture, p, rng, as_released=True).map(lambda w: w.astype(float))
+    net = initialise(architecture, p, rng, paper_initialisation=True).map(lambda w: w.astype(float))
     Q, _ = np.linalg.qr(rng.standard_normal((p, p)))
     variance = rng.uniform(0.2, 2, p)
     return dataclasses.replace(net, L=(Q * variance) @ Q.T, L_inverse=(Q / variance) @ Q.T)
@@ -209,9 +209,11 @@ def test_torch_and_numpy_agree(architecture: Architecture) -> None:
 
 
 def test_the_net_of_the_paper_gives_an_orthonormal_camera_from_the_start() -> None:
-    for as_released in (True, False):  # without them the raw camera is of size 0.01
+    for paper_initialisation in (True, False):  # without them the raw camera is of size 0.01
         rng = np.random.default_rng(1)
-        net = initialise(Architecture(PAPER_WIDTHS), 31, rng, as_released=as_released)
+        net = initialise(
+            Architecture(PAPER_WIDTHS), 31, rng, paper_initialisation=paper_initialisation
+        )
         W = 0.3 * rng.standard_normal((500, 31, 2)).astype(np.float32)
         _, M = forward(net, W)
         np.testing.assert_allclose(M.swapaxes(1, 2) @ M, np.tile(np.eye(2), (500, 1, 1)), atol=1e-3)
@@ -256,23 +258,29 @@ def test_coherence_is_the_largest_cosine_of_two_atoms(
 
 @some
 @given(widths, points, st.booleans())
-def test_initialise_makes_every_weight(widths: tuple[int, ...], p: int, as_released: bool) -> None:
+def test_initialise_makes_every_weight(
+    widths: tuple[int, ...], p: int, paper_initialisation: bool
+) -> None:
     architecture = Architecture(widths)
     rng = np.random.default_rng(0)
-    weights = dict(initialise(architecture, p, rng, as_released=as_released).named())
+    weights = dict(
+        initialise(architecture, p, rng, paper_initialisation=paper_initialisation).named()
+    )
     assert {name: w.shape for name, w in weights.items()} == weight_shapes(architecture, p)
     for name, weight in weights.items():
         assert weight.dtype == np.float32
         if name.startswith("L"):  # not whitened yet
             np.testing.assert_array_equal(weight, np.eye(p))
             continue
-        assert np.any(weight) != (name.startswith("b") and not as_released)
-    again = initialise(architecture, p, np.random.default_rng(0), as_released=as_released)
+        assert np.any(weight) != (name.startswith("b") and not paper_initialisation)
+    again = initialise(
+        architecture, p, np.random.default_rng(0), paper_initialisation=paper_initialisation
+    )
     assert all(np.array_equal(w, weights[name]) for name, w in again.named())
 
 
 @pytest.mark.parametrize(
-    ("as_released", "fans"),
+    ("paper_initialisation", "fans"),
     [
         (False, {"D.0": 90 + 50, "D.1": 50 + 40, "code_head": 240 + 40}),
         (True, {"D.0": 3 * (30 + 50), "D.1": 50 + 40, "code_head": 6 * (40 + 40), "b.0": 100}),
@@ -280,10 +288,14 @@ def test_initialise_makes_every_weight(widths: tuple[int, ...], p: int, as_relea
     ids=["matrices", "convolutions"],
 )
 def test_glorot_takes_the_fans_of_what_a_weight_is_applied_as(
-    as_released: bool, fans: dict[str, int]
+    paper_initialisation: bool, fans: dict[str, int]
 ) -> None:
     rng = np.random.default_rng(0)
-    weights = dict(initialise(Architecture((50, 40)), 30, rng, as_released=as_released).named())
+    weights = dict(
+        initialise(
+            Architecture((50, 40)), 30, rng, paper_initialisation=paper_initialisation
+        ).named()
+    )
     for name, fan in fans.items():
         limit = (6 / fan) ** 0.5
         assert 0.9 * limit < np.abs(weights[name]).max() <= limit

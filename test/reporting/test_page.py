@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.data.curation import Curation, curate
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.sufficiency import examine
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
-from deep_nrsfm_ros.nrsfm.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.observations.curation import Curation, curate
-from deep_nrsfm_ros.observations.ensemble import Ensemble
-from deep_nrsfm_ros.observations.variation import examine
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.reporting.drawing import GUESSED
 from deep_nrsfm_ros.reporting.page import Training, page, write_report
 
@@ -56,14 +56,14 @@ def training_of(
     points[::40, 3] += 900
     visible = np.ones((f, p), bool)
     visible[7, 2:] = False
-    curated = curate(Ensemble(points, visible, layout, "bags b"), Curation())
+    curated = curate(Dataset(points, visible, layout, "bags b"), Curation())
     progress = [Progress(s, 30, k, 1 / s, 0.3, 0.4, 0.0) for k in (0, 1) for s in (5, 10, 30)]
     fields: dict[str, Any] = {
         "model": model or model_of(layout),
         "path": Path("folder") / "mine.safetensors",
-        "ensemble": curated.ensemble,
+        "dataset": curated.dataset,
         "curated": curated,
-        "variation": examine(curated.ensemble),
+        "variation": examine(curated.dataset),
         "progress": progress,
     }
     return Training(**(fields | changes))
@@ -126,12 +126,12 @@ def test_every_canvas_has_its_scene(text: str) -> None:
 
 
 def test_what_no_frame_shows_is_drawn_pale() -> None:
-    kept = training_of().ensemble
+    kept = training_of().dataset
     toe = HUMAN17.index("left_big_toe")
     visible = kept.visible.copy()
     visible[:, toe] = False
-    blind = Ensemble(kept.points, visible, HUMAN17, kept.source)
-    for scene in scenes_of(page(training_of(ensemble=blind))):
+    blind = Dataset(kept.points, visible, HUMAN17, kept.source)
+    for scene in scenes_of(page(training_of(dataset=blind))):
         pale = {
             toe in edge: c == GUESSED
             for edge, c in zip(scene["edges"], scene["colours"], strict=True)
@@ -143,7 +143,7 @@ def test_what_no_frame_shows_is_drawn_pale() -> None:
 
 def test_it_tells_what_was_left_out_and_hidden(text: str) -> None:
     curated = training_of().curated
-    for count in (curated.given, curated.few_visible, curated.mended, len(curated.ensemble)):
+    for count in (curated.given, curated.few_visible, curated.mended, len(curated.dataset)):
         assert f'<td class="figure">{count}</td>' in text
     assert curated.mended > 0 and HUMAN17.keypoints[3] in text
     assert "times the usual: points hidden" in " ".join(text.split())

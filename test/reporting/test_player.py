@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.data.detections import gather, stamps_at
+from deep_nrsfm_ros.data.recording import Recording
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.nrsfm.geometry import centre
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.observations.detections import gather, stamps_at
-from deep_nrsfm_ros.observations.observation import Observation
-from deep_nrsfm_ros.observations.recording import Recording
 from deep_nrsfm_ros.reporting.player import recording_page, scenes, stride
 
 P = len(HUMAN17)

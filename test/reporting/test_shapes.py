@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, random_cameras, rotation_from_camera
-from deep_nrsfm_ros.nrsfm.keypoints import HUMAN17, KeypointLayout
-from deep_nrsfm_ros.nrsfm.lifting import Lifted
-from deep_nrsfm_ros.nrsfm.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
-from deep_nrsfm_ros.nrsfm.normaliser import Normaliser
-from deep_nrsfm_ros.observations.ensemble import Ensemble
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.reporting.shapes import cycle_error, doubt, fit, lift_sample, shape_space
 
 P = 10
@@ -29,10 +29,10 @@ def lifted(S: np.ndarray, seed: int = 0) -> Lifted:
     return Lifted(S @ R.swapaxes(1, 2), R, ones, np.zeros((len(S), 2)), 0 * ones, ones[:, None])
 
 
-def frames(f: int, p: int) -> Ensemble:
+def frames(f: int, p: int) -> Dataset:
     rng = np.random.default_rng(1)
     points = rng.uniform(0, 500, (f, p, 2)).astype(np.float32)
-    return Ensemble(points, rng.random((f, p)) < 0.9, KeypointLayout.numbered(p), "made up")
+    return Dataset(points, rng.random((f, p)) < 0.9, KeypointLayout.numbered(p), "made up")
 
 
 def test_the_modes_are_those_of_the_object() -> None:
@@ -93,7 +93,7 @@ def test_figures_do_not_depend_on_chance_or_unit() -> None:
     mine = model(seen.layout)
     first = fit(mine, seen)
     assert first == fit(mine, seen) and np.isfinite(first).all()
-    larger = Ensemble(10 * seen.points, seen.visible, seen.layout, "made up")
+    larger = Dataset(10 * seen.points, seen.visible, seen.layout, "made up")
     np.testing.assert_allclose(fit(mine, larger), first, rtol=1e-2)
     assert cycle_error(mine, seen) == pytest.approx(first.cycle, rel=1e-5)
 
@@ -114,5 +114,5 @@ def test_depth_is_doubted_where_keypoints_contradict_each_other() -> None:
 
 def test_what_no_model_lifts_is_not_doubted() -> None:
     nothing = frames(5, P)
-    blind = Ensemble(nothing.points, np.zeros((5, P), bool), nothing.layout, "made up")
+    blind = Dataset(nothing.points, np.zeros((5, P), bool), nothing.layout, "made up")
     assert doubt(model(nothing.layout), blind) == ""

@@ -21,12 +21,12 @@ import numpy as np
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter
 from deep_nrsfm_ros.commands.demo.evaluation import read_points, table
 from deep_nrsfm_ros.commands.demo.picture import Panel, draw
-from deep_nrsfm_ros.node.model_folders import model_folders
-from deep_nrsfm_ros.node.training_job import ENDED
-from deep_nrsfm_ros.nrsfm.keypoints import BODY25B, KeypointLayout
-from deep_nrsfm_ros.nrsfm.model_file import find_model, load_model
-from deep_nrsfm_ros.observations.bags import Frame, frames, write_bag
-from deep_nrsfm_ros.observations.pose2sim import JOINTS, RATE, Session, read_session
+from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
+from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, Session, read_session
+from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, KeypointLayout
+from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.model_file import find_model, load_model
+from deep_nrsfm_ros.training.job import ENDED
 
 WHEEL = "pose2sim-0.6.0-py3-none-any.whl"
 TOPIC = "/keypoints"

@@ -12,8 +12,8 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.commands.demo.client import Played
+from deep_nrsfm_ros.data.pose2sim import Session
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
-from deep_nrsfm_ros.observations.pose2sim import Session
 
 Floats = NDArray[Any]
 

@@ -1,0 +1,1 @@
+"""Other methods of non-rigid structure from motion, on the same frames."""

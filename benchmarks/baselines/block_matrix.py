@@ -1,0 +1,103 @@
+"""The block-matrix method of Dai, Li and He."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from benchmarks.baselines.rigid import quadratic, root_of_rank_three, stack, symmetric
+from deep_nrsfm_ros.nrsfm.geometry import back_project, polar
+
+Floats = NDArray[Any]
+
+
+def block_matrix(W: Floats, K: int, *, iterations: int = 150) -> Floats:
+    """Return the shapes of lowest nuclear norm among those that the images allow.
+
+    Dai, Li and He, "A simple prior-free method for non-rigid structure from motion
+    factorization", IJCV 2014: cameras from the Gram matrix of one column triplet of the rank 3K
+    factorisation, then shapes by the block-matrix method. K is used for the cameras alone.
+    """
+    R = _block_rotations(W, K)
+    return _least_nuclear_norm(W, R, iterations)
+
+
+def _block_rotations(W: Floats, K: int) -> Floats:
+    """Return R (f, 2, 3) from the rank 3K factorisation.
+
+    Each row pair of Pi G is a multiple of a rotation: A q = 0 for the Gram matrix Q = G G^T.
+    First min |A q|^2 + trace Q over positive Q, then G itself by least squares.
+    """
+    n = min(3 * K, *stack(W).shape)
+    U, s, _ = np.linalg.svd(stack(W), full_matrices=False)
+    Pi = (U[:, :n] * np.sqrt(s[:n])).reshape(-1, 2, n)
+    Pi /= np.sqrt((Pi**2).sum((1, 2)).mean() / 2)
+    G = _refine(Pi, root_of_rank_three(_gram_matrix(Pi)))
+    R: Floats = polar(Pi @ G)
+    return R
+
+
+def _gram_matrix(Pi: Floats, *, trace: float = 1e-1, iterations: int = 500) -> Floats:
+    """Return the positive Q (n, n) of low trace that makes Pi Q Pi^T nearly orthogonal.
+
+    Q is scaled so that the mean of |Pi G|^2 is one; `trace` is the weight of Q's trace relative
+    to the mean curvature of the rest. ADMM between the quadratic and the cone.
+    """
+    f, _, n = Pi.shape
+    x, y = Pi[:, 0], Pi[:, 1]
+    A = np.concatenate([quadratic(x, x) - quadratic(y, y), 2 * quadratic(x, y)])
+    c = (quadratic(x, x) + quadratic(y, y)).mean(0)
+    H = A.T @ A / f
+    step = np.trace(H) / len(H)
+    inverse = np.linalg.inv(H + step * np.eye(len(H)))
+    towards = inverse @ c / (c @ inverse @ c)
+    i, j = np.triu_indices(n)
+    scale = np.where(i == j, 1, 2**0.5)
+    z = u = np.zeros(len(H))
+    for _ in range(iterations):
+        q = inverse @ (step * (z - u))
+        q += towards * (1 - c @ q)
+        values, vectors = np.linalg.eigh(symmetric(q + u, n))
+        positive = (vectors * np.maximum(values - trace, 0)) @ vectors.T
+        z = scale * positive[i, j]
+        u = u + q - z
+    return symmetric(z, n)
+
+
+def _refine(Pi: Floats, G: Floats) -> Floats:
+    """Return G (n, 3) with row pairs of Pi G of equal length and at right angles."""
+
+    def residual(g: Floats) -> Floats:
+        x, y = np.moveaxis(Pi @ g.reshape(G.shape), 1, 0)
+        xx, yy, xy = (x * x).sum(1), (y * y).sum(1), (x * y).sum(1)
+        skew: Floats = np.concatenate((xx - yy, 2 * xy)) / np.tile(xx + yy + 1e-12, 2)
+        return skew
+
+    refined: Floats = least_squares(residual, G.ravel(), max_nfev=30).x.reshape(G.shape)
+    return refined
+
+
+def _least_nuclear_norm(W: Floats, R: Floats, iterations: int) -> Floats:
+    """Return S (f, p, 3): min |S#|_* subject to R S = W, S# being S as a matrix (f, 3p).
+
+    ADMM: singular values are shrunk, then the shapes moved to where they project onto W.
+    """
+    Y = W.astype(np.float64)
+    f, p, _ = Y.shape
+
+    def held(S: Floats) -> Floats:
+        moved: Floats = back_project(S, R.swapaxes(1, 2), Y)
+        return moved
+
+    S, U = held(np.zeros((f, p, 3))), np.zeros((f, p, 3))
+    shrinkage = 0.05 * np.linalg.norm(S.reshape(f, -1), 2)
+    for _ in range(iterations):
+        matrix = (S + U).reshape(f, -1)
+        left, s, right = np.linalg.svd(matrix, full_matrices=False)
+        X = ((left * np.maximum(s - shrinkage, 0)) @ right).reshape(S.shape)
+        S = held(X - U)
+        U = U + S - X
+    return S

@@ -1,0 +1,1 @@
+"""The paper's tables and what its method depends on."""

@@ -1,0 +1,85 @@
+"""Table 1, NRSfM on CMU motion capture: the first 80 % of a subject's trials, in-sample."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from benchmarks.baselines.batches import BASELINES, solve
+from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
+from benchmarks.harness import LIFTING_LEGEND, Session, command
+from benchmarks.table import Table, bars
+from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, LIFTING, evaluate, figures
+from deep_nrsfm_ros.data.mocap import HEIGHT_18
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+
+SUBJECTS = ("01", "05", "127")
+# Kong and Lucey, "Deep Interpretable Non-Rigid Structure from Motion", arXiv 1902.10840, Table 1.
+_PRINTED = "01 05 18 23 64 70 102 106 123 127".split()
+_SHAPE = {
+    "Deep NRSfM": "10.74 13.40 4.73 3.24 4.38 2.17 7.32 6.83 2.23 6.00",
+    "Simple": "16.45 14.07 13.85 20.03 18.13 18.91 18.78 18.63 19.32 23.70",
+    "Sparse": "71.23 66.30 46.72 52.44 70.83 39.42 74.12 47.00 44.46 73.85",
+    "EM-SfM": "110.23 119.97 111.05 110.94 114.04 127.11 111.60 113.81 107.67 108.07",
+}
+_POINT = {
+    "Deep NRSfM": "5.0638 6.6717 2.2664 1.5138 2.2909 0.9622 3.0240 2.9130 0.9844 2.6820",
+    "Simple": "7.9905 6.9406 6.6340 9.5139 8.1784 8.4294 8.0171 8.1782 8.6922 10.9473",
+    "Sparse": "35.0283 35.3014 22.6930 25.3302 32.4681 17.7433 30.8274 21.2735 20.3565 32.4896",
+    "EM-SfM": "53.1818 60.5971 53.0413 52.2671 50.3960 56.3713 48.5891 50.3306 47.7355 50.8183",
+}
+PAPER = {
+    method: {
+        subject: {"shape %": float(shape), "point cm": float(point)}
+        for subject, shape, point in zip(
+            _PRINTED, _SHAPE[method].split(), _POINT[method].split(), strict=True
+        )
+    }
+    for method in _SHAPE
+}
+"""Printed figures: method -> subject -> figure."""
+OURS: dict[str, tuple[str, dict[str, LiftingOptions]]] = {
+    "paper's network, ours": ("paper", {"network alone": ALONE}),
+    "default recipe": ("default", LIFTING),
+}
+TIME = {"CPU min": "training (of baselines: solving) on this machine"}
+
+
+def benchmark(session: Session) -> Table:
+    """Train, solve and compare each subject on its own frames."""
+    printed = f"as printed; the ratio of its cm and % fits skeletons 1 / {HEIGHT_18:.3f} as high"
+    table = Table(
+        "nrsfm_on_cmu",
+        "NRSfM on CMU motion capture, in-sample",
+        ("subject", "method"),
+        (*CONVENTIONS, *TIME),
+        CONVENTIONS | TIME | {"paper": printed} | LIFTING_LEGEND | BASELINE_LEGEND,
+        bars("shape %", "proper %"),
+    )
+    for subject in session.subjects:
+        for method, by_subject in PAPER.items():
+            if subject in by_subject:
+                table.add((subject, f"paper: {method}"), by_subject[subject])
+        dataset = session.mocap([subject], "train")
+        for method, (preset, liftings) in OURS.items():
+            for seed in session.seeds:
+                title = f"{subject} {preset} seed {seed}"
+                model = session.trained(title, dataset, session.preset(preset, seed))
+                spent = {"CPU min": model.provenance["cpu_seconds"] / 60}
+                for lifting, options in liftings.items():
+                    shown = figures(evaluate(model, dataset, options)) | spent
+                    table.add((subject, f"{method}, {lifting}"), shown, seed)
+        for name in BASELINES:
+            solved = solve(session, name, dataset)
+            rank = f", K = {solved.rank}" if solved.rank else ""
+            shown = figures(solved.errors) | {"CPU min": solved.cpu_seconds / 60}
+            table.add((subject, name + rank), shown)
+    return table
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    command(benchmark, __doc__, SUBJECTS, argv)
+
+
+if __name__ == "__main__":
+    main()

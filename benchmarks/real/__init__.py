@@ -1,0 +1,1 @@
+"""Real detections with measured truth."""

@@ -1,0 +1,122 @@
+"""What tells good lifted people from bad ones without any truth: which way round, how steady."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.nrsfm.bones import shares
+from deep_nrsfm_ros.nrsfm.geometry import centre
+
+Floats = NDArray[Any]
+
+SIDES = ("left", "right")
+BENT = 20.0
+"""Degrees from which a knee counts as bent."""
+FIGURES = {
+    "faces %": "frames with the nose before the plane of neck and hips",
+    "knees %": f"knees bent by {BENT:.0f} degrees or more that bend to the front",
+    "toes %": "feet with the toes before the ankle",
+    "bones %": "how far a bone's share of all bones varies: half of what lies between the 16th and "
+    "the 84th percentile, over the median, mean of the bones",
+    "depth %": "RMS depth over RMS size: 0 is flat",
+}
+"""Only keypoints that were seen count. A mirrored person has 0 % where a real one has 100."""
+_VIEWS = ("camera", "right", "above")
+_COLOURS = {"left": "tab:blue", "right": "tab:red"}
+
+
+def figures(S: Floats, visible: NDArray[np.bool_]) -> dict[str, float]:
+    """Return the FIGURES of people S (f, p, 3) in camera axes, any unit, in the layout human17."""
+    front = _front(S)
+    nose = _before(_joint(S, "nose") - _joint(S, "neck"), front)
+    knees, toes = [], []
+    for side in SIDES:
+        leg = [f"{side}_{part}" for part in ("hip", "knee", "ankle", "big_toe")]
+        hip, knee, ankle, toe = (_joint(S, name) for name in leg)
+        seen = np.stack([visible[:, HUMAN17.index(name)] for name in leg], 1)
+        bent = seen[:, :3].all(1) & (_angle(knee - hip, ankle - knee) >= BENT)
+        knees.append(_before(knee - (hip + ankle) / 2, front)[bent])
+        toes.append(_before(toe - ankle, front)[seen[:, 2:].all(1)])
+    shares = (nose, np.concatenate(knees), np.concatenate(toes))
+    X = centre(S)
+    depth = np.sqrt((X[..., 2] ** 2).mean() / (X**2).sum(2).mean())
+    values = (*map(_share, shares), 100 * _spread(S, visible), 100 * float(depth))
+    return dict(zip(FIGURES, values, strict=True))
+
+
+def draw(
+    figure: Figure, dataset: Dataset, lifted: Mapping[str, Floats], frames: Sequence[int]
+) -> None:
+    """Draw the keypoints of some frames, and below them each method's people from three sides."""
+    rows = [("seen", None), *((name, view) for name in lifted for view in _VIEWS)]
+    figure.set_size_inches(1.9 * len(frames), 2.2 * len(rows))
+    axes = figure.subplots(len(rows), len(frames), squeeze=False)
+    for (name, view), row in zip(rows, axes, strict=True):
+        row[0].set_ylabel(name if view is None else f"{name}\nfrom {view}", fontsize="small")
+        for axis, i in zip(row, frames, strict=True):
+            if view is None:
+                seen = dataset.visible[i, :, None]
+                _person(axis, np.where(seen, dataset.points[i], np.nan))
+                axis.set_title(f"object {i}", fontsize="small")
+            else:
+                x, y, z = lifted[name][i].T
+                # The camera looks along z, y is down: from the right z goes to the left of it.
+                across = {"camera": (x, y), "right": (z, y), "above": (x, -z)}[view]
+                _person(axis, np.stack(across, 1))
+
+
+def _person(axis: Axes, points: Floats) -> None:
+    """Draw points (p, 2), y down."""
+    for a, b in HUMAN17.edges:
+        side = next((s for s in SIDES if s in a or s in b), "")
+        ends = points[[HUMAN17.index(a), HUMAN17.index(b)]]
+        axis.plot(*ends.T, color=_COLOURS.get(side, "0.3"), linewidth=1.5)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.invert_yaxis()
+    axis.set(xticks=[], yticks=[])
+
+
+def _joint(S: Floats, name: str) -> Floats:
+    joint: Floats = S[:, HUMAN17.index(name)]
+    return joint
+
+
+def _front(S: Floats) -> Floats:
+    """Return where people (f, p, 3) face by trunk alone: across the hips' line and the spine."""
+    left = _joint(S, "left_hip") - _joint(S, "right_hip")
+    front: Floats = np.cross(left, _joint(S, "neck") - _joint(S, "mid_hip"))
+    return front
+
+
+def _before(X: Floats, front: Floats) -> NDArray[np.bool_]:
+    ahead: NDArray[np.bool_] = (X * front).sum(-1) > 0
+    return ahead
+
+
+def _angle(a: Floats, b: Floats) -> Floats:
+    sizes = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+    cosine = (a * b).sum(-1) / np.maximum(sizes, 1e-9)
+    degrees: Floats = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    return degrees
+
+
+def _share(yes: NDArray[np.bool_]) -> float:
+    return 100 * float(yes.mean()) if len(yes) else float("nan")
+
+
+def _spread(S: Floats, visible: NDArray[np.bool_]) -> float:
+    edges = HUMAN17.edge_indices()
+    a, b = np.array(edges).T
+    found = shares(S, edges)
+    seen = visible[:, a] & visible[:, b]
+    found[~seen] = np.nan
+    low, middle, high = np.nanpercentile(found[:, seen.any(0)], (16, 50, 84), axis=0)
+    return float(np.mean((high - low) / 2 / middle))

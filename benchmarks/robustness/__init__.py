@@ -1,0 +1,1 @@
+"""Noise, missing points, perspective, long runs and damaged data."""

@@ -1,0 +1,91 @@
+"""Table 3, noise: keypoints disturbed by 0 to 20 % of their size, trained with and without."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from benchmarks.baselines.batches import BASELINES, solve
+from benchmarks.harness import LIFTING_LEGEND, Session, across, command, in_pairs
+from benchmarks.table import Table, lines
+from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+
+SUBJECTS = ("01",)
+RATIOS = {"0 %": 0.0, "5 %": 0.05, "10 %": 0.1, "15 %": 0.15, "20 %": 0.2}
+LIFTING: dict[str, Callable[[float], LiftingOptions]] = {
+    "network alone": lambda ratio: ALONE,
+    "as shipped": lambda ratio: LiftingOptions(),
+    "noise known": lambda ratio: LiftingOptions(noise=max(ratio, LiftingOptions().noise)),
+}
+EVERY = 5
+"""Trained on all frames, tested on every so many-th of them."""
+TRAINED: dict[str, dict[str, float]] = {
+    "default": {},
+    "augmented by noise": {"noise": max(RATIOS.values())},
+}
+LEGEND = {
+    "noise": "||noise||_F / ||W||_F of each frame, Gaussian; the truth is without",
+    "default": "default recipe, trained on the frames without noise",
+    "augmented by noise": "the same frames, noise up to the highest ratio added to the input at "
+    "each step",
+    "network alone": LIFTING_LEGEND["network alone"],
+    "as shipped": f"corrected for keypoints of {LiftingOptions().noise:.0%} noise",
+    "noise known": "corrected for keypoints as noisy as they are (option `noise`)",
+    "N %": f"shape error of every {EVERY}th frame: {CONVENTIONS['shape %']}",
+    "N % proper": CONVENTIONS["proper %"],
+}
+
+
+def disturbed(dataset: Dataset, ratio: float, seed: int = 0) -> Dataset:
+    """Return the dataset with Gaussian noise of `ratio` times the norm of each (centred) frame."""
+    if not ratio:
+        return dataset
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal(dataset.points.shape).astype(np.float32)
+    size = [np.linalg.norm(x, axis=(1, 2), keepdims=True) for x in (dataset.points, noise)]
+    points = dataset.points + np.float32(ratio) * size[0] / size[1] * noise
+    return dataclasses.replace(dataset, points=points)
+
+
+def benchmark(session: Session) -> Table:
+    """Compare models trained with and without noise at every ratio."""
+    table = Table(
+        "noise",
+        "Noise",
+        ("subject", "trained", "lifting"),
+        in_pairs(RATIOS),
+        LEGEND,
+        lines(list(RATIOS), "noise", "shape error %"),
+    )
+    for subject in session.subjects:
+        clean = session.mocap([subject], "train")
+        seen = clean[slice(None, None, EVERY)]
+        tests = {name: disturbed(seen, ratio) for name, ratio in RATIOS.items()}
+        for trained, recipe in TRAINED.items():
+            for seed in session.seeds:
+                title = f"{subject} {trained} seed {seed}"
+                model = session.trained(title, clean, session.preset("default", seed, **recipe))
+                for lifting, options in LIFTING.items():
+                    row: dict[str, float] = {}
+                    for name, ratio in RATIOS.items():
+                        row |= across({name: (model, tests[name])}, options(ratio))
+                    table.add((subject, trained, lifting), row, seed)
+        solved = {name: solve(session, name, clean).errors for name in BASELINES}
+        name = min(solved, key=lambda name: solved[name].shape)
+        found = 100 * solved[name].shape, 100 * solved[name].proper
+        row = dict(zip(in_pairs(["0 %"]), found, strict=True))
+        table.add((subject, f"best baseline: {name}", ""), row)
+    return table
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    command(benchmark, __doc__, SUBJECTS, argv)
+
+
+if __name__ == "__main__":
+    main()

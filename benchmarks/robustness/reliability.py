@@ -1,0 +1,261 @@
+"""Reliability of the confidence: how often points are near where they are said to be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from benchmarks.harness import Session, command
+from benchmarks.table import Table
+from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
+from deep_nrsfm_ros.commands.evaluate import read_split
+from deep_nrsfm_ros.data.pose2sim import JOINTS, read_session
+from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, KeypointMap
+from deep_nrsfm_ros.lifting.confidence import CALIBRATED, NEAR, Calibration, evidence
+from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
+from deep_nrsfm_ros.lifting.numpy_backend import Constants, Fit, Float32
+from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
+from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
+
+Floats = NDArray[Any]
+
+SUBJECTS = ("131", "03")
+"""The first is what the calibration is fitted to, the others rate it; no model saw any of them."""
+MODELS = ("human", "cmu31")
+STRIDE = 8
+NOISE = (0.0, 0.02, 0.05, 0.1, 0.2)
+HIDDEN = (0.0, 0.1, 0.2, 0.4, 0.6)
+DISTANCE = (5.0, 20.0)
+ASIDE = 15.0
+CACHE = Path(".cache")
+BINS = 10
+_FEWEST = 30  # points that a bin needs to be shown
+_STEPS = 30  # of Newton's method: a few are enough
+LEGEND = {
+    "rated on": f"CMU subjects, each frame seen by a random perspective camera {DISTANCE[0]:g} to "
+    f"{DISTANCE[1]:g} RMS radii away and up to {ASIDE:g} degrees beside the optical axis, with a "
+    f"noise of {', '.join(f'{n:.0%}' for n in NOISE)} of the RMS radius and "
+    f"{', '.join(f'{h:.0%}' for h in HIDDEN)} of the points hidden, drawn for each frame; or the "
+    "real detections of pose2sim, where `make demo` has fetched them",
+    "points %": "share of the points whose confidence is in the bin",
+    "confidence %": "their mean confidence",
+    "near %": f"how many are in truth within {NEAR:.0%} of the object's size, 2 RMS radii, of "
+    "where they should be, in the camera's axes after the best scale",
+    "error %": "their mean distance from there, in the object's size",
+    "off %": "over the bins, how far confidence and truth are apart on average",
+    "rank points, objects": "Spearman correlation of confidence and error, of single points, and "
+    "of objects by the means over their points; -1 would be perfect",
+}
+FIGURES = (
+    *("points %", "confidence %", "near %", "error %"),
+    *("off %", "rank points", "rank objects"),
+)
+ALL = "all"
+
+
+class Rated(NamedTuple):
+    """k points of n objects: what was told of them, and how far off they are."""
+
+    confidence: Floats  # (n, k)
+    error: Floats  # (n, k) in sizes of the object
+    evidence: Floats  # (n, k, 5) what the log odds are a sum of, in the order of `Calibration`
+
+
+class Witness(Fit):
+    """Keeps the evidence (n, p, 5) of what it has lifted, a part for each call."""
+
+    def __init__(self, known: Constants) -> None:
+        """Take what a lifter knows."""
+        super().__init__(known)
+        self.kept: list[Floats] = []
+
+    def sure(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
+        """Return the confidence, and keep what it comes from."""
+        visible = confidence > 0
+        known = evidence(visible, residual, self.spread(S))
+        self.kept.append(np.concatenate([known, ~visible[..., None]], 2))
+        return super().sure(confidence, residual, S)
+
+
+class Observed(Lifter):
+    """A lifter as shipped, with a witness."""
+
+    def __init__(self, model: Model) -> None:
+        """Take the model."""
+        super().__init__(model)
+        self.fit = self.witness = Witness(self.constants)
+
+    def take(self) -> Floats:
+        """Return the evidence that was kept since the last time."""
+        kept, self.witness.kept = np.concatenate(self.witness.kept), []
+        return kept
+
+
+def benchmark(session: Session) -> Table:
+    """Fit the calibration to the first subject and rate it on the others and on real detections."""
+    fitted_to, *others = session.subjects
+    folders = model_folders(default_models_dir())
+    lifters = [Observed(load_model(find_model(name, folders))) for name in MODELS]
+    fitted = fit([on_mocap(session, lifter, fitted_to, 0) for lifter in lifters])
+    table = Table(
+        "reliability",
+        "Reliability of the confidence",
+        ("model", "rated on", "confidence"),
+        FIGURES,
+        LEGEND
+        | {
+            f"fitted to subject {fitted_to}": _words(fitted),
+            "shipped, and rated here": _words(CALIBRATED),
+        },
+        draw,
+    )
+    for lifter in lifters:
+        for subject in others:
+            _add(table, lifter, f"CMU {subject}", on_mocap(session, lifter, subject, 1))
+    wheel = CACHE / WHEEL
+    if wheel.exists():
+        _add(table, lifters[0], "pose2sim", on_detections(lifters[0], wheel))
+    else:
+        print(f"no {wheel}, so nothing is rated on pose2sim; `make demo` fetches it")
+    return table
+
+
+def on_mocap(session: Session, lifter: Observed, subject: str, seed: int) -> Rated:
+    """Lift a subject's frames, seen and spoiled at random, and compare with the truth."""
+    layout, rng = lifter.model.layout, np.random.default_rng(seed)
+    stride = session.stride if session.stride > 1 else STRIDE
+    truth = read_split(session.data / "cmu", [subject], "all", layout, stride=stride).shapes
+    assert truth is not None
+    T, points, confidence = seen(truth, rng)
+    return rated(lifter, points, confidence, T, np.arange(len(layout)))
+
+
+def seen(truth: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+    """Return shapes (n, p, 3) as random cameras see them: turned; points; confidence, 0 or 1."""
+    n, p, _ = truth.shape
+    T = centre(truth @ rotation_from_camera(random_cameras(n, rng)).swapaxes(1, 2))
+    T /= radius(T)[:, None, None]
+    place = np.ones((n, 1, 3))
+    place[:, 0, :2] = np.tan(np.radians(rng.uniform(-ASIDE, ASIDE, (n, 2)) / np.sqrt(2)))
+    at = T + rng.uniform(*DISTANCE, (n, 1, 1)) * place / np.linalg.norm(place, axis=2)[..., None]
+    W = at[..., :2] / at[..., 2:]
+    spoil = rng.choice(NOISE, n) * radius(centre(W))
+    W += spoil[:, None, None] * rng.standard_normal(W.shape) / np.sqrt(2)
+    visible = rng.random((n, p)) >= rng.choice(HIDDEN, n)[:, None]
+    return T, W.astype(np.float32), visible.astype(np.float32)
+
+
+def on_detections(lifter: Observed, wheel: Path) -> Rated:
+    """Lift the real detections of the four pose2sim cameras and compare with the truth."""
+    to_model = KeypointMap(BODY25B, lifter.model.layout)
+    limbs = np.array([lifter.model.layout.index(joint) for joint in JOINTS])
+    parts = []
+    for view in read_session(wheel).views:
+        known = np.isfinite(view.truth).all((1, 2))
+        points, confidence = to_model(view.points[known], view.confidence[known])
+        parts.append(rated(lifter, points, confidence, view.truth[known], limbs))
+    return Rated(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def rated(
+    lifter: Observed, points: Floats, confidence: Floats, truth: Floats, which: NDArray[np.int64]
+) -> Rated:
+    """Lift points (n, p, 2) and compare k of them with the truth (n, k, 3), in camera axes."""
+    lifted = lift_all(lifter, points, confidence)
+    kept = lifter.take()
+    done = ~np.isnan(lifted.residual)
+    S, T = centre(lifted.shapes[done][:, which].astype(float)), centre(truth[done])
+    scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
+    size = 2 * radius(lifted.shapes[done]) * radius(T) / radius(S)
+    error = np.linalg.norm(scale[:, None, None] * S - T, axis=2) / size[:, None]
+    return Rated(lifted.confidence[done][:, which], error, kept[done][:, which])
+
+
+def fit(parts: Sequence[Rated]) -> Calibration:
+    """Return the calibration under which what happened is likeliest: logistic regression.
+
+    Takes points that were surely seen or surely missing: of confidence 1 or 0.
+    """
+    X = np.concatenate([part.evidence.reshape(-1, 5) for part in parts]).astype(float)
+    y = np.concatenate([part.error.ravel() < NEAR for part in parts])
+    w, ridge = np.zeros(5), 1e-6 * len(X)
+    for _ in range(_STEPS):
+        chance = 1 / (1 + np.exp(-X @ w))
+        curvature = (X * (chance * (1 - chance))[:, None]).T @ X + ridge * np.eye(5)
+        w += np.linalg.solve(curvature, X.T @ (y - chance) - ridge * w)
+    return Calibration(*w.tolist())
+
+
+def reliability(confidence: Floats, error: Floats) -> Iterable[tuple[str, dict[str, float]]]:
+    """Return the `FIGURES` of each bin of confidence (n, k), then over all."""
+    hit, share = error < NEAR, np.clip((confidence * BINS).astype(int), 0, BINS - 1)
+    off = 0.0
+    for i in range(BINS):
+        inside = share == i
+        if inside.sum() < _FEWEST:
+            continue
+        figures = _means(inside.mean(), confidence[inside], hit[inside], error[inside])
+        off += inside.mean() * abs(figures["confidence %"] - figures["near %"])
+        yield f"{i / BINS:g} to {(i + 1) / BINS:g}", figures
+    ranks = {
+        "rank points": spearman(confidence.ravel(), error.ravel()),
+        "rank objects": spearman(confidence.mean(1), error.mean(1)),
+    }
+    yield ALL, _means(1.0, confidence, hit, error) | {"off %": off} | ranks
+
+
+def spearman(a: Floats, b: Floats) -> float:
+    """Return Spearman's rank correlation of a (n,) and b (n,), ties in order of appearance."""
+    rank_a, rank_b = (np.argsort(np.argsort(x, kind="stable")) for x in (a, b))
+    return float(np.corrcoef(rank_a, rank_b)[0, 1])
+
+
+def draw(table: Table, figure: Figure) -> None:
+    """Draw what is near, and how large the error is, against the confidence."""
+    figure.set_size_inches(9, 4.5)
+    left, right = figure.subplots(1, 2)
+    for labels in dict.fromkeys(row.labels[:2] for row in table.rows):
+        rows = [r.figures for r in table.rows if r.labels[:2] == labels and r.labels[2] != ALL]
+        x = [figures["confidence %"] for figures in rows]
+        for axes, name in ((left, "near %"), (right, "error %")):
+            axes.plot(x, [figures[name] for figures in rows], "o-", label=" on ".join(labels))
+    left.plot([0, 100], [0, 100], color="0.7", linestyle="--", zorder=0)
+    left.set(xlabel="confidence %", ylabel=f"within {NEAR:.0%} of the object's size, %")
+    right.set(xlabel="confidence %", ylabel="mean error, % of the object's size", ylim=(0, None))
+    right.set_xlim(left.get_xlim())
+    left.legend(fontsize="small")
+
+
+def _add(table: Table, lifter: Observed, on: str, found: Rated) -> None:
+    for label, figures in reliability(found.confidence, found.error):
+        table.add((lifter.model.name, on, label), figures)
+
+
+def _means(share: float, confidence: Floats, hit: Floats, error: Floats) -> dict[str, float]:
+    values = (share, confidence.mean(), hit.mean(), error.mean())
+    return {name: 100 * float(v) for name, v in zip(FIGURES, values, strict=False)}
+
+
+def radius(S: Floats) -> Floats:
+    """Return the RMS radius (n,) of centred shapes (n, p, d)."""
+    radius: Floats = np.sqrt((S * S).sum(2).mean(1))
+    return radius
+
+
+def _words(found: Calibration) -> str:
+    return ", ".join(f"{name}={value:.2f}" for name, value in found._asdict().items())
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    command(benchmark, __doc__, SUBJECTS, argv)
+
+
+if __name__ == "__main__":
+    main()

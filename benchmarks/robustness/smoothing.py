@@ -1,0 +1,202 @@
+"""Steadiness: how much the lifted trembles, and how late it comes, filtered and not."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.harness import Session, command
+from benchmarks.table import Table, bars
+from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
+from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
+from deep_nrsfm_ros.data.openpose import largest, read_people
+from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, read_session
+from deep_nrsfm_ros.layouts.keypoint_layout import BODY25, BODY25B, HUMAN17, KeypointMap
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
+from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
+from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
+from deep_nrsfm_ros.model_files.model_file import find_model, load_model
+from deep_nrsfm_ros.nrsfm.geometry import centre
+from deep_nrsfm_ros.nrsfm.metrics import degrees, procrustes_distances
+
+Floats = NDArray[Any]
+
+SUBJECTS = ("03",)
+"""Walks on uneven ground; no model saw them."""
+VIDEO = "detections/long_video_body25.jsonl.gz"
+VIDEO_RATE = 30.0
+MIN_CONFIDENCE = 0.1
+CAPTURED = 120.0
+NOISE = 0.02  # of the RMS radius, as the lifter takes it to be
+HELD = 300  # frames of one pose
+LENGTH = 1200  # frames of motion capture
+STEPS = (1, 2, 4)  # every so many of them
+FIGURES = {
+    "rotation deg": "rotation of the object from one frame to the next, median",
+    "points %": "movement of its points, in the camera's axes, in RMS radii, median over frames",
+    "shake %": "the same of what no steady motion explains: x(t+1) - 2 x(t) + x(t-1)",
+    "error mm": "mean distance from the truth after the best similarity, 12 limb joints",
+    "camera mm": "the same after the best scale and translation: the rotation must fit too",
+    "lag ms": "delay at which it fits what was lifted without a filter best; only where no noise "
+    "hides it",
+}
+FILTERS = {"off": SmoothingOptions(), "on": SmoothingOptions(enabled=True)}
+CACHE = Path(".cache")
+_LAGS = np.arange(0, 0.3, 0.001)
+
+
+class Clip(NamedTuple):
+    """Keypoints of one object over time, in the model's layout, and where it was in truth."""
+
+    points: Floats  # (f, p, 2)
+    confidence: Floats  # (f, p)
+    rate: float
+    truth: Floats | None = None  # (f, 12, 3) mm, `JOINTS` in the camera's axes
+    noisy: bool = True
+
+
+def benchmark(session: Session) -> Table:
+    """Lift each clip, with the filter and without."""
+    lifter = Lifter(load_model(find_model("human", model_folders(default_models_dir()))))
+    table = Table(
+        *("steadiness", "Steadiness of what is lifted", ("clip", "filter")),
+        tuple(FIGURES),
+        FIGURES,
+        bars("rotation deg", "points %", "shake %"),
+    )
+    for name, clip in clips(session).items():
+        lifted = lift_all(lifter, clip.points, clip.confidence)
+        for word, options in FILTERS.items():
+            steady = steadied(lifted, clip.rate, options)
+            table.add((name, word), figures(lifted, steady, clip))
+    return table
+
+
+def clips(session: Session) -> dict[str, Clip]:
+    """Return a held-out subject's motion, at two rates, and what real detections there are."""
+    found = {}
+    for subject in session.subjects:
+        motion = walk(session, subject)
+        for step in STEPS:
+            rate = CAPTURED / step
+            found[f"CMU {subject}, {rate:.0f} Hz"] = seen(motion[::step], rate)
+            clean = seen(motion[::step], rate, noise=0.0)
+            found[f"CMU {subject} without noise, {rate:.0f} Hz"] = clean
+        found[f"CMU {subject} held still, {rate:.0f} Hz"] = seen(motion[[0] * HELD], rate)
+    wheel, video = CACHE / WHEEL, session.data / VIDEO
+    if wheel.exists():
+        to_model = KeypointMap(BODY25B, HUMAN17)
+        for view in read_session(wheel).views:
+            clip = Clip(*to_model(view.points, view.confidence), RATE, view.truth)
+            found[f"pose2sim {view.camera.name}, {RATE:.0f} Hz"] = clip
+    else:
+        print(f"no {wheel}, so nothing is said of pose2sim; `make demo` fetches it")
+    if video.exists():
+        found[f"{VIDEO}, {VIDEO_RATE:.0f} Hz"] = filmed(video)
+    return found
+
+
+def walk(session: Session, subject: str) -> Floats:
+    """Return the first trial of a subject (f, 17, 3) in mm, seen a little from above."""
+    folder = session.data / "cmu"
+    skeleton = read_asf(folder / subject / f"{subject}.asf")
+    S = 1000 * human17(read_amc(trials(folder, subject)[0], skeleton))[:LENGTH]
+    S = centre(S.astype(float)) * [1, -1, -1]  # y down, z away
+    c, s = np.cos(np.radians(20)), np.sin(np.radians(20))
+    return np.asarray(S @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]]))
+
+
+def seen(S: Floats, rate: float, noise: float = NOISE) -> Clip:
+    """Return what a detector would see of a motion S (f, 17, 3)."""
+    rng = np.random.default_rng(0)
+    size = np.sqrt((S * S).sum(2).mean())
+    W = S[..., :2] + noise * size * rng.standard_normal((*S.shape[:2], 2)) / np.sqrt(2)
+    limbs = [HUMAN17.index(joint) for joint in JOINTS]
+    return Clip(
+        W.astype(np.float32), np.ones(S.shape[:2], np.float32), rate, S[:, limbs], noise > 0
+    )
+
+
+def filmed(video: Path) -> Clip:
+    """Return the largest person in each frame of a video's detections."""
+    points, confidence = [], []
+    with gzip.open(video, "rt") as lines:
+        for line in lines:
+            people = read_people(line, len(BODY25), MIN_CONFIDENCE)
+            i = largest(people)
+            if i is not None:
+                points.append(people.points[i])
+                confidence.append(people.confidence[i])
+    to_model = KeypointMap(BODY25, HUMAN17)
+    return Clip(*to_model(np.array(points), np.array(confidence)), VIDEO_RATE)
+
+
+def steadied(lifted: Lifted, rate: float, options: SmoothingOptions) -> Lifted:
+    """Return one object's frames (n = f), as a filter answers them one by one."""
+    steady = Smoother(options)
+    answers = [
+        steady(Lifted(*(part[i : i + 1] for part in lifted)), ("0",), i / rate)[0]
+        for i in range(len(lifted.residual))
+    ]
+    return Lifted(*(np.concatenate(parts) for parts in zip(*answers, strict=True)))
+
+
+def figures(lifted: Lifted, steady: Lifted, clip: Clip) -> dict[str, float]:
+    """Return the `FIGURES` of the answers `steady` of a filter to what was lifted."""
+    S, R = steady.shapes.astype(float), steady.rotations
+    S = S / np.sqrt((S * S).sum(2).mean(1))[:, None, None]
+    turns = degrees(R[1:] @ R[:-1].swapaxes(1, 2))
+    shown: dict[str, float] = {
+        "rotation deg": float(np.nanmedian(turns)),
+        "points %": 100 * _middle(np.diff(S, axis=0)),
+        "shake %": 100 * _middle(np.diff(S, 2, axis=0)),
+    }
+    if not clip.noisy:
+        shown["lag ms"] = 1000 * lag(lifted.shapes, steady.shapes, clip.rate)
+    if clip.truth is not None:
+        shown |= errors(steady.shapes, clip.truth)
+    return {name: float(value) for name, value in shown.items()}
+
+
+def errors(shapes: Floats, truth: Floats) -> Mapping[str, float]:
+    """Return the errors of shapes (f, 17, 3) against the truth (f, 12, 3) in mm."""
+    limbs = [HUMAN17.index(joint) for joint in JOINTS]
+    known = np.isfinite(truth).all((1, 2)) & np.isfinite(shapes).all((1, 2))
+    S, T = centre(shapes[known][:, limbs].astype(float)), centre(truth[known])
+    scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
+    apart = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
+    return {"error mm": procrustes_distances(S, T).mean(), "camera mm": apart.mean()}
+
+
+def lag(before: Floats, after: Floats, rate: float) -> float:
+    """Return by how many seconds `after` (f, p, 3) comes later than `before`."""
+    known = np.isfinite(before).all((1, 2)) & np.isfinite(after).all((1, 2))
+    times = np.arange(len(before))[known] / rate
+    a, b = (X[known].reshape(known.sum(), -1) for X in (before, after))
+    inner = times >= times[0] + _LAGS[-1]
+    off = []
+    for delay in _LAGS:
+        places = (times[inner] - delay) * rate
+        low = np.clip(np.searchsorted(times, times[inner] - delay, "right") - 1, 0, len(a) - 2)
+        share = np.clip(places - times[low] * rate, 0, 1)[:, None]
+        off.append(np.square((1 - share) * a[low] + share * a[low + 1] - b[inner]).mean())
+    return float(_LAGS[int(np.argmin(off))])
+
+
+def _middle(steps: Floats) -> float:
+    """Return the median over frames of the mean length of steps (f, p, 3)."""
+    return float(np.nanmedian(np.linalg.norm(steps, axis=2).mean(1)))
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    command(benchmark, __doc__, SUBJECTS, argv)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Latency, training speed and memory, side by side with floors and other ways."""

@@ -1,0 +1,80 @@
+"""How fast bags become an dataset, against rosbags that only decodes their messages."""
+
+from __future__ import annotations
+
+import tempfile
+from argparse import Namespace
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from benchmarks.speed.harness import arguments, by_turns, on_one_thread, show
+from benchmarks.table import Table, bars
+from deep_nrsfm_ros.data.bags import STORAGES, frames, read_bags, write_bag
+from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+
+TOPIC = "/keypoints"
+BARE, OURS = "rosbags alone", "read_bags"
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+def decode(bag: Path) -> int:
+    """Decode every message of a bag, and keep none; return how many there are."""
+    count = 0
+    with Reader(bag) as reader:
+        for connection, _, raw in reader.messages():
+            _STORE.deserialize_cdr(raw, connection.msgtype)
+            count += 1
+    return count
+
+
+def benchmark(given: Namespace) -> Iterator[Table]:
+    """Write a bag of each storage and read it, by turns."""
+    messages, rounds = (500, 1) if given.quick else (50_000, 5)
+    table = Table(
+        "bag_reading",
+        f"Reading a bag of {messages} PointCloud2 messages of {len(CMU31)} keypoints",
+        ("storage", "by"),
+        ("messages/s", "share"),
+        {
+            BARE: "Reader.messages and deserialize_cdr, nothing kept",
+            OURS: "into an dataset: decoded, checked, mapped to a layout",
+            "share": f"of the messages/s of {BARE}",
+        },
+        bars("messages/s"),
+    )
+    rng = np.random.default_rng(0)
+    points = rng.uniform(1, 600, (messages, len(CMU31), 2))
+    with tempfile.TemporaryDirectory() as folder:
+        for storage in STORAGES:
+            bag = Path(folder) / storage
+            write_bag(bag, TOPIC, frames(points, np.ones(points.shape[:2])), storage)
+            took = by_turns(readers(bag), rounds, 0, warm_up=1)
+            rates = {by: messages / np.median(seconds) for by, seconds in took.items()}
+            for by, rate in rates.items():
+                figures = {"messages/s": float(rate), "share": float(rate / rates[BARE])}
+                table.add((storage, by), figures)
+    yield table
+
+
+def readers(bag: Path) -> dict[str, Callable[[], int]]:
+    """Return both ways to read a bag; each returns how many messages it read."""
+
+    def ours() -> int:
+        return read_bags([bag], TOPIC, CMU31, CMU31).messages
+
+    return {BARE: lambda: decode(bag), OURS: ours}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    given = arguments(__doc__).parse_args(argv)
+    show(benchmark(given), given.output)
+
+
+if __name__ == "__main__":
+    on_one_thread()
+    main()

@@ -1,0 +1,1 @@
+"""Data: datasets, bags, keypoint files and motion capture; no ROS import."""

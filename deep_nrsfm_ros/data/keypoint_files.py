@@ -1,0 +1,277 @@
+"""Keypoint files of any kind to detections: bags, npz, COCO JSON, OpenPose JSON."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.data.bag_files import SUFFIXES, open_bag
+from deep_nrsfm_ros.data.bag_topics import keypoint_topics
+from deep_nrsfm_ros.data.bags import Progress
+from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
+from deep_nrsfm_ros.data.openpose import read_people
+from deep_nrsfm_ros.lifting.observation import Observation, observation
+from deep_nrsfm_ros.messages.field_mapping import FieldMapping, Size
+from deep_nrsfm_ros.messages.serialised import Reader, header_of
+
+KINDS = (
+    "a bag (folder, .db3 or .mcap), an .npz with `points`, COCO keypoints (.json), a folder of "
+    "OpenPose .json files, or OpenPose frames as .jsonl (.jsonl.gz)"
+)
+
+_MOST_EMPTY = 1_000_000  # nine hours at 30 Hz
+
+
+class KeypointFileError(ValueError):
+    """A file of keypoints that cannot be read: names the file and the mend."""
+
+
+def read_keypoints(
+    path: Path,
+    keypoints: int,
+    *,
+    topic: str = "",
+    rate: float = 30.0,
+    min_confidence: float = 0.0,
+    on_progress: Progress = lambda done, total: None,
+    warn: Callable[[str], None] = lambda message: None,
+    mapping: FieldMapping | None = None,
+    size: Size | None = None,
+) -> Detections:
+    """Return everyone in a file or folder of `KINDS`, whichever it turns out to be.
+
+    keypoints: q of the detector's layout. topic: of a bag; "" takes the only one that fits.
+    rate: frames a second of files that have no stamps. min_confidence: below, a keypoint is
+    missing. mapping, size: of a bag, see `read_bag`. Raises KeypointFileError or BagError, which
+    name the file and what is wrong with it.
+    """
+    name = path.name.lower()
+    if not path.exists():
+        raise KeypointFileError(f"{path} does not exist")
+    if is_bag(path):
+        words = (on_progress, warn, mapping, size)
+        return read_bag(path, topic, keypoints, min_confidence, *words)
+    try:
+        if path.is_dir():
+            files = sorted(path.glob("*.json"), key=_natural)
+            if not files:
+                raise KeypointFileError(f"it holds neither a bag nor .json files; expected {KINDS}")
+            texts = ((file.name, file.read_bytes()) for file in files)
+            return _openpose(texts, len(files), keypoints, rate, min_confidence, on_progress)
+        if name.endswith(".npz"):
+            return _npz(path, keypoints, rate, min_confidence)
+        if name.endswith((".jsonl", ".jsonl.gz")):
+            data = path.read_bytes()
+            lines = (gzip.decompress(data) if name.endswith(".gz") else data).splitlines()
+            numbered = ((f"line {i}", line) for i, line in enumerate(lines, 1) if line.strip())
+            return _openpose(numbered, len(lines), keypoints, rate, min_confidence, on_progress)
+        if name.endswith(".json"):
+            content = json.loads(path.read_bytes())
+            if isinstance(content, dict) and "people" in content:
+                one = [(path.name, path.read_bytes())]
+                return _openpose(one, 1, keypoints, rate, min_confidence, on_progress)
+            return _coco(content, keypoints, rate, min_confidence)
+    except (ValueError, TypeError, ArithmeticError, EOFError, OSError, zlib.error) as error:
+        raise KeypointFileError(f"{path}: {error}") from None
+    except (MemoryError, RecursionError) as error:
+        raise KeypointFileError(f"{path} asks for more than there is: {error!r}") from None
+    raise KeypointFileError(f"{path} is of no known kind; expected {KINDS}")
+
+
+def is_bag(path: Path) -> bool:
+    """Tell whether a path that exists looks like a bag."""
+    if path.is_dir():
+        return any(f.name == "metadata.yaml" or f.suffix in SUFFIXES for f in path.iterdir())
+    return path.suffix in SUFFIXES
+
+
+def read_bag(
+    path: Path,
+    topic: str,
+    keypoints: int,
+    min_confidence: float = 0.0,
+    on_progress: Progress = lambda done, total: None,
+    warn: Callable[[str], None] = lambda message: None,
+    mapping: FieldMapping | None = None,
+    size: Size | None = None,
+) -> Detections:
+    """Return everyone on a topic of a bag ("": the only one that fits); raise BagError if none.
+
+    The topic may have a `*`, mapping and size are as in `bags.read_bags`.
+    Stamps are those of the headers, or the time of recording where there is no header. Messages
+    that cannot be read are left out; `warn` gets how many, and the reason of the first.
+    """
+    seen, stamps, reason, camera, count = [], [], "", "", 0
+    with closing(open_bag(path)) as bag:
+        for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
+            reader = Reader(kind, decode)
+            for record in bag.records(chosen):
+                count += 1
+                try:
+                    header, shown = reader(record.raw, keypoints, min_confidence, size)
+                    seen.append(shown)
+                    stamps.append((header and header.stamp) or record.time)
+                    camera = camera or (header.frame_id if header else "")
+                except Exception as error:  # whatever bytes a bag holds, the others still count
+                    reason = reason or str(error) or repr(error)
+                if count % 256 == 0:
+                    on_progress(count, max(count, chosen.total))
+            if warning := bag.warning(chosen):
+                warn(warning)
+    if not seen:
+        raise KeypointFileError(f"no readable message in {path} ({count} found); {reason}")
+    if len(seen) < count:
+        warn(f"{count - len(seen)} of {count} messages could not be read: {reason}")
+    order = np.argsort(stamps, kind="stable")
+    return gather([seen[i] for i in order], [stamps[i] for i in order], keypoints, camera)
+
+
+def stamp_of(message: Any) -> int:
+    """Return the stamp of a message's header in ns, 0 if it has none."""
+    header = header_of(message)
+    return header.stamp if header else 0
+
+
+def _openpose(
+    texts: Iterable[tuple[str, bytes]],
+    total: int,
+    keypoints: int,
+    rate: float,
+    min_confidence: float,
+    on_progress: Progress,
+) -> Detections:
+    """Return the people of frames of OpenPose JSON, each with the name of where it stands."""
+    seen: list[Observation] = []
+    for done, (name, text) in enumerate(texts, 1):
+        try:
+            seen.append(read_people(text, keypoints, min_confidence))
+        except ValueError as error:
+            raise KeypointFileError(f"{name}: {error}; is it the right keypoint layout?") from None
+        on_progress(done, total)
+    if not seen:
+        raise KeypointFileError("it is empty")
+    return gather(seen, stamps_at(rate, len(seen)), keypoints)
+
+
+def _coco(content: Any, keypoints: int, rate: float, min_confidence: float) -> Detections:
+    """Return the people of COCO keypoint annotations, or of a list of results."""
+    rows = content.get("annotations") if isinstance(content, dict) else content
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise KeypointFileError(
+            "neither COCO keypoints (`annotations`, or a list of results) nor OpenPose (`people`)"
+        )
+    rows = [row for row in rows if "keypoints" in row]
+    if not rows:
+        raise KeypointFileError("no annotation or result has `keypoints`")
+    for row in rows:
+        if "image_id" not in row:
+            raise KeypointFileError("an annotation or result has no `image_id`")
+        if np.shape(row["keypoints"]) != (3 * keypoints,):
+            raise KeypointFileError(
+                f"image {row['image_id']!r} has {np.size(row['keypoints']) / 3:g} keypoints; the "
+                f"keypoint layout has {keypoints}: name the layout in which they were written"
+            )
+    images = content.get("images") if isinstance(content, dict) else None
+    names = [image.get("id") for image in images or () if isinstance(image, dict)]
+    if not all(isinstance(name, (int, str)) for name in [*names, *(r["image_id"] for r in rows)]):
+        raise KeypointFileError("`id` of an image or `image_id` is neither a number nor a text")
+    names = list(dict.fromkeys([*names, *sorted((row["image_id"] for row in rows), key=_natural)]))
+    frames = {name: frame for frame, name in enumerate(names)}
+    by_frame: list[list[Mapping[str, Any]]] = [[] for _ in names]
+    for row in rows:
+        by_frame[frames[row["image_id"]]].append(row)
+    seen = [_people(people, keypoints, min_confidence) for people in by_frame]
+    ids = [str(p.get("track_id", i)) for people in by_frame for i, p in enumerate(people)]
+    return gather(seen, stamps_at(rate, len(seen)), keypoints, ids=ids)
+
+
+def _people(
+    rows: Sequence[Mapping[str, Any]], keypoints: int, min_confidence: float
+) -> Observation:
+    """Return the observation of annotations of one image."""
+    values = np.reshape([row["keypoints"] for row in rows], (len(rows), keypoints, 3))
+    return observation(values.astype(np.float64), min_confidence)
+
+
+def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Detections:
+    """Return the objects of arrays: see README, "Files instead of topics"."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
+        raise KeypointFileError(f"damaged or no .npz file: {error!r}") from error
+    if "points" not in arrays:
+        raise KeypointFileError(
+            f"no array `points` (objects, {keypoints}, 2); there are: {', '.join(arrays) or 'none'}"
+        )
+    points = _numbers(arrays, "points", np.float64)
+    if points.ndim != 3 or points.shape[1:] not in ((keypoints, 2), (keypoints, 3)):
+        raise KeypointFileError(
+            f"`points` is {points.shape}; (objects, {keypoints}, 2), or 3 with the confidence, is "
+            "needed: x, y in the order of the keypoint layout"
+        )
+    m = len(points)
+    if "confidence" in arrays:
+        confidence = _numbers(arrays, "confidence", np.float64, (m, keypoints))
+        points = np.concatenate([points[..., :2], confidence[..., None]], -1)
+    frame = _numbers(arrays, "frame", np.int64, (m,)) if "frame" in arrays else np.arange(m)
+    count = int(frame.max(initial=-1)) + 1
+    if m and int(frame.min()) < 0:
+        raise KeypointFileError(f"`frame` has {frame.min()}; frames are counted from 0")
+    if count > m + _MOST_EMPTY:
+        raise KeypointFileError(
+            f"`frame` goes to {count - 1} with {m} objects; at most {_MOST_EMPTY} frames may show "
+            "nobody"
+        )
+    if "stamps" in arrays:
+        count = max(count, len(arrays["stamps"]))
+        stamps = _numbers(arrays, "stamps", np.int64, (count,))
+    else:
+        stamps = stamps_at(rate, count)
+    ids = arrays.get("ids", _places(frame)).astype(str)
+    if ids.shape != (m,):
+        raise KeypointFileError(f"`ids` is {ids.shape}; ({m},) is needed")
+    seen = observation(points, min_confidence)
+    order = np.argsort(frame, kind="stable")
+    return Detections(seen.points[order], seen.confidence[order], frame[order], ids[order], stamps)
+
+
+def _numbers(
+    arrays: Mapping[str, NDArray[Any]],
+    name: str,
+    kind: type,
+    shape: tuple[int, ...] | None = None,
+) -> NDArray[Any]:
+    """Return an array of an npz, of numbers and of the shape that it must have."""
+    array = arrays[name]
+    if array.dtype.kind not in "fiu" or shape is not None and array.shape != shape:
+        wanted = "of numbers" if shape is None else f"of numbers {shape}"
+        raise KeypointFileError(f"`{name}` is {array.dtype} {array.shape}; {wanted} is needed")
+    if kind is np.int64 and not (np.abs(array) < 2**63).all():
+        raise KeypointFileError(f"`{name}` has a number that is no whole one of 64 bits")
+    return array.astype(kind)
+
+
+def _places(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the place of each object among those of its frame (m,)."""
+    order = np.argsort(frame, kind="stable")
+    ordered = frame[order]
+    places = np.empty(len(frame), np.int64)
+    places[order] = np.arange(len(frame)) - np.searchsorted(ordered, ordered)
+    return places
+
+
+def _natural(name: Any) -> list[tuple[int, int, str]]:
+    """Return what sorts names as people do: frame_2 before frame_10."""
+    text = name.name if isinstance(name, Path) else str(name)
+    parts = re.split(r"(\d+)", text)
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p]

@@ -1,0 +1,1 @@
+"""Lifting: from 2D keypoints to 3D shapes and cameras with a trained model; no torch, no ROS."""

@@ -1,0 +1,111 @@
+"""The lifter's sums as one compiled call: `kernel/`, where it was compiled at installation.
+
+Without it, and for options of the network that the default recipe does not use, `fitting` does the
+same some ten times slower.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.lifting.confidence import CALIBRATED, LEAST_RESIDUAL
+from deep_nrsfm_ros.lifting.correction import UNKNOWN
+from deep_nrsfm_ros.lifting.numpy_backend import NEAREST, RESIDUAL_SPREAD, Constants
+from deep_nrsfm_ros.nrsfm.bones import Bones
+from deep_nrsfm_ros.nrsfm.network import Network, filling
+
+try:
+    from deep_nrsfm_ros.kernel import _kernel
+except ImportError:  # no compiler at installation
+    _kernel = None  # type: ignore[assignment]
+
+AVAILABLE = _kernel is not None
+
+
+def fits(network: Network) -> bool:
+    """Tell whether there is a kernel, and it knows the network's options."""
+    options = network.architecture
+    return AVAILABLE and options.is_default_variant and len(options.widths) <= _kernel.MOST_LAYERS
+
+
+class Kernel:
+    """A lifter's constants, laid out for the kernel."""
+
+    def __init__(self, constants: Constants) -> None:
+        """Take the constants, of a network that the kernel `fits`."""
+        net, p = constants.network, constants.network.p
+        options = net.architecture
+        covariance = np.eye(3 * p) if constants.covariance is None else constants.covariance
+        header = [
+            p,
+            len(options.widths),
+            len(constants.test_time_rotations),
+            constants.partners is not None,
+        ]
+        header += [bool(options.whitening), constants.normaliser.scale == "rms"]
+        header += [constants.covariance is not None]
+        header += [constants.refill, *(constants.reference or (-1, -1)), constants.min_visible]
+        bones = constants.bones or Bones(np.zeros((2, 0), np.int32), np.zeros(0), np.zeros(0))
+        header += [len(bones.lengths), *options.widths, *(constants.partners or range(p))]
+        header += [*bones.ends.T.flat]
+        floats = [_panels(net.L), _panels(net.L_inverse)]
+        for i, (D, b, b_) in enumerate(zip(net.D, net.b, net.b_, strict=True)):
+            # Of shapes, the coordinates stand one after the other, (3, p).
+            encoder = D if i else _padded(D).reshape(p, -1)
+            decoder = D.T if i else _padded(D.transpose(2, 1, 0)).reshape(D.shape[2], -1)
+            floats += [_panels(encoder), _padded(b), _panels(decoder), _padded(b_ if i else b_.T)]
+        last = options.widths[-1]
+        code_head = _padded(net.code_head.reshape(6, last, last).swapaxes(1, 2)).swapaxes(1, 2)
+        floats += [_panels(code_head.reshape(-1, last)), net.camera_head, constants.spread]
+        # Three rows for each point: (p, 3, 3, p), both p filled up.
+        rows = _padded(covariance.reshape(p, 3, p, 3).swapaxes(2, 3), _kernel.DOUBLES)
+        rows = _padded(rows.swapaxes(0, 3), _kernel.DOUBLES).swapaxes(0, 3)
+        floats += [rows]
+        doubles = [filling(net), constants.test_time_rotations, constants.frame]
+        doubles += [CALIBRATED, np.stack(bones[1:], 1), constants.noise, constants.length]
+        doubles += [UNKNOWN * np.trace(covariance) / (3 * p), NEAREST, RESIDUAL_SPREAD]
+        doubles += [LEAST_RESIDUAL]
+        self._plan = _kernel.plan(
+            np.array(header, np.int32), _joined(floats, np.float32), _joined(doubles, np.float64)
+        )
+        self._p = p
+
+    def __call__(
+        self, points: NDArray[np.float32], confidence: NDArray[np.float32], perspective: bool
+    ) -> tuple[tuple[NDArray[np.float32], ...], NDArray[np.bool_]]:
+        """Return the fields of `lifting.Lifted`, and (n,) where there is nothing to lift.
+
+        Arguments as those of `Lifter.__call__`, their shapes checked.
+        """
+        n, p = confidence.shape
+        shapes = ((n, p, 3), (n, 3, 3), n, (n, 2), n, (n, p))
+        lifted = tuple(np.empty(shape, np.float32) for shape in shapes)
+        lost = np.empty(n, np.bool_)
+        _kernel.lift(
+            self._plan,
+            np.ascontiguousarray(points, np.float32),
+            np.ascontiguousarray(confidence, np.float32),
+            perspective,
+            *lifted,
+            lost,
+        )
+        return lifted, lost
+
+
+def _padded(A: NDArray[Any], multiple: int | None = None) -> NDArray[Any]:
+    """Return A (..., n) filled up with zeros to n a multiple, by default of FLOATS."""
+    more = -A.shape[-1] % (multiple or _kernel.FLOATS)
+    return np.pad(A, ((0, 0),) * (A.ndim - 1) + ((0, more),))
+
+
+def _panels(A: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return A (k, n) in panels of some columns, (panels, k, columns), as the kernel reads it."""
+    return _padded(A).reshape(len(A), -1, _kernel.FLOATS).swapaxes(0, 1)
+
+
+def _joined(parts: Sequence[object], kind: type) -> NDArray[np.float32]:
+    return np.concatenate([np.ravel(np.asarray(part, kind)) for part in parts])

@@ -1,0 +1,1 @@
+"""Messages of detectors: bytes and fields to observations; no ROS import."""

@@ -1,0 +1,207 @@
+"""Keypoint messages to observations, by duck typing: nothing of ROS is imported.
+
+Live messages of rclpy and messages that rosbags read from a bag have the same fields and take the
+same path. Whatever is wrong with a message ends in a `MessageError`, before anything of a size
+that the message claims is allocated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.lifting.observation import (
+    MessageError,
+    Observation,
+    check_keypoints,
+    observation,
+)
+from deep_nrsfm_ros.messages.field_mapping import MAPPINGS, FieldMapping, Size
+from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES, read_mapping
+from deep_nrsfm_ros.messages.point_cloud import make_of
+
+POINT_CLOUD = "sensor_msgs/PointCloud2"
+MULTI_ARRAY = "std_msgs/Float32MultiArray"
+POLYGON = "geometry_msgs/PolygonStamped"
+
+# The layout that `pack_points` writes, as (name, offset) of float32 fields.
+POINT_FIELDS = (("x", 0), ("y", 4), ("z", 8), ("confidence", 12))
+POINT_STEP = 16
+
+
+InputType = str | FieldMapping
+"""One of `INPUT_TYPES`, or the mapping of any other."""
+
+
+def find_input(option: str, word: str) -> InputType:
+    """Return the input type that `word`, given by `option`, stands for.
+
+    word: one of `INPUT_TYPES`, or the path of a field mapping. Raises ValueError for anything else,
+    or for a damaged file.
+    """
+    name = word.replace("/msg/", "/")
+    if name in INPUT_TYPES:
+        return name
+    if word.endswith(MAPPING_SUFFIXES):
+        return read_mapping(Path(word).expanduser())
+    raise ValueError(
+        f"{option} is {word!r}; name one of {', '.join(INPUT_TYPES)}, or for any other type the "
+        f"path of a field mapping ({MAPPING_SUFFIXES[0]})"
+    )
+
+
+def name_of(input_type: InputType) -> str:
+    """Return the type of the messages, "package/Type"."""
+    return input_type if isinstance(input_type, str) else input_type.type
+
+
+def read(
+    message: Any,
+    input_type: InputType,
+    keypoints: int,
+    min_confidence: float = 0.0,
+    size: Size | None = None,
+) -> Observation:
+    """Return the observation in `message`, which is of type `input_type`.
+
+    keypoints: q, the number that the detector's layout has; another number is an error.
+    min_confidence: a keypoint below it is missing. So is one with confidence 0, at (0, 0), or
+        with NaN or infinity in a coordinate or its confidence.
+    size: width and height of the image, where the keypoints are normalised by them.
+    Raises MessageError for a malformed message, ValueError for an unknown `input_type`.
+    """
+    mapping = _mapping(input_type)
+    try:
+        if mapping:
+            values, ids = mapping(message, keypoints, size)
+            return observation(values, min_confidence, ids)
+        if isinstance(input_type, str) and (reader := _READERS.get(input_type)):
+            return observation(reader(message, keypoints), min_confidence)
+    except MessageError:
+        raise
+    except (AttributeError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise MessageError(f"expected a message of type {name_of(input_type)}: {error}") from None
+    raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
+
+
+def count_keypoints(message: Any, input_type: InputType) -> int:
+    """Return how many keypoints each object in `message` has; 0 if there is no object in it.
+
+    Where the detector leaves some out it is the least that there can be. Raises MessageError for
+    an array of plain numbers that may be pairs or triples.
+    """
+    mapping = _mapping(input_type)
+    if mapping:
+        return mapping.count(message)
+    if input_type == POINT_CLOUD:
+        return int(message.width) if int(message.height) else 0
+    if input_type == POLYGON:
+        return len(message.polygon.points)
+    shape = [int(dimension.size) for dimension in message.layout.dim]
+    if len(shape) > 1:
+        return shape[-2] if math.prod(shape) else 0
+    numbers = max(len(message.data) - int(message.layout.data_offset), 0)
+    fits = [numbers // size for size in (2, 3) if numbers % size == 0]
+    if not numbers or len(fits) == 1:
+        return fits[0]
+    raise MessageError(
+        f"data has {numbers} numbers and no layout; give it one, so that (x, y) can be told from "
+        "(x, y, confidence)"
+    )
+
+
+def may_leave_out(input_type: InputType) -> bool:
+    """Tell whether messages leave out keypoints, so that none need tell how many there are."""
+    mapping = _mapping(input_type)
+    return bool(mapping and mapping.keypoint_id and not mapping.names)
+
+
+def _mapping(input_type: InputType) -> FieldMapping | None:
+    """Return the mapping of an input type, if it is read by one."""
+    return MAPPINGS.get(input_type) if isinstance(input_type, str) else input_type
+
+
+def pack_points(points: NDArray[np.floating], confidence: NDArray[np.floating]) -> bytes:
+    """Return the data of a little-endian PointCloud2 with the fields `POINT_FIELDS`.
+
+    points: (n, p, 3) or (n, p, 2), z is then 0. confidence: (n, p). Height is n, width is p,
+    point_step is `POINT_STEP`.
+    """
+    packed = np.zeros((*confidence.shape, 4), "<f4")
+    packed[..., : points.shape[-1]] = points
+    packed[..., 3] = confidence
+    return packed.tobytes()
+
+
+def read_points(message: Any) -> NDArray[np.float32]:
+    """Return (n, p, 4) of the lifter's PointCloud2: x, y, z, confidence.
+
+    Raises MessageError for a cloud of another make.
+    """
+    n, p = int(message.height), int(message.width)
+    found = tuple((str(field.name), int(field.offset)) for field in message.fields)
+    if found != POINT_FIELDS or int(message.point_step) != POINT_STEP:
+        raise MessageError(f"fields are {found}; a lifter's points have {POINT_FIELDS}")
+    data = memoryview(message.data).cast("B")
+    if len(data) != n * p * POINT_STEP:
+        raise MessageError(f"data has {len(data)} bytes; {n} x {p} points need {n * p * 16}")
+    order = ">f4" if message.is_bigendian else "<f4"
+    return np.frombuffer(data, order).reshape(n, p, 4).astype(np.float32)
+
+
+def _point_cloud(message: Any, keypoints: int) -> NDArray[np.floating]:
+    """Return (n, q, 2 or 3) of a PointCloud2: fields x, y and, where there is one, confidence."""
+    return make_of(message, keypoints).values(memoryview(message.data).cast("B"))
+
+
+def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:
+    """Return (n, q, 2 or 3) of a Float32MultiArray.
+
+    The sizes of the layout's dimensions tell the shape: q x 2, q x 3, n x q x 2 or n x q x 3,
+    rows of x, y and, in threes, confidence. Strides are not looked at: the data is dense. With no
+    dimensions, or a single one, the data is one object: 2q numbers are q x 2, 3q are q x 3.
+    """
+    data = np.asarray(message.data, np.float32)[int(message.layout.data_offset) :]
+    shape = [int(dimension.size) for dimension in message.layout.dim]
+    if len(shape) > 3:
+        raise MessageError(f"layout has {len(shape)} dimensions; expected at most 3")
+    if shape and math.prod(shape) != len(data):
+        sizes = " x ".join(map(str, shape))
+        raise MessageError(f"layout says {sizes} numbers; data has {len(data)} after its offset")
+    if len(shape) < 2:
+        if len(data) not in (2 * keypoints, 3 * keypoints):
+            raise MessageError(
+                f"data has {len(data)} numbers and no layout; {keypoints} keypoints need "
+                f"{2 * keypoints} (x, y) or {3 * keypoints} (x, y, confidence)"
+            )
+        shape = [keypoints, len(data) // keypoints]
+    *objects, count, size = shape
+    if size not in (2, 3):
+        raise MessageError(f"last dimension is {size}; expected 2 (x, y) or 3 (x, y, confidence)")
+    check_keypoints(count, keypoints, "next to last dimension")
+    return data.reshape(*(objects or [1]), count, size)
+
+
+def _polygon(message: Any, keypoints: int) -> NDArray[np.floating]:
+    """Return (1, q, 2 or 3) of a PolygonStamped; z is the confidence.
+
+    A z of exactly 0 everywhere is a sender that gives no confidence: all points are certain.
+    """
+    points = message.polygon.points
+    check_keypoints(len(points), keypoints, "number of points")
+    values = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(1, keypoints, 3)
+    return values if values[..., 2].any() else values[..., :2]
+
+
+_READERS: dict[str, Callable[[Any, int], NDArray[np.floating]]] = {
+    POINT_CLOUD: _point_cloud,
+    MULTI_ARRAY: _multi_array,
+    POLYGON: _polygon,
+}
+
+INPUT_TYPES = (*_READERS, *MAPPINGS)

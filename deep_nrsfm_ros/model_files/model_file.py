@@ -1,0 +1,254 @@
+"""Model files: safetensors weights with everything that is needed to use them, never pickle."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import load, save_file
+
+from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.nrsfm.bones import Bones
+from deep_nrsfm_ros.nrsfm.network import Architecture, Network, weight_shapes
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+
+MODEL_SUFFIX = ".safetensors"
+_FORMAT = "deep_nrsfm_ros model 2"
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_MAX_BYTES = 64 * 2**20
+_MAX_HEADER = 2**20
+_SMALLEST = 1e-9  # length of a bone, or its spread, that can be divided by
+_LARGEST = 1e9  # no weight of a trained model comes near; products of them stay finite
+
+
+class ModelFileError(ValueError):
+    """A model file that is missing, damaged or not one of ours; the text says which and what."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained network and what its input and output mean.
+
+    object_frame: (3, 3) orthonormal A that takes the network's axes to the object's (S A, A^T M).
+        det -1 undoes a mirrored depth; the axes are x front, y left, z up where the layout has
+        a handedness.
+    provenance: data, recipe and versions; quality: label-free figures.
+    error_covariance: (3p, 3p) of the network's errors, in its own axes; see `correction`. Equal
+        and apart from each other if nothing is known.
+    bone_lengths: (b, 2) of the layout's bones, shares of their sum and how much they vary; see
+        `bones`. Empty if nothing is known.
+    """
+
+    name: str
+    network: Network
+    layout: KeypointLayout
+    normaliser: Normaliser
+    object_frame: NDArray[np.float32]
+    provenance: dict[str, Any] = field(default_factory=dict)
+    quality: dict[str, Any] = field(default_factory=dict)
+    error_covariance: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    bone_lengths: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+
+    def __post_init__(self) -> None:
+        """Fill in a covariance that is not given."""
+        if not self.error_covariance.size:
+            unknown = np.eye(3 * len(self.layout), dtype=np.float32)
+            object.__setattr__(self, "error_covariance", unknown)
+
+    @property
+    def bones(self) -> Bones | None:
+        """What is known of the bones."""
+        if not len(self.bone_lengths):
+            return None
+        ends = np.array(self.layout.bone_indices(), np.int32).T
+        return Bones(ends, *self.bone_lengths.astype(np.float64).T)
+
+
+def save_model(path: Path, model: Model) -> None:
+    """Write `model` whole or not at all: to a temporary name first, then renamed."""
+    header = {
+        "name": model.name,
+        "architecture": dataclasses.asdict(model.network.architecture),
+        "layout": dataclasses.asdict(model.layout),
+        "normaliser": dataclasses.asdict(model.normaliser),
+        "object_frame": np.asarray(model.object_frame).tolist(),
+        "provenance": model.provenance,
+        "quality": model.quality,
+    }
+    weights = {k: np.ascontiguousarray(w, np.float32) for k, w in model.network.named()}
+    weights["error_covariance"] = np.ascontiguousarray(model.error_covariance, np.float32)
+    if len(model.bone_lengths):
+        weights["bone_lengths"] = np.ascontiguousarray(model.bone_lengths, np.float32)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        save_file(weights, partial, {"format": _FORMAT, "model": json.dumps(header)})
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())  # or a power cut may leave the new name on an empty file
+        partial.chmod(0o644)  # safetensors writes for its owner alone; models are for everybody
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_model(path: Path) -> Model:
+    """Read a model; raise ModelFileError that says what is wrong with the file."""
+    content = _read(path)
+    try:
+        metadata, weights = _metadata(content), load(content)
+    except Exception as error:  # safetensors raises many kinds for a damaged file
+        raise ModelFileError(f"{path} is damaged or no safetensors file: {error}") from error
+    if metadata.get("format") != _FORMAT:
+        raise ModelFileError(f"{path} is not a {_FORMAT!r} file; train or download one")
+    try:
+        return _build(json.loads(metadata["model"]), weights)
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as e:
+        raise ModelFileError(f"{path} has a damaged header or weights: {e}") from e
+
+
+def _read(path: Path) -> bytes:
+    """Return what a file holds, its size bounded; raise ModelFileError.
+
+    Read, not mapped: a mapped file that somebody cuts off meanwhile kills whoever looks at it.
+    """
+    try:
+        if path.exists() and not path.is_file():  # reading a pipe would wait for ever
+            raise ModelFileError(f"cannot read model {path}: not a regular file")
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size <= _MAX_BYTES:
+                return file.read(_MAX_BYTES)
+    except OSError as error:
+        raise ModelFileError(f"cannot read model {path}: {error.strerror or error}") from error
+    raise ModelFileError(f"{path} is larger than {_MAX_BYTES >> 20} MiB: not a model")
+
+
+def _metadata(content: bytes) -> dict[str, Any]:
+    """Return the metadata of a safetensors file: 8 bytes of length, then a header of JSON."""
+    length = int.from_bytes(content[:8], "little")
+    if length > _MAX_HEADER:
+        raise ValueError(f"its header claims {length} bytes; at most {_MAX_HEADER} are allowed")
+    return dict(json.loads(content[8 : 8 + length]).get("__metadata__", {}))
+
+
+def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> Model:
+    """Return the model of a parsed header, every shape checked against the architecture."""
+    architecture = Architecture(**_tuples(header["architecture"]))
+    normaliser = Normaliser(**header["normaliser"])
+    for config in (architecture, normaliser):
+        _check_types(config)
+        check(config)
+    layout = _layout(header["layout"])
+    p = len(layout)
+    shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
+    if "bone_lengths" in weights:  # older files have none
+        shapes["bone_lengths"] = (len(layout.bone_indices()), 2)
+    for name, shape in shapes.items():
+        found = weights[name]
+        if found.shape != shape or found.dtype != np.float32:
+            raise ValueError(
+                f"weight {name} is {found.dtype} {found.shape}; it must be float32 {shape}"
+            )
+        if not (np.abs(found) < _LARGEST).all():  # NaN compares false
+            raise ValueError(f"weight {name} has a number that is not below {_LARGEST:g}")
+    frame = np.array(header["object_frame"], np.float64)
+    # NaN and what would overflow compare false.
+    if frame.shape != (3, 3) or not (np.abs(frame) < 2).all():
+        raise ValueError("object_frame is not orthonormal (3, 3)")
+    if not np.abs(frame @ frame.T - np.eye(3)).max() < 1e-3:
+        raise ValueError("object_frame is not orthonormal (3, 3)")
+    covariance = weights["error_covariance"]
+    if not (np.abs(covariance - covariance.T) <= 1e-5 * np.trace(covariance)).all():
+        raise ValueError("error_covariance is not symmetric")
+    if not np.linalg.eigvalsh(covariance)[0] > 0:
+        raise ValueError("error_covariance is not positive definite")
+    bone_lengths = weights.get("bone_lengths", np.zeros((0, 2), np.float32))
+    if not (bone_lengths > _SMALLEST).all():
+        raise ValueError(f"bone_lengths are not all above {_SMALLEST:g}")
+    return Model(
+        str(header["name"]),
+        Network.from_named(architecture, weights),
+        layout,
+        normaliser,
+        frame.astype(np.float32),
+        dict(header["provenance"]),
+        dict(header["quality"]),
+        covariance,
+        bone_lengths,
+    )
+
+
+def _tuples(value: Any) -> Any:
+    """Return parsed JSON with its lists as tuples, as the dataclasses hold them."""
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return value
+
+
+def _check_types(config: Any) -> None:
+    """Raise ValueError for a value that has not the type of its default; JSON may hold anything."""
+    for field_ in dataclasses.fields(config):
+        default, value = field_.default, getattr(config, field_.name)
+        if isinstance(default, float) and type(value) is int:
+            continue
+        items = value if isinstance(default, tuple) and isinstance(value, tuple) else (value,)
+        kind = type(default[0] if isinstance(default, tuple) else default)
+        if type(value) is not type(default) or any(type(item) is not kind for item in items):
+            raise ValueError(f"{field_.name} is {value!r}; it must be like {default!r}")
+
+
+def _layout(header: dict[str, Any]) -> KeypointLayout:
+    """Return the layout of a header."""
+    handedness = header["handedness"] or []
+    if handedness and isinstance(handedness[0], str):  # the one of an older file
+        handedness = [handedness]
+    header = {"rigid": []} | header | {"handedness": handedness}  # as older files have none
+    _check_names(header)
+    return KeypointLayout(**_tuples(header))
+
+
+def _check_names(layout: dict[str, Any]) -> None:
+    """Raise ValueError unless every name in the header's layout is a text."""
+    derived = layout["derived"]
+    pairs = [*layout["edges"], *layout["rigid"], layout["reference"]]
+    lists = [layout["keypoints"], *pairs, *layout["handedness"]]
+    for names in ([layout["name"]], [*derived], *derived.values(), *lists):
+        if not isinstance(names, (list, type(None))) or any(
+            type(n) is not str for n in names or ()
+        ):
+            raise ValueError(f"layout has {str(names)[:60]} for names")
+
+
+def check_name(option: str, name: str) -> None:
+    """Raise ValueError unless `name`, given by `option`, can name a model and so its file."""
+    if not _SAFE_NAME.fullmatch(name):
+        raise ValueError(f"{option} is {name!r}; use letters, digits, '_', '-' and '.'")
+
+
+def find_model(name_or_path: str, folders: Sequence[Path]) -> Path:
+    """Return the file of a model given by path or by name in the first folder that has it.
+
+    Raises ModelFileError that lists the models there are.
+    """
+    path = Path(name_or_path).expanduser()
+    if path.suffix == MODEL_SUFFIX and path.is_file():
+        return path
+    for folder in folders:
+        candidate = folder / f"{name_or_path}{MODEL_SUFFIX}"
+        if candidate.is_file():
+            return candidate
+    names = sorted({f.stem for folder in folders for f in folder.glob(f"*{MODEL_SUFFIX}")})
+    raise ModelFileError(
+        f"no model {name_or_path!r}; there are {', '.join(names) or 'none'} in "
+        f"{', '.join(map(str, folders))}"
+    )

@@ -1,1 +1,0 @@
-"""Everything that turns the outside world into observations: messages, bags, motion capture."""

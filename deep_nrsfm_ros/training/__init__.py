@@ -1,0 +1,1 @@
+"""Training: the loop and everything around it, from the request to the record on disk; no ROS."""

@@ -1,0 +1,74 @@
+import csv
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from benchmarks.baselines import batches
+from benchmarks.furniture import CATEGORIES
+from benchmarks.harness import Session
+from benchmarks.paper import structure_from_category
+from benchmarks.paper.structure_from_category import CAMERAS, FACES, images, main
+from deep_nrsfm_ros.commands.evaluate import LIFTING
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A folder of 30 faces of 10 points."""
+    rng = np.random.default_rng(0)
+    faces = rng.standard_normal((10, 3)) + 0.1 * rng.standard_normal((30, 10, 3))
+    folder = tmp_path / "data" / "nrsfm"
+    folder.mkdir(parents=True)
+    savemat(folder / "FRGC_X.mat", {"X": faces.transpose(2, 1, 0)})
+    return folder.parent
+
+
+@pytest.fixture
+def session(data, tmp_path):
+    return Session(data, tmp_path / "output", (), (0,), 20, 1)
+
+
+@pytest.mark.parametrize("category", [FACES, *CATEGORIES])
+def test_each_object_is_seen_by_cameras_of_its_own(session, category, monkeypatch):
+    monkeypatch.setattr(structure_from_category, "OBJECTS", 30)
+    dataset = images(session, category)
+    assert len(dataset) == 30 * CAMERAS
+    assert dataset.shapes is not None
+    one = slice(0, CAMERAS)
+    assert np.ptp(dataset.shapes[one], axis=0).max() == 0
+    assert np.ptp(dataset.points[one], axis=0).max() > 0.1
+    # An orthographic image is a linear map of the shape that keeps no length longer.
+    for W, S in zip(dataset.points, dataset.shapes, strict=True):
+        M = np.linalg.pinv(S) @ W
+        np.testing.assert_allclose(S @ M, W, atol=1e-4)
+    again = images(session, category)
+    np.testing.assert_array_equal(dataset.points, again.points)
+
+
+def test_command_compares_all_methods_on_each_category(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(batches, "RANKS", (3,))
+    monkeypatch.setattr(structure_from_category, "OBJECTS", 30)
+    output = tmp_path / "output"
+    main(
+        [
+            *("--data", str(data), "--output", str(output), "--steps", "20", "--seeds", "0"),
+            *("--subjects", FACES, "chair"),
+        ]
+    )
+    assert "stand-in for the IKEA data" in capsys.readouterr().out
+    with open(output / "structure_from_category.csv") as file:
+        table = list(csv.DictReader(file))
+    methods = {row["method"] for row in table if row["category"] == FACES}
+    assert len(methods) == len(LIFTING) + 3
+    printed = [row for row in table if row["method"] == "paper on IKEA: Deep NRSfM"]
+    assert [(row["category"], float(row["shape %"])) for row in printed] == [("chair", 1.15)]
+    for row in table:
+        assert 0 < float(row["shape %"]) < 100
+
+
+def test_command_lists_the_categories_there_are(data, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--data", str(data), "--subjects", "wardrobe"])
+    assert stopped.value.code == 2
+    assert "wardrobe" in (said := capsys.readouterr().err)
+    assert "sofa" in said

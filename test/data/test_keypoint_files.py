@@ -1,0 +1,208 @@
+"""Keypoints come from files of every kind alike, and what is wrong with one is said by name."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.data.bags import Frame, write_bag
+from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
+from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
+from deep_nrsfm_ros.layouts.keypoint_layout import COCO17
+from deep_nrsfm_ros.lifting.observation import observation
+from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY
+
+Q = len(COCO17)
+PERSON = json.dumps({"image_id": 5, "keypoints": [0] * 3 * Q})
+COUNTS = (1, 0, 2, 3, 1)  # objects in each frame
+
+
+@pytest.fixture
+def seen() -> Detections:
+    """Return five frames of 0 to 3 people at 10 Hz, some keypoints missing."""
+    rng = np.random.default_rng(0)
+    values = rng.uniform(1, 1000, (sum(COUNTS), Q, 3))
+    values[..., 2] = rng.uniform(0.2, 1, values.shape[:2])
+    values[rng.random(values.shape[:2]) < 0.1] = 0
+    people = observation(values)
+    parts = np.split(np.arange(len(values)), np.cumsum(COUNTS)[:-1])
+    frames = [type(people)(people.points[p], people.confidence[p]) for p in parts]
+    return gather(frames, stamps_at(10, len(COUNTS)), Q)
+
+
+def triples(seen: Detections) -> list[list[float]]:
+    both = np.concatenate([seen.points, seen.confidence[..., None]], -1)
+    return both.astype(float).reshape(len(seen), -1).tolist()
+
+
+def write_openpose(folder: Path, seen: Detections) -> list[str]:
+    """Write a file a frame, named so that they sort as numbers only; return their texts."""
+    folder.mkdir()
+    texts, rows = [], triples(seen)
+    for frame in range(len(seen.stamps)):
+        people = [{"pose_keypoints_2d": rows[i]} for i in np.flatnonzero(seen.frame == frame)]
+        texts.append(json.dumps({"people": people}))
+        (folder / f"cam_{8 + frame}_keypoints.json").write_text(texts[-1])
+    return texts
+
+
+def assert_same(found: Detections, expected: Detections) -> None:
+    for name in ("confidence", "frame", "ids", "stamps"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+    np.testing.assert_array_equal(found.points, expected.points)
+
+
+def write(kind: str, folder: Path, seen: Detections) -> Path:
+    """Write the same people as a file of any kind; return its path."""
+    rows = triples(seen)
+    if kind == "openpose folder":
+        write_openpose(folder / "json", seen)
+        return folder / "json"
+    if kind.startswith("jsonl"):
+        text = "\n".join(write_openpose(folder / "json", seen)).encode()
+        path = folder / f"people.{kind}"
+        path.write_bytes(gzip.compress(text) if kind.endswith("gz") else text)
+        return path
+    if kind.startswith("coco"):
+        entries: list[dict[str, Any]] = [
+            {"image_id": int(f), "keypoints": row, "score": 0.9}
+            for f, row in zip(seen.frame, rows, strict=True)
+        ]
+        images = [{"id": i, "file_name": f"{i}.jpg"} for i in range(len(seen.stamps))]
+        path = folder / "people.json"
+        path.write_text(json.dumps({"images": images, "annotations": entries}))
+        return path
+    if kind == "npz":
+        path = folder / "people.npz"
+        order = np.arange(len(seen))[::-1]  # any order of frames will do
+        np.savez(
+            path,
+            points=seen.points[order],
+            confidence=seen.confidence[order],
+            frame=seen.frame[order],
+            ids=seen.ids[order],
+            stamps=seen.stamps,
+        )
+        return path
+    rows_of = [np.flatnonzero(seen.frame == f) for f in range(len(seen.stamps))]
+    frames = (
+        Frame(int(stamp), seen.points[rows], seen.confidence[rows])
+        for stamp, rows in zip(seen.stamps, rows_of, strict=True)
+    )
+    input_type = {"input_type": MULTI_ARRAY} if "array" in kind else {}
+    write_bag(folder / "bag", "/people", frames, kind.split()[0], **input_type)
+    return folder / "bag"
+
+
+KINDS = ("openpose folder", "jsonl", "jsonl.gz", "coco", "npz", "mcap", "sqlite3", "mcap array")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_gives_the_same_people(kind: str, tmp_path: Path, seen: Detections) -> None:
+    found = read_keypoints(write(kind, tmp_path, seen), Q, rate=10)
+    if kind == "npz":  # the objects of a frame stay in their order, which was turned round
+        found = found[np.lexsort((found.ids, found.frame))]
+    assert_same(found, seen)
+
+
+def test_coco_results_without_images(tmp_path: Path, seen: Detections) -> None:
+    rows = triples(seen)
+    results = [
+        {"image_id": f"{9 + f}.jpg", "keypoints": rows[i], "track_id": 7 + i}
+        for i, f in reversed([*enumerate(seen.frame.tolist())])
+    ]
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    found = read_keypoints(tmp_path / "results.json", Q)
+    assert found.frame.tolist() == [0, 1, 1, 2, 2, 2, 3]  # the frame of nobody is not told of
+    assert sorted(found.ids.tolist()) == sorted(map(str, range(7, 14)))
+    np.testing.assert_array_equal(found.points[0], seen.points[0])
+
+
+def test_plain_npz_is_a_frame_each(tmp_path: Path, seen: Detections) -> None:
+    np.savez(tmp_path / "a.npz", points=seen.points)
+    found = read_keypoints(tmp_path / "a.npz", Q, rate=50)
+    assert found.frame.tolist() == list(range(7)) and set(found.ids) == {"0"}
+    assert found.stamps.tolist() == [20_000_000 * i for i in range(7)]
+    np.testing.assert_array_equal(found.confidence > 0, (seen.points != 0).any(-1))
+
+
+def test_largest_is_one_a_frame(seen: Detections) -> None:
+    seen.points[seen.frame == 3] *= np.array([0.1, 1, 0.5], np.float32)[:, None, None]
+    found = seen.largest()
+    assert found.frame.tolist() == [0, 2, 3, 4]
+    assert found.ids[2] == "1"
+    np.testing.assert_array_equal(found.stamps, seen.stamps)
+
+
+def test_low_confidence_is_missing(tmp_path: Path, seen: Detections) -> None:
+    for kind in ("coco", "npz"):
+        found = read_keypoints(write(kind, tmp_path, seen), Q, min_confidence=0.6)
+        assert (found.confidence > 0).sum() == (seen.confidence >= 0.6).sum()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "expected"),
+    [
+        ({"poses": np.zeros(3)}, r"no array `points` \(objects, 17, 2\); there are: poses"),
+        ({"points": np.zeros((4, 18, 2))}, r"`points` is \(4, 18, 2\); \(objects, 17, 2\)"),
+        ({"points": np.array([["a"]])}, "`points` is <U1"),
+        ({"points": np.array([None])}, "a.npz: .*pickle"),
+        ({"points": np.zeros((4, 17, 2)), "confidence": np.zeros(4)}, r"`confidence` is .*\(4,\)"),
+        ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, -1])}, "counted from 0"),
+        ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, 2**60])}, "at most 1000000 frames"),
+        ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, np.nan])}, "no whole one"),
+        ({"points": np.zeros((2, 17, 2)), "ids": np.array(["a"])}, r"`ids` is \(1,\); \(2,\)"),
+        ({"points": np.zeros((2, 17, 2)), "stamps": np.zeros(1)}, r"`stamps` is .* \(2,\)"),
+    ],
+)
+def test_wrong_arrays_are_named(tmp_path: Path, arrays: dict[str, Any], expected: str) -> None:
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(KeypointFileError, match=expected):
+        read_keypoints(tmp_path / "a.npz", Q)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("a.json", "{", "a.json: Expecting"),
+        ("a.json", "{}", "neither COCO"),
+        ("a.json", "[1]", "neither COCO"),
+        ("a.json", '[{"image_id": 1}]', "no annotation or result has `keypoints`"),
+        ("a.json", '[{"keypoints": []}]', "no `image_id`"),
+        ("a.json", '[{"image_id": 5, "keypoints": [1, 2, 3]}]', "image 5 has 1 keypoints.*has 17"),
+        ("a.json", '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}', "1 keypoints; expected 17"),
+        ("a.jsonl", '{"people": []}\n{"persons": []}', "a.jsonl: line 2: not a frame"),
+        ("a.json", f'{{"images": [{{}}], "annotations": [{PERSON}]}}', "`id` of an image"),
+        ("a.json", f"[{PERSON.replace('5', '[5]')}]", "`image_id` is neither"),
+        ("a.json", f"[{PERSON.replace('[0,', '[{},', 1)}]", "a.json: .*dict"),
+        pytest.param("a.json", "[" * 100_000, "asks for more .* Recursion", id="deep json"),
+        pytest.param("a.jsonl", "[" * 100_000, "line 1: not a frame", id="deep jsonl"),
+        ("a.jsonl", "", "is empty"),
+        ("a.jsonl.gz", "no gzip", "a.jsonl.gz: "),
+        ("a.npz", "no zip", "a.npz: "),
+        ("a.txt", "", "a.txt is of no known kind; expected a bag"),
+        ("a.mcap", "no bag", "a.mcap cannot be read"),
+        ("folder/a.txt", "", "folder: it holds neither a bag nor .json"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, name: str, text: str, expected: str) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    with pytest.raises(ValueError, match=expected):
+        read_keypoints(path.parent if path.parent != tmp_path else path, Q)
+
+
+def test_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(KeypointFileError, match="nowhere does not exist"):
+        read_keypoints(tmp_path / "nowhere", Q)
+
+
+def test_bags_of_another_layout_say_so(tmp_path: Path, seen: Detections) -> None:
+    with pytest.raises(ValueError, match=r"no readable message in .*bag \(5 found\).* has 25"):
+        read_keypoints(write("mcap", tmp_path, seen), 25)

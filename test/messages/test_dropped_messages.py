@@ -1,0 +1,62 @@
+"""What never came is counted while it is clear whose numbers they are."""
+
+from __future__ import annotations
+
+from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
+
+A, B = b"a", b"b"
+
+
+def gaps_after(*numbers: int | None) -> DroppedMessages:
+    gaps = DroppedMessages()
+    for number in numbers:
+        gaps.came(number)
+    return gaps
+
+
+def test_gaps_are_counted_once():
+    gaps = gaps_after(1, 2, 5, 6, 10)
+    assert gaps.missed([A]) == 2 + 3
+    assert gaps.missed([A]) == 0
+    gaps.came(12)
+    assert gaps.missed([A]) == 1
+
+
+def test_what_came_before_the_first_message_is_not_missed():
+    assert gaps_after(1000, 1001).missed([A]) == 0
+
+
+def test_the_last_gap_of_a_publisher_that_has_gone_counts():
+    gaps = gaps_after(1, 2)
+    assert gaps.missed([A]) == 0
+    gaps.came(4)
+    assert gaps.missed([]) == 1
+
+
+def test_numbers_of_two_publishers_tell_nothing():
+    assert gaps_after(1000, 5, 1001, 6).missed([A, B]) == 0
+
+
+def test_a_publisher_in_the_place_of_another_is_not_taken_for_it():
+    gaps = gaps_after(1, 2)
+    gaps.missed([A])
+    gaps.came(500)
+    assert gaps.missed([B]) == 0
+    gaps.came(502)
+    assert gaps.missed([B]) == 1
+
+
+def test_a_publisher_that_comes_later_counts_anew():
+    gaps = gaps_after(1, 2)
+    gaps.missed([A])
+    gaps.missed([])
+    gaps.came(7)
+    assert gaps.missed([B]) == 0
+
+
+def test_a_publisher_that_starts_again_is_behind_not_ahead():
+    assert gaps_after(7, 8, 1, 2).missed([A]) == 0
+
+
+def test_a_middleware_without_numbers_tells_nothing():
+    assert gaps_after(None, None, 5, None, 9).missed([A]) == 0

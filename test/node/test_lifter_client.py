@@ -1,0 +1,97 @@
+"""The watcher joins what a lifter hears and what it answers, over DDS."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import PointCloud2, PointField
+
+from deep_nrsfm_ros.data.recording import Recording
+from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
+from deep_nrsfm_ros.node.lifter_client import Watcher
+
+KEYPOINTS = 17
+
+
+def message(second: int, objects: int = 2) -> PointCloud2:
+    points = np.random.default_rng(second).uniform(1, 900, (objects, KEYPOINTS, 2))
+    fields = [PointField(name=n, offset=at, datatype=7, count=1) for n, at in POINT_FIELDS]
+    cloud = PointCloud2(height=objects, width=KEYPOINTS, fields=fields, point_step=POINT_STEP)
+    cloud.row_step = POINT_STEP * KEYPOINTS
+    cloud.data = array("B", pack_points(points, np.full((objects, KEYPOINTS), 0.9)))
+    cloud.header.stamp.sec = second
+    return cloud
+
+
+def test_keypoints_and_answers_are_joined(
+    start_lifter: Callable[..., Any],
+    connect: Callable[[], Any],
+    domain: int,
+) -> None:
+    start_lifter()
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    shown: list[Recording] = []
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    executor = SingleThreadedExecutor(context=context)
+    watcher = Watcher(
+        "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
+    )
+    executor.add_node(watcher)
+    try:
+        second = 0
+
+        def joined() -> Recording | None:
+            nonlocal second
+            second += 1
+            publisher.publish(message(second))
+            executor.spin_once(timeout_sec=0.2)
+            found = [r for r in shown if r.seen.confidence.any() and r.sound.all()]
+            # The rotation is a message of its own, which may come too late for a frame.
+            found = [r for r in found if np.isfinite(r.lifted.rotations[0]).all()]
+            return found[-1] if found else None
+
+        recording = client.wait(joined, "a frame with keypoints, points and rotation")
+    finally:
+        executor.shutdown()
+        watcher.destroy_node()
+        rclpy.shutdown(context=context)
+    (stamp,) = recording.seen.stamps.tolist()
+    expected = np.random.default_rng(stamp // 10**9).uniform(1, 900, (2, KEYPOINTS, 2))
+    np.testing.assert_allclose(recording.seen.points, expected, rtol=1e-6)
+    R = recording.lifted.rotations
+    np.testing.assert_allclose(R[0] @ R[0].T, np.eye(3), atol=1e-5)
+    assert np.isnan(R[1]).all() and len(recording.seen) == 2
+    W = recording.lifted.scale[:, None, None] * recording.lifted.shapes[..., :2]
+    W += recording.lifted.translation[:, None]
+    assert np.linalg.norm(W - expected) < np.linalg.norm(expected - expected.mean(1, keepdims=True))
+
+
+@pytest.mark.parametrize("wrong", ["fields", "width"])
+def test_odd_points_are_complained_of(domain: int, wrong: str) -> None:
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    shown: list[Recording] = []
+    watcher = Watcher(
+        "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
+    )
+    complaints: list[str] = []
+    watcher._complain = complaints.append  # type: ignore[method-assign]
+    odd = message(1)
+    if wrong == "fields":
+        odd.fields = odd.fields[:2]
+    else:
+        odd.width, odd.height = 34, 1
+    watcher._take_points(odd)
+    watcher._flush()
+    assert not shown and len(complaints) == 1
+    watcher.destroy_node()
+    rclpy.shutdown(context=context)

@@ -1,0 +1,74 @@
+"""What each process of test_distributed.py does; writes what it found to `rank.safetensors`."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+
+from deep_nrsfm_ros.nrsfm.network import Architecture
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
+from deep_nrsfm_ros.training.distributed import ProcessGroup, join, rank
+from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.limits import Limits
+from deep_nrsfm_ros.training.loop import train
+from deep_nrsfm_ros.training.trainer import Trainer
+
+PRESET = Preset(
+    Architecture(widths=(64, 32, 16)),
+    Normaliser(),
+    Recipe(steps=300, batch=65, learning_rate=1e-2, seeds=2, screening=20),
+)
+
+
+def first_step(points: torch.Tensor, team: ProcessGroup) -> dict[str, torch.Tensor]:
+    """Return the gradient of one step, what it was asked on, and the whitening."""
+    pool = FrameStore.of(points.numpy(), np.ones(points.shape[:2], bool))
+    pool = dataclasses.replace(pool, usable=team.shard(pool.usable))
+    trainer = Trainer(pool, PRESET, 0, team=team)
+    batch = trainer.sample(trainer.batch, 0).points
+    trainer.advance()
+    gradient = trainer.weights.grad
+    assert gradient is not None
+    return {"batch": batch, "gradient": gradient, "L": trainer.initial.L}
+
+
+def main(folder: Path) -> None:
+    """Take one step, train, train until one process wants to stop, and go on."""
+    torch.set_num_threads(1)
+    points = np.load(folder / "points.npy")
+    data = points, np.ones(points.shape[:2], bool), PRESET
+    team = join()
+    found = first_step(torch.from_numpy(points), team)
+    reports: list[object] = []
+    trainer = train(*data, limits=Limits(), team=team, on_progress=reports.append)
+    errors = team.mean(trainer.measure())
+    found |= {"weights": trainer.weights, "errors": torch.tensor(errors)}
+    found |= {"reports": torch.tensor(len(reports)), "frames": torch.tensor(trainer.frames_in_all)}
+
+    asked = 0
+
+    def stop() -> bool:
+        nonlocal asked
+        asked += 1
+        return rank() == team.size - 1 and asked > 6
+
+    file = folder / "checkpoint"
+    stopped = train(*data, team=team, should_stop=stop, checkpoint=file)
+    found["stopped"] = torch.tensor(stopped.step)
+    first: list[int] = []
+    train(*data, team=team, checkpoint=file, on_step=lambda trainer: first.append(trainer.step))
+    found |= {"resumed": torch.tensor(first[0]), "resumed_to": torch.tensor(first[-1])}
+    team.leave()
+    names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
+    found["threads"] = torch.tensor(sum("gloo" in name for name in names))
+    save_file(found, folder / f"{rank()}.safetensors")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,172 @@
+"""A training that starts from a model starts as good as it, and ends better on new data."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.nrsfm.geometry import reprojection_error
+from deep_nrsfm_ros.nrsfm.network import Architecture, Network, forward, initialise
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
+from deep_nrsfm_ros.training.fine_tuning import inherit, keep_what_is_fixed, start_from
+from deep_nrsfm_ros.training.loop import finish, train
+from deep_nrsfm_ros.training.trainer import Trainer
+
+RECIPE = Recipe(steps=100, batch=64, learning_rate=1e-3)
+LIGHT = "light"  # a keypoint that no model knows
+
+
+@pytest.fixture(scope="module")
+def source(trained: Trainer, figure: Any) -> Model:
+    return finish(trained, "source", figure.layout, "old data")
+
+
+@pytest.fixture(scope="module")
+def stretched(figure: Any) -> np.ndarray:
+    """Points (1000, 12, 2) of a figure of other proportions than the model was trained on."""
+    return ((figure.shapes[:1000] * np.float32([1.4, 1, 0.7])) @ figure.cameras[:1000]).astype("f4")
+
+
+def tuned(source: Model, layout: KeypointLayout, points: np.ndarray, steps: int = 100) -> Trainer:
+    preset = Preset(source.network.architecture, source.normaliser, RECIPE)
+    calls = iter(range(10**6))
+    return train(
+        np.ascontiguousarray(points),
+        np.ones(points.shape[:2], bool),
+        preset,
+        start=start_from(source, layout),
+        should_stop=lambda: next(calls) >= steps,
+    )
+
+
+def error(net: Network, points: np.ndarray) -> float:
+    """Return the mean reprojection error of the network alone."""
+    points = points - points.mean(1, keepdims=True)
+    W = Normaliser().encode(points, np.ones((*points.shape[:2], 1), np.float32)).W
+    S, M = forward(net, W)
+    return float(reprojection_error(W, S @ M, np.ones(W.shape[:2], bool)).mean())
+
+
+def learned(trainer: Trainer) -> Network:
+    return trainer.net.map(lambda w: w.numpy())
+
+
+def test_with_the_same_keypoints_it_starts_as_good_as_its_source(
+    source: Model, figure: Any, stretched: np.ndarray
+) -> None:
+    start = tuned(source, figure.layout, stretched, steps=0)
+    for (name, weight), (_, old) in zip(start.net.named(), source.network.named(), strict=True):
+        np.testing.assert_array_equal(weight.numpy(), old, err_msg=name)
+    on_new_data = Trainer(start.frames, start.preset, 0, source.network)
+    assert start.measure() == on_new_data.measure()
+
+
+def test_it_ends_better_on_the_new_data_than_its_source(
+    source: Model, figure: Any, stretched: np.ndarray
+) -> None:
+    before, after = (tuned(source, figure.layout, stretched, steps) for steps in (0, 100))
+    assert sum(after.measure()) < 0.7 * sum(before.measure())
+    assert error(learned(after), stretched) < 0.7 * error(source.network, stretched)
+    fresh = train(stretched, np.ones(stretched.shape[:2], bool), after.preset)
+    assert sum(after.measure()) < sum(fresh.measure())
+
+
+def test_the_order_of_the_keypoints_does_not_matter(source: Model, figure: Any) -> None:
+    order = np.random.default_rng(0).permutation(12)
+    layout = KeypointLayout("other", tuple(figure.layout.keypoints[i] for i in order))
+    net, points = start_from(source, layout), figure.points[:20]
+    S, M = forward(source.network, points)
+    shuffled, camera = forward(net, points[:, order])
+    np.testing.assert_allclose(shuffled, S[:, order], atol=1e-4)
+    np.testing.assert_allclose(camera, M, atol=1e-4)
+    np.testing.assert_allclose(net.L @ net.L_inverse, np.eye(12), atol=1e-3)
+
+
+@pytest.mark.parametrize("kept", [8, 12])
+def test_other_keypoints_are_matched_by_name_and_new_ones_learned(
+    source: Model, figure: Any, kept: int
+) -> None:
+    names = (LIGHT, *figure.layout.keypoints[12 - kept :])
+    layout = KeypointLayout("other", names)
+    light = figure.points[:, :1] * 0.5 + figure.points[:, 3:4] * 0.5  # fixed to two of the points
+    points = np.concatenate([light, figure.points[:, 12 - kept :]], 1)
+    net = start_from(source, layout)
+    np.testing.assert_array_equal(net.D[0][1:], source.network.D[0][12 - kept :])
+    assert not net.D[0][0].any() and not net.b_[0][0].any()
+    start, end = (tuned(source, layout, points, steps) for steps in (0, 100))
+    assert not np.array_equal(start.net.L.numpy(), np.eye(kept + 1))  # whitened by the new data
+    fresh = train(points, np.ones(points.shape[:2], bool), end.preset)
+    assert sum(end.measure()) < 0.6 * sum(start.measure())
+    assert sum(end.measure()) < 0.7 * sum(fresh.measure())
+
+
+def test_a_network_that_is_not_whitened_is_taken_as_it_is(figure: Any) -> None:
+    architecture = Architecture(widths=(8, 4), whitening=0.0)
+    network = initialise(architecture, 12, np.random.default_rng(0))
+    frame = np.eye(3, dtype=np.float32)
+    plain = Model("plain", network, figure.layout, Normaliser(), frame)
+    net = tuned(plain, figure.layout, figure.points, steps=0).net
+    np.testing.assert_array_equal(net.L.numpy(), np.eye(12))
+
+
+def test_strangers_are_refused(source: Model, figure: Any) -> None:
+    three = KeypointLayout("stranger", (*figure.layout.keypoints[:3], "a", "b"))
+    with pytest.raises(ValueError, match="'source' knows 3 of the 5 keypoints of 'stranger'; at"):
+        start_from(source, three)
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "complaint"),
+    [
+        ("architecture", {"widths": (64, 32)}, r"widths is \(64, 32\); model 'source'"),
+        ("architecture", {"whitening": 0.5}, "whitening is 0.5; .* has 1.0: leave"),
+        ("normaliser", {"scale": "none"}, "scale is none"),
+        ("recipe", {"steps": 5}, ""),
+    ],
+)
+def test_what_the_model_has_fixed_cannot_be_chosen_anew(
+    source: Model, part: str, changes: dict[str, Any], complaint: str
+) -> None:
+    preset = Preset(source.network.architecture, source.normaliser, RECIPE)
+    keep_what_is_fixed(source, preset)
+    preset = preset._replace(**{part: dataclasses.replace(getattr(preset, part), **changes)})
+    if complaint:
+        with pytest.raises(ValueError, match=complaint):
+            keep_what_is_fixed(source, preset)
+    else:
+        keep_what_is_fixed(source, preset)
+
+
+def test_it_inherits_its_origin_and_the_axes_that_it_cannot_find(
+    source: Model, figure: Any
+) -> None:
+    mirrored = np.diag([1, 1, -1]).astype(np.float32)
+    start = dataclasses.replace(source, object_frame=mirrored)
+    trainer = tuned(source, figure.layout, figure.points, steps=0)
+    nameless = KeypointLayout("nameless", figure.layout.keypoints)
+    found, unknown = (
+        inherit(finish(trainer, "new", layout, "new data"), start)
+        for layout in (figure.layout, nameless)
+    )
+    assert found.provenance["from"] == {"model": "source", "data": "old data"}
+    assert found.provenance["data"] == "new data"
+    np.testing.assert_allclose(found.object_frame, source.object_frame, atol=0.1)
+    np.testing.assert_array_equal(unknown.object_frame, mirrored)
+
+
+def test_a_checkpoint_is_not_taken_on_by_a_training_that_starts_elsewhere(
+    source: Model, figure: Any, stretched: np.ndarray
+) -> None:
+    trainer = tuned(source, figure.layout, stretched, steps=2)
+    fresh = Trainer(trainer.frames, trainer.preset, 0)
+    with pytest.raises(ValueError, match="checkpoint is of other data or another model"):
+        fresh.restore(trainer.state())
+    again = Trainer(trainer.frames, trainer.preset, 0, start_from(source, figure.layout))
+    again.restore(trainer.state())
+    assert again.step == 2
