@@ -2,6 +2,7 @@
 # make demo-live   from videos to 3D, with MediaPipe Pose as the detector
 # make test        environment, lint, types and all tests
 # make lint        lint and types only
+# make reference   docs/reference/ from the code
 # make fuzz        100000 spoilt inputs of every kind; takes hours
 # make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
 # make benchmark-speed     speed against floors and other ways, side by side; DATA=DIR adds time_to_error
@@ -29,7 +30,7 @@ READY := .venv/.ready
 # Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
 EXAMPLES_READY := .venv/.ready-examples
 
-.PHONY: demo demo-live test lint fuzz benchmark benchmark-speed audit lock clean
+.PHONY: demo demo-live test lint fuzz benchmark benchmark-speed audit lock clean reference
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
@@ -44,6 +45,9 @@ lint: $(READY)
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
+
+reference: $(READY)
+	$(PYTHON) -m docs.generate
 
 fuzz: $(READY)
 	FUZZ=100000 $(PYTHON) -m pytest test/fuzz

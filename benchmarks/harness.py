@@ -34,7 +34,7 @@ CHECKPOINT_SECONDS = 30.0
 LIFTING_LEGEND = {
     "network alone": "one pass of the network, nothing after it",
     "back-projected": "one pass, then moved within the image plane onto the keypoints",
-    "without bones": f"averaged over {LiftingOptions().test_time_rotations} in-plane rotations, then "
+    "without bones": f"mean over {LiftingOptions().test_time_rotations} in-plane rotations, then "
     "corrected by what the model knows of its own errors",
     "as shipped": "the same, and by how long the model knows the object's bones to be",
     "as shipped, noise 0": "the same, told that the keypoints are without noise, as they are here: "

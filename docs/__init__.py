@@ -1,0 +1,1 @@
+"""Documentation: pages written by hand, and the reference that `generate` writes."""
