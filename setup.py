@@ -23,8 +23,13 @@ setup(
             f"{NAME}.kernel._kernel",
             glob(f"{NAME}/kernel/*.c"),
             depends=glob(f"{NAME}/kernel/*.h"),
-            extra_compile_args="-O3 -fno-math-errno -fno-trapping-math -fvisibility=hidden "
-            "-pthread".split(),
+            extra_compile_args=[
+                "-O3",
+                "-fno-math-errno",
+                "-fno-trapping-math",
+                "-fvisibility=hidden",
+                "-pthread",
+            ],
             extra_link_args=["-pthread"],
             optional=True,
         )

@@ -78,7 +78,7 @@ class Table:
         """Write `name`.md, .csv and .png."""
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{self.name}.md").write_text(self.markdown())
-        with open(folder / f"{self.name}.csv", "w", newline="") as file:
+        with (folder / f"{self.name}.csv").open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow((*self.labels, "seed", *self.figures))
             for row in self.rows:

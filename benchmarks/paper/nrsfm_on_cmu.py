@@ -14,7 +14,7 @@ from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 
 SUBJECTS = ("01", "05", "127")
 # Kong and Lucey, "Deep Interpretable Non-Rigid Structure from Motion", arXiv 1902.10840, Table 1.
-_PRINTED = "01 05 18 23 64 70 102 106 123 127".split()
+_PRINTED = ["01", "05", "18", "23", "64", "70", "102", "106", "123", "127"]
 _SHAPE = {
     "Deep NRSfM": "10.74 13.40 4.73 3.24 4.38 2.17 7.32 6.83 2.23 6.00",
     "Simple": "16.45 14.07 13.85 20.03 18.13 18.91 18.78 18.63 19.32 23.70",

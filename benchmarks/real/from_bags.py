@@ -254,17 +254,19 @@ def _served(session: Session, title: str, bag: Path, options: Mapping[str, str])
     }
     answers = session.output / f"{name}_answers"
     shutil.rmtree(answers, ignore_errors=True)
-    with lifter(parameters, session.output / f"{name}.log") as process:
-        with Client(process, bag, answers) as client:
-            client.meet()
-            print(client.train(), flush=True)
-            with tqdm(total=steps, desc=name) as bar:
-                while client.training["state"] not in ENDED:
-                    client.wait_a_second()
-                    if client.training["state"] == "training":
-                        bar.update(int(client.training.get("step", bar.n)) - bar.n)
-            if client.training["state"] != "finished":
-                raise DemoError(client.training["message"])
+    with (
+        lifter(parameters, session.output / f"{name}.log") as process,
+        Client(process, bag, answers) as client,
+    ):
+        client.meet()
+        print(client.train(), flush=True)
+        with tqdm(total=steps, desc=name) as bar:
+            while client.training["state"] not in ENDED:
+                client.wait_a_second()
+                if client.training["state"] == "training":
+                    bar.update(int(client.training.get("step", bar.n)) - bar.n)
+        if client.training["state"] != "finished":
+            raise DemoError(client.training["message"])
     return load_model(path)
 
 

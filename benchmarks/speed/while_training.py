@@ -43,10 +43,12 @@ def connected(folder: Path) -> Iterator[Client]:
         "train.steps": 10_000_000,
         "train.seeds": 1,
     }
-    with lifter(parameters, folder / "log") as process:
-        with Client(process, bag, folder / "answers") as client:
-            client.meet()
-            yield client
+    with (
+        lifter(parameters, folder / "log") as process,
+        Client(process, bag, folder / "answers") as client,
+    ):
+        client.meet()
+        yield client
 
 
 def measure(folder: Path, rounds: int) -> dict[str, list[Played]]:

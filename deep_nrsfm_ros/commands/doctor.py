@@ -56,8 +56,10 @@ def check_imports() -> Finding:
             except Exception as error:  # a library of the wrong kind fails in many ways
                 mend = "install it anew; are two ROS installations mixed?"
                 return Finding(f"{name} does not import: {error}", mend)
-        for distribution in distributions.get(name, ())[:1]:  # none where apt has installed it
-            seen.append(f"{distribution} {importlib.metadata.version(distribution)}")
+        seen.extend(
+            f"{distribution} {importlib.metadata.version(distribution)}"
+            for distribution in distributions.get(name, ())[:1]  # none where apt has installed it
+        )
     said = ", ".join(dict.fromkeys(seen))
     if missing:
         mend = f"pip install {' '.join(missing)}, or source the setup file of ROS 2"

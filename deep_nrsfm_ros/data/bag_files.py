@@ -260,7 +260,7 @@ def _whole_pages(path: Path) -> IO[bytes]:
     page = 65536 if page == 1 else page  # as the format has it
     if not page or size % page == 0:
         return file
-    copy = NamedTemporaryFile(suffix=path.suffix)
+    copy = NamedTemporaryFile(suffix=path.suffix)  # noqa: SIM115 - the caller closes it
     with file:
         file.seek(0)
         shutil.copyfileobj(file, copy)

@@ -51,7 +51,7 @@ def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     try:
         with partial.open("wb") as file:
             write(file)
-        os.replace(partial, path)
+        partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
 

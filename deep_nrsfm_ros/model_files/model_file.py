@@ -95,7 +95,7 @@ def save_model(path: Path, model: Model) -> None:
         with partial.open("rb") as file:
             os.fsync(file.fileno())  # or a power cut may leave the new name on an empty file
         partial.chmod(0o644)  # safetensors writes for its owner alone; models are for everybody
-        os.replace(partial, path)
+        partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
 

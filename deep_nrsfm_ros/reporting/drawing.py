@@ -97,10 +97,12 @@ def skeleton(
             if seen[i] and seen[j]:
                 (x1, y1), (x2, y2) = at[i], at[j]
                 parts.append(_stroke(x1, y1, x2, y2, colour, 2.5))
-        for k in np.flatnonzero(seen):
-            parts.append(_dot(at[k, 0], at[k, 1], 2.5, "#222222", layout.keypoints[k]))
-        for k in np.flatnonzero(seen & doubted) if doubted is not None else ():
-            parts.append(_ring(at[k, 0], at[k, 1]))
+        parts.extend(
+            _dot(at[k, 0], at[k, 1], 2.5, "#222222", layout.keypoints[k])
+            for k in np.flatnonzero(seen)
+        )
+        if doubted is not None:
+            parts.extend(_ring(at[k, 0], at[k, 1]) for k in np.flatnonzero(seen & doubted))
     return _svg(size, size, parts, "keypoints")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,7 +67,7 @@ def write_report(training: Training, folders: Sequence[Path]) -> Path:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         partial.write_text(page(training, folders), encoding="utf-8")
-        os.replace(partial, path)
+        partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
     return path
@@ -136,10 +137,8 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
     for model in models:
         here = None
         if model.layout.keypoints == training.dataset.layout.keypoints:
-            try:
+            with suppress(ValueError):  # it lifts none of these frames
                 here = fit(model, training.dataset)
-            except ValueError:
-                pass  # it lifts none of these frames
         quality = [model.quality.get(key) for key in _QUALITY]
         rows.append({"model": model, "quality": quality, "here": here})
     return rows

@@ -16,7 +16,7 @@ def write_checkpoint(path: Path, state: dict[str, Tensor]) -> None:
     save_file({name: tensor.contiguous().cpu() for name, tensor in state.items()}, partial)
     with partial.open("rb") as file:
         os.fsync(file.fileno())  # or a power cut may leave the new name on an empty file
-    os.replace(partial, path)
+    partial.replace(path)
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:

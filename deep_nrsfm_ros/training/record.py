@@ -154,7 +154,7 @@ def _write(file: IO[str], asked: Mapping[str, Any], record: Path) -> None:
         json.dump(asked, file, indent=1, default=str)
         file.flush()
         os.fsync(file.fileno())
-        os.replace(file.name, record)
+        Path(file.name).replace(record)
     except OSError as error:
         raise ValueError(unwritable(record.parent, error)) from error
 

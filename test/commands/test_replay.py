@@ -91,7 +91,7 @@ def test_answers_are_shown_as_they_were_recorded(
         (["keypoints", "--html", "no/page.html"], "no/page.html"),
         (["keypoints", "--html", "page.html", "--model", "cmu31"], "17 keypoints (width)"),
         (
-            "answered --html page.html --model cmu31 --keypoint-layout human17".split(),
+            ["answered", "--html", "page.html", "--model", "cmu31", "--keypoint-layout", "human17"],
             "name the model that lifted",
         ),
     ],

@@ -29,7 +29,7 @@ def test_no_one_there() -> None:
 
 
 @pytest.mark.parametrize(
-    "text, expected",
+    ("text", "expected"),
     [
         ("", "not a frame"),
         ("[]", "not a frame"),

@@ -195,7 +195,7 @@ def test_confidence_is_at_most_one() -> None:
 
 
 @pytest.mark.parametrize(
-    "input_type, message",
+    ("input_type", "message"),
     [
         (POINT_CLOUD, cloud(keypoints(1, 17))),
         (MULTI_ARRAY, multi_array(keypoints(1, 17), (17, 3))),
@@ -214,7 +214,7 @@ def test_flat_array_of_wrong_length_says_what_it_takes() -> None:
 
 
 @pytest.mark.parametrize(
-    "mend, expected",
+    ("mend", "expected"),
     [
         ({"fields": []}, "expected one field 'x'; the fields are: none"),
         ({"fields": "twice"}, "expected one field 'x'; the fields are: x, x"),
@@ -246,7 +246,7 @@ def test_malformed_point_cloud(mend: dict[str, Any], expected: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "sizes, expected",
+    ("sizes", "expected"),
     [
         ((5, 4), "last dimension is 4"),
         ((2, 2, 5, 1), "4 dimensions"),

@@ -134,7 +134,7 @@ def rewrite(
     """Write the model again after `change` of its header, weights and metadata."""
     with safe_open(file, "numpy") as opened:
         metadata = opened.metadata()
-        weights = {name: opened.get_tensor(name) for name in opened.keys()}
+        weights = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - not a dict
     header = json.loads(metadata.pop("model"))
     change(header, weights, metadata)
     save_file(weights, file, metadata | ({"model": json.dumps(header)} if header else {}))

@@ -86,15 +86,23 @@ def test_every_order_of_the_four_has_the_sign_of_its_permutation() -> None:
 
 # x to the front, y to the left, z up; one leg a little before the other.
 WALKING = {
-    **{"neck": (0.0, 0.0, 1.4), "mid_hip": (0.0, 0.0, 0.9), "nose": (0.12, 0.0, 1.55)},
-    **{"left_shoulder": (0.0, 0.2, 1.4), "left_elbow": (0.0, 0.25, 1.1)},
-    **{"left_wrist": (0.1, 0.25, 0.9), "left_hip": (0.0, 0.1, 0.9)},
-    **{"left_knee": (0.15, 0.1, 0.5), "left_ankle": (0.1, 0.1, 0.1)},
-    **{"left_big_toe": (0.25, 0.12, 0.02)},
-    **{"right_shoulder": (0.0, -0.2, 1.4), "right_elbow": (0.0, -0.25, 1.1)},
-    **{"right_wrist": (0.1, -0.25, 0.9), "right_hip": (0.0, -0.1, 0.9)},
-    **{"right_knee": (0.05, -0.1, 0.5), "right_ankle": (-0.1, -0.1, 0.1)},
-    **{"right_big_toe": (0.05, -0.12, 0.02)},
+    "neck": (0.0, 0.0, 1.4),
+    "mid_hip": (0.0, 0.0, 0.9),
+    "nose": (0.12, 0.0, 1.55),
+    "left_shoulder": (0.0, 0.2, 1.4),
+    "left_elbow": (0.0, 0.25, 1.1),
+    "left_wrist": (0.1, 0.25, 0.9),
+    "left_hip": (0.0, 0.1, 0.9),
+    "left_knee": (0.15, 0.1, 0.5),
+    "left_ankle": (0.1, 0.1, 0.1),
+    "left_big_toe": (0.25, 0.12, 0.02),
+    "right_shoulder": (0.0, -0.2, 1.4),
+    "right_elbow": (0.0, -0.25, 1.1),
+    "right_wrist": (0.1, -0.25, 0.9),
+    "right_hip": (0.0, -0.1, 0.9),
+    "right_knee": (0.05, -0.1, 0.5),
+    "right_ankle": (-0.1, -0.1, 0.1),
+    "right_big_toe": (0.05, -0.12, 0.02),
 }
 
 

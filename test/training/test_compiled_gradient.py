@@ -155,9 +155,14 @@ def test_what_it_does_not_know_is_left_to_torch() -> None:
 
 def test_torch_has_its_threads_again() -> None:
     torch.set_num_threads(2)
-    with pytest.raises(KeyError), torch_on_one_thread():
-        assert torch.get_num_threads() == 1
-        raise KeyError
+
+    def fail() -> None:
+        with torch_on_one_thread():
+            assert torch.get_num_threads() == 1
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
     assert torch.get_num_threads() == 2
 
 

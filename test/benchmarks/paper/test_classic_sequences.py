@@ -81,7 +81,7 @@ def test_command_compares_all_methods_on_each_sequence(data, tmp_path, capsys, m
         ]
     )
     assert "Classic sequences" in capsys.readouterr().out
-    with open(output / "classic_sequences.csv") as file:
+    with (output / "classic_sequences.csv").open() as file:
         table = list(csv.DictReader(file))
     for sequence in ("drink", "face_mocap"):
         by_method = {row["method"]: row for row in table if row["sequence"] == sequence}

@@ -56,7 +56,7 @@ def test_command_compares_all_methods_on_each_category(data, tmp_path, capsys, m
         ]
     )
     assert "stand-in for the IKEA data" in capsys.readouterr().out
-    with open(output / "structure_from_category.csv") as file:
+    with (output / "structure_from_category.csv").open() as file:
         table = list(csv.DictReader(file))
     methods = {row["method"] for row in table if row["category"] == FACES}
     assert len(methods) == len(LIFTING) + 3

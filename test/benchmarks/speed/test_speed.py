@@ -220,7 +220,12 @@ def test_domains_differ(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_variables_are_as_they_were_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("THERE", "before")
     monkeypatch.delenv("NEW", raising=False)
-    with pytest.raises(ZeroDivisionError), speed.environment(THERE=None, NEW="now"):
-        assert "THERE" not in os.environ and os.environ["NEW"] == "now"
-        raise ZeroDivisionError
+
+    def fail() -> None:
+        with speed.environment(THERE=None, NEW="now"):
+            assert "THERE" not in os.environ and os.environ["NEW"] == "now"
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
     assert os.environ["THERE"] == "before" and "NEW" not in os.environ
