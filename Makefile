@@ -38,6 +38,9 @@ demo: $(READY)
 demo-live: $(EXAMPLES_READY)
 	$(PYTHON) -m examples.demo_live
 
+# A suite that passes without the kernel tests only half of the package. Where there is no C compiler:
+# make test DEEP_NRSFM_REQUIRE_KERNEL=0
+test: export DEEP_NRSFM_REQUIRE_KERNEL = 1
 test: lint
 	$(PYTHON) -m pytest
 

@@ -1,11 +1,34 @@
 """Install the package, its executables and what ROS 2 looks up in share/deep_nrsfm_ros."""
 
+import os
 from glob import glob
 
 from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
+from setuptools.errors import CompileError
 
 NAME = "deep_nrsfm_ros"
 SHARE = f"share/{NAME}"
+REQUIRE_KERNEL = "DEEP_NRSFM_REQUIRE_KERNEL"  # environment variable, as in deep_nrsfm_ros.kernel
+REQUIRED = os.environ.get(REQUIRE_KERNEL) == "1"
+
+
+class BuildKernel(build_ext):
+    """Compiles the kernel; says how to mend it where it is required and cannot be compiled."""
+
+    def build_extension(self, extension: Extension) -> None:
+        """Compile and link one extension."""
+        try:
+            super().build_extension(extension)
+        except Exception as error:
+            if not REQUIRED:
+                raise
+            raise CompileError(
+                f"{REQUIRE_KERNEL}=1, but the kernel cannot be compiled ({error}): install a C "
+                f"compiler (apt-get install gcc python3-dev), or unset {REQUIRE_KERNEL} to "
+                "install without the kernel, which is ten times slower"
+            ) from error
+
 
 setup(
     name=NAME,
@@ -17,7 +40,8 @@ setup(
     package_data={
         NAME: ["py.typed", "kernel/*.pyi", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]
     },
-    # Optional: without a C compiler NumPy and torch do the same, some ten and three times slower.
+    cmdclass={"build_ext": BuildKernel},
+    # Without a C compiler NumPy and torch compute the same, some ten and three times slower.
     ext_modules=[
         Extension(
             f"{NAME}.kernel._kernel",
@@ -31,7 +55,7 @@ setup(
                 "-pthread",
             ],
             extra_link_args=["-pthread"],
-            optional=True,
+            optional=not REQUIRED,
         )
     ],
     # data_files, because `pip install` ignores setup.cfg's install_scripts and `ros2 run` needs

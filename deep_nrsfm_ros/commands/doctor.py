@@ -114,7 +114,7 @@ def check_model(name: str, models_dir: Path) -> Finding:
     """Load a model and lift with it."""
     import numpy as np
 
-    from deep_nrsfm_ros.lifting import compiled_backend as compiled
+    from deep_nrsfm_ros import kernel
     from deep_nrsfm_ros.lifting.lifter import Lifter
     from deep_nrsfm_ros.model_files.folders import model_folders
     from deep_nrsfm_ros.model_files.model_file import find_model, load_model
@@ -131,7 +131,7 @@ def check_model(name: str, models_dir: Path) -> Finding:
     if not np.isfinite(lifted.shapes).all():
         return Finding(f"{path} lifts to what is no number", mend)
     seen = f"{path} of {p} keypoints lifts"
-    if not compiled.AVAILABLE:
+    if not kernel.AVAILABLE:
         mend = "install a C compiler (apt-get install gcc python3-dev), then the package anew"
         return Finding(f"{seen}, but in NumPy: ten times slower", mend, fatal=False)
     return Finding(f"{seen}, compiled")

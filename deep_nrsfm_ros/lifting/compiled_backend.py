@@ -12,31 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.kernel import _kernel
 from deep_nrsfm_ros.lifting.confidence import CALIBRATED, LEAST_RESIDUAL
 from deep_nrsfm_ros.lifting.correction import UNKNOWN
 from deep_nrsfm_ros.lifting.numpy_backend import NEAREST, RESIDUAL_SPREAD, Constants
 from deep_nrsfm_ros.nrsfm.bones import Bones
-from deep_nrsfm_ros.nrsfm.network import Network, filling
-
-try:
-    from deep_nrsfm_ros.kernel import _kernel
-except ImportError:  # no compiler at installation
-    _kernel = None  # type: ignore[assignment]
-
-AVAILABLE = _kernel is not None
-
-
-def fits(network: Network) -> bool:
-    """Tell whether there is a kernel, and it knows the network's options."""
-    options = network.architecture
-    return AVAILABLE and options.is_default_variant and len(options.widths) <= _kernel.MOST_LAYERS
+from deep_nrsfm_ros.nrsfm.network import filling
 
 
 class Kernel:
     """A lifter's constants, laid out for the kernel."""
 
     def __init__(self, constants: Constants) -> None:
-        """Take the constants, of a network that the kernel `fits`."""
+        """Take the constants, of a network that the kernel `supports`."""
         net, p = constants.network, constants.network.p
         options = net.architecture
         covariance = np.eye(3 * p) if constants.covariance is None else constants.covariance

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.batched import blocks
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.lifting.compiled_backend import Kernel, fits
+from deep_nrsfm_ros.kernel import supports
+from deep_nrsfm_ros.lifting.compiled_backend import Kernel
 from deep_nrsfm_ros.lifting.numpy_backend import Constants, Fit, Float32
 from deep_nrsfm_ros.model_files.model_file import Model
 
@@ -93,7 +94,7 @@ class Lifter:
         self.model = model
         self.options = options or LiftingOptions()
         self.constants = _constants(model, self.options)
-        self.fit = Kernel(self.constants) if fits(model.network) else Fit(self.constants)
+        self.fit = Kernel(self.constants) if supports(model.network) else Fit(self.constants)
 
     def __call__(
         self, points: Float32, confidence: Float32, *, perspective: bool = False

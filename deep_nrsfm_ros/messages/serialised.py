@@ -13,14 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from deep_nrsfm_ros.lifting import compiled_backend as compiled
+from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.lifting.observation import FARTHEST, LEAST, Observation, observation
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, InputType, read
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.point_cloud import CloudMake, make_of
-
-if compiled.AVAILABLE:
-    from deep_nrsfm_ros.kernel import _kernel
 
 _LITTLE_ENDIAN = b"\x00\x01"  # how plain CDR of that order begins
 _STAMP = struct.Struct("<iI")
@@ -80,7 +77,7 @@ class SerialisedMake(NamedTuple):
     def observation(self, raws: Sequence[bytes], min_confidence: float) -> Observation:
         """Return the objects of messages of this make, one after the other."""
         data = b"".join(raws)
-        if compiled.AVAILABLE and self.cloud.plain:
+        if kernel.AVAILABLE and self.cloud.plain:
             return self._compiled(data, len(raws), min_confidence)
         values = self.cloud.values(data, self.start, len(raws), self.length)
         return observation(values, min_confidence)
@@ -90,7 +87,7 @@ class SerialisedMake(NamedTuple):
         cloud, shape = self.cloud, (messages * self.cloud.height, self.cloud.width)
         points, confidence = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
         x, y, *sure = (self.start + offset for offset in cloud.offsets)
-        _kernel.observe(
+        kernel._kernel.observe(
             data,
             (messages, self.length),
             (cloud.height, cloud.width),

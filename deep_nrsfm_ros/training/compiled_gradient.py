@@ -13,12 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deep_nrsfm_ros.lifting import compiled_backend as compiled
+from deep_nrsfm_ros.kernel import _kernel, supports
 from deep_nrsfm_ros.nrsfm.losses import Losses, Objective, Task
 from deep_nrsfm_ros.nrsfm.network import Network
-
-if compiled.AVAILABLE:
-    from deep_nrsfm_ros.kernel import _kernel
 
 _FRAMES_AT_A_TIME = 16  # so that their codes stay in the cache
 _LEAST_SHARE = 8  # frames of a thread: it also lays out all weights
@@ -27,7 +24,7 @@ _MOST_WEIGHTS = 2_000_000  # that are read anew for every few frames; torch is f
 
 def fits(objective: Objective, net: Network) -> bool:
     """Tell whether there is a kernel, and it knows this loss and this network."""
-    known = compiled.fits(net) and net.L.device.type == "cpu" and net.L.dtype == torch.float32
+    known = supports(net) and net.L.device.type == "cpu" and net.L.dtype == torch.float32
     small = sum(weight.numel() for _, weight in net.learned()) <= _MOST_WEIGHTS
     return known and small and objective.whitened and not objective.layout_loss
 

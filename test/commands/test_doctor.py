@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.commands import doctor
-from deep_nrsfm_ros.lifting import compiled_backend as compiled
 
 
 def test_a_sound_installation_has_nothing_to_mend(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_what_is_missing_is_named_with_the_mend(
     monkeypatch.setattr(doctor, "TO_TRAIN", ("no_torch_here",))
     assert doctor.check_imports().word == "warn"
     assert "if you want to train" in doctor.check_imports().mend
-    monkeypatch.setattr(compiled, "AVAILABLE", False)
+    monkeypatch.setattr(kernel, "AVAILABLE", False)
     found = doctor.check_model("human", tmp_path)
     assert found.word == "warn" and "C compiler" in found.mend
     monkeypatch.setattr(doctor, "NEEDED", ("numpy", "no_rclpy_here"))

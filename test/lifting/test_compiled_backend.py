@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.kernel import _kernel
+from deep_nrsfm_ros.kernel import AVAILABLE, _kernel
 from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
-from deep_nrsfm_ros.lifting.compiled_backend import AVAILABLE, Kernel
+from deep_nrsfm_ros.lifting.compiled_backend import Kernel
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.numpy_backend import Fit
 from deep_nrsfm_ros.model_files.model_file import Model

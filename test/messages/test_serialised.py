@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray
 
-from deep_nrsfm_ros.lifting import compiled_backend as compiled
+from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY, POINT_CLOUD, read
 from deep_nrsfm_ros.messages.serialised import Header, Reader, header_of
 
@@ -153,7 +153,7 @@ def test_bytes_between_numbers_do_not_matter() -> None:
     assert raw[16:18] == b"a\0" and reader(bytes(raw), Q)[0] == reader(plain(frame_id="a"), Q)[0]
 
 
-@pytest.mark.skipif(not compiled.AVAILABLE, reason="no C compiler")
+@pytest.mark.skipif(not kernel.AVAILABLE, reason="no C compiler")
 @pytest.mark.parametrize(
     ("messages", "steps", "offsets", "room"),
     [

@@ -11,9 +11,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.kernel import _kernel
 from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
-from deep_nrsfm_ros.lifting import compiled_backend as compiled
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.losses import Objective, Task
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, encode, initialise, whitening
@@ -134,7 +134,7 @@ def test_a_training_goes_the_same_way_without(
 
     monkeypatch.setattr(gradient, "written_out", watched)
     assert ours.descent(ours.net, ours.sample(8), None, ours.generator) and not asked
-    monkeypatch.setattr(compiled, "AVAILABLE", False)
+    monkeypatch.setattr(kernel, "AVAILABLE", False)
     theirs = trained()
     assert len(asked) == 6
     moved = (theirs.weights - gradient.joined(w for _, w in theirs.initial.learned())).norm()
