@@ -19,7 +19,7 @@ class Detections:
 
     points: (m, q, 2), x right and y down; confidence: (m, q), 0 where missing: as `Observation`.
     frame: (m,) int64, ascending: the place among `stamps` of the frame that shows the object.
-    ids: (m,) str: who it is, by the source; where that does not say, its place in its frame.
+    identities: (m,) str: who it is, by the source; where that does not say, its place in its frame.
     stamps: (f,) int64, ns, of all frames, those that show nobody among them.
     frame_id: the camera, "" if it is not known.
     """
@@ -27,14 +27,14 @@ class Detections:
     points: NDArray[np.float32]
     confidence: NDArray[np.float32]
     frame: NDArray[np.int64]
-    ids: NDArray[np.str_]
+    identities: NDArray[np.str_]
     stamps: NDArray[np.int64]
     frame_id: str = ""
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit each other."""
         m, q = self.confidence.shape
-        for name, shape in {"points": (m, q, 2), "frame": (m,), "ids": (m,)}.items():
+        for name, shape in {"points": (m, q, 2), "frame": (m,), "identities": (m,)}.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} are {getattr(self, name).shape}; {shape} is needed")
         if m and not (0 <= self.frame.min() and self.frame.max() < len(self.stamps)):
@@ -53,7 +53,7 @@ class Detections:
             points=self.points[objects],
             confidence=self.confidence[objects],
             frame=self.frame[objects],
-            ids=self.ids[objects],
+            identities=self.identities[objects],
         )
 
     def largest(self) -> Detections:
@@ -72,11 +72,11 @@ def gather(
     stamps: Sequence[int] | NDArray[np.int64],
     keypoints: int,
     frame_id: str = "",
-    ids: Sequence[str] | None = None,
+    identities: Sequence[str] | None = None,
 ) -> Detections:
     """Return what each frame shows, in order, as one; `stamps` (f,) in ns.
 
-    keypoints: q, for recordings that show nobody. ids: of all objects; None: those of the
+    keypoints: q, for recordings that show nobody. identities: of all objects; None: those of the
     observations, and the places of whom they do not name.
     """
     seen = list(observations)
@@ -88,16 +88,20 @@ def gather(
         points,
         confidence,
         np.repeat(np.arange(len(seen)), counts),
-        np.asarray(_names(seen) if ids is None else ids, str),
+        np.asarray(_identities(seen) if identities is None else identities, str),
         np.asarray(stamps, np.int64),
         frame_id,
     )
 
 
-def _names(seen: Sequence[Observation]) -> list[str]:
+def _identities(seen: Sequence[Observation]) -> list[str]:
     """Return who the objects of all observations are: by name, or by place in the frame."""
-    named = ((o.ids or (None,) * len(o.confidence)) for o in seen)
-    return [str(i) if name is None else name for ids in named for i, name in enumerate(ids)]
+    named = ((o.identities or (None,) * len(o.confidence)) for o in seen)
+    return [
+        str(i) if identity is None else identity
+        for identities in named
+        for i, identity in enumerate(identities)
+    ]
 
 
 def stamps_at(rate: float, frames: int) -> NDArray[np.int64]:

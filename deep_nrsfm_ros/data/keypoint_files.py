@@ -190,8 +190,8 @@ def _coco(content: Any, keypoints: int, rate: float, min_confidence: float) -> D
     for row in rows:
         by_frame[frames[row["image_id"]]].append(row)
     seen = [_people(people, keypoints, min_confidence) for people in by_frame]
-    ids = [str(p.get("track_id", i)) for people in by_frame for i, p in enumerate(people)]
-    return gather(seen, stamps_at(rate, len(seen)), keypoints, ids=ids)
+    identities = [str(p.get("track_id", i)) for people in by_frame for i, p in enumerate(people)]
+    return gather(seen, stamps_at(rate, len(seen)), keypoints, identities=identities)
 
 
 def _people(
@@ -237,12 +237,14 @@ def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Dete
         stamps = _numbers(arrays, "stamps", np.int64, (count,))
     else:
         stamps = stamps_at(rate, count)
-    ids = arrays.get("ids", _places(frame)).astype(str)
-    if ids.shape != (m,):
-        raise KeypointFileError(f"`ids` is {ids.shape}; ({m},) is needed")
+    identities = arrays.get("identities", _places(frame)).astype(str)
+    if identities.shape != (m,):
+        raise KeypointFileError(f"`identities` is {identities.shape}; ({m},) is needed")
     seen = observation(points, min_confidence)
     order = np.argsort(frame, kind="stable")
-    return Detections(seen.points[order], seen.confidence[order], frame[order], ids[order], stamps)
+    return Detections(
+        seen.points[order], seen.confidence[order], frame[order], identities[order], stamps
+    )
 
 
 def _numbers(

@@ -61,7 +61,7 @@ def _arrays(recording: Recording, model: str) -> dict[str, NDArray[Any]]:
     seen, target = recording.seen, recording.target
     return recording.lifted._asdict() | {
         "frame": seen.frame,
-        "ids": seen.ids,
+        "identities": seen.identities,
         "stamps": seen.stamps,
         "names": np.array(target.keypoints),
         "edges": np.array(target.edge_indices(), np.int64).reshape(-1, 2),
@@ -77,7 +77,7 @@ def _document(recording: Recording, model: str) -> dict[str, Any]:
     ]
     for i in np.flatnonzero(sound).tolist():
         one = {name: _plain(values[i]) for name, values in recording.lifted._asdict().items()}
-        frames[seen.frame[i]]["objects"].append({"id": str(seen.ids[i]), **one})
+        frames[seen.frame[i]]["objects"].append({"identity": str(seen.identities[i]), **one})
     return {
         "model": model,
         "keypoints": list(target.keypoints),

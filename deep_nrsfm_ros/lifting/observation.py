@@ -24,17 +24,17 @@ class Observation(NamedTuple):
 
     points: (n, q, 2) float32, x right and y down; (0, 0) where missing.
     confidence: (n, q) float32, above 0 and at most 1; 0 where missing.
-    ids: n identities as the detector gives them, None for an object to which it gives none; ()
-        where it gives none at all.
+    identities: n, as the detector gives them; None for an object to which it gives none; () where
+        it gives none at all.
     """
 
     points: NDArray[np.float32]
     confidence: NDArray[np.float32]
-    ids: Identities = ()
+    identities: Identities = ()
 
 
 def observation(
-    values: NDArray[np.floating], min_confidence: float = 0.0, ids: Identities = ()
+    values: NDArray[np.floating], min_confidence: float = 0.0, identities: Identities = ()
 ) -> Observation:
     """Return values (n, q, 2: x, y or 3: x, y, confidence) with missing keypoints marked.
 
@@ -54,7 +54,7 @@ def observation(
         confidence = np.where(seen, _CERTAIN, _MISSING)
     points = np.zeros((*seen.shape, 2), np.float32)
     np.copyto(points, values[..., :2], where=seen[..., None])
-    return Observation(points, confidence, ids)
+    return Observation(points, confidence, identities)
 
 
 def check_keypoints(count: int, keypoints: int, where: str) -> None:

@@ -134,49 +134,53 @@ class Smoother:
         self._now = -np.inf
 
     def __call__(
-        self, lifted: Lifted, ids: tuple[str, ...], time: float
+        self, lifted: Lifted, identities: tuple[str, ...], time: float
     ) -> tuple[Lifted, tuple[str, ...]]:
         """Return the objects, steadied, and their identities.
 
-        lifted: n objects of the n identities `ids`, at `time` in seconds of any clock. Objects that
-        are bridged and not among them come last.
+        lifted: n objects, at `time` in seconds of any clock. identities: n. Objects that are
+        bridged and not among them come last.
         """
         if not self._options.enabled:
-            return lifted, ids
+            return lifted, identities
         if time < self._now - MEMORY:
             self._tracks.clear()
             self._now = -np.inf
         self._now = max(time, self._now)
         oldest = self._now - self._memory
-        self._tracks = {name: t for name, t in self._tracks.items() if t.time >= oldest}
+        self._tracks = {identity: t for identity, t in self._tracks.items() if t.time >= oldest}
         objects = [
-            self._follow(Lifted(*(part[i : i + 1] for part in lifted)), name, time)
-            for i, name in enumerate(ids)
+            self._follow(Lifted(*(part[i : i + 1] for part in lifted)), identity, time)
+            for i, identity in enumerate(identities)
         ]
-        absent = [name for name in self._tracks if name not in ids and self._left(name, time)]
-        objects += [self._tracks[name].faded(self._left(name, time)) for name in absent]
+        absent = [
+            identity
+            for identity in self._tracks
+            if identity not in identities and self._left(identity, time)
+        ]
+        objects += [self._tracks[identity].faded(self._left(identity, time)) for identity in absent]
         if not objects:
-            return lifted, ids
+            return lifted, identities
         together = Lifted(*(np.concatenate(parts) for parts in zip(*objects, strict=True)))
-        return together, (*ids, *absent)
+        return together, (*identities, *absent)
 
-    def _follow(self, lifted: Lifted, name: str, time: float) -> Lifted:
+    def _follow(self, lifted: Lifted, identity: str, time: float) -> Lifted:
         """Return one object (n = 1), steadied or bridged."""
-        track = self._tracks.get(name)
+        track = self._tracks.get(identity)
         if np.isnan(lifted.residual[0]):
-            left = self._left(name, time)
+            left = self._left(identity, time)
             return track.faded(left) if track and left else lifted
         if track is None:
-            self._tracks[name] = _Track(self._options, lifted, time)
+            self._tracks[identity] = _Track(self._options, lifted, time)
             return lifted
         if time <= track.time:
             return lifted
         track.follow(lifted, time)
         return track.lifted
 
-    def _left(self, name: str, time: float) -> float:
+    def _left(self, identity: str, time: float) -> float:
         """Return the share of `bridge` that is left of an object, 0 of one that is not known."""
-        track, bridge = self._tracks.get(name), self._options.bridge
+        track, bridge = self._tracks.get(identity), self._options.bridge
         if track is None or not bridge or time < track.time:
             return 0.0
         return max(0.0, 1 - (time - track.time) / bridge)

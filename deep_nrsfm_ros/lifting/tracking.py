@@ -19,7 +19,7 @@ _NAME = "object"
 class _Tracks(NamedTuple):
     """m objects as they were seen the last time, in arrays, so that all are compared at once."""
 
-    names: list[str]
+    identities: list[str]
     points: NDArray[np.float32]  # (m, q, 2)
     visible: NDArray[np.float32]  # (m, q) 1 or 0
     size: NDArray[np.float32]  # (m,) distance of the keypoints from their centre, RMS
@@ -27,41 +27,46 @@ class _Tracks(NamedTuple):
 
 
 class Tracker:
-    """Names for the objects of one topic, each kept while the object is seen.
+    """Identities of the objects of one topic, each kept while the object is seen.
 
-    What the detector names keeps that name. The others are matched by place, the nearest first: an
-    object is one that was seen within the last second if the keypoints that both show have moved,
-    on average, by less than 1.5 times its size (their distance from their centre, RMS).
+    An identity that the detector gives is kept. Other objects are matched by place, the nearest
+    first: an object is one that was seen within the last second if the keypoints that both
+    show have moved, on average, by less than 1.5 times its size (their distance from their centre,
+    RMS).
     """
 
     def __init__(self, topic: str = "", memory: float = MEMORY) -> None:
         """Forget objects that were not seen for `memory` seconds.
 
-        topic: tells this topic from others. An object that comes alone and without a name is called
-        that, any other "topic/name"; "" if there are no others.
+        topic: tells this topic from others: the identity of an object that comes alone and without
+        one; that of any other is "topic/identity". "" if there are no others.
         """
         self._topic, self._memory = topic, memory
         self._tracks: _Tracks | None = None
         self._count = 0
 
     def __call__(self, seen: Observation, now: float) -> tuple[str, ...]:
-        """Return the names of the n objects seen at `now`, in seconds of any clock.
+        """Return the identities of the n objects seen at `now`, in seconds of any clock.
 
-        They differ from one another. An object without keypoints that no one has named has no name:
-        "".
+        They differ from one another. An object without keypoints, and without an identity of the
+        detector, has none: "".
         """
         if not self._topic:
             return self._match(seen, now)
-        if len(seen.confidence) == 1 and not any(seen.ids):
+        if len(seen.confidence) == 1 and not any(seen.identities):
             return (self._topic,)
-        return tuple(name and f"{self._topic}/{name}" for name in self._match(seen, now))
+        return tuple(
+            identity and f"{self._topic}/{identity}" for identity in self._match(seen, now)
+        )
 
     def _match(self, seen: Observation, now: float) -> tuple[str, ...]:
-        """Return the names, the topic's aside."""
-        names = self._given(seen)
-        nameless = [i for i, name in enumerate(names) if not name and seen.confidence[i].any()]
+        """Return the identities, the topic's aside."""
+        identities = self._given(seen)
+        nameless = [
+            i for i, identity in enumerate(identities) if not identity and seen.confidence[i].any()
+        ]
         if not nameless:
-            return tuple(names)
+            return tuple(identities)
         new = _tracks(seen, nameless, now)
         old = self._tracks
         # Another model has other keypoints: there is nothing to compare.
@@ -69,32 +74,35 @@ class Tracker:
             old = _part(old, (now >= old.time) & (now - old.time <= self._memory))
             distance = _distance(new, old)
             near = np.argwhere(distance < _FARTHEST)
-            taken = np.zeros(len(old.names), bool)
+            taken = np.zeros(len(old.identities), bool)
             for j, k in near[distance[tuple(near.T)].argsort()].tolist():
-                if not new.names[j] and not taken[k]:
-                    new.names[j], taken[k] = old.names[k], True
+                if not new.identities[j] and not taken[k]:
+                    new.identities[j], taken[k] = old.identities[k], True
             old = _part(old, ~taken)
         else:
             old = None
         for j, i in enumerate(nameless):
-            names[i] = new.names[j] = new.names[j] or self._next(names)
-        self._tracks = _joined(old, new) if old and old.names else new
-        return tuple(names)
+            identities[i] = new.identities[j] = new.identities[j] or self._next(identities)
+        self._tracks = _joined(old, new) if old and old.identities else new
+        return tuple(identities)
 
     def _given(self, seen: Observation) -> list[str]:
-        """Return the detector's names, "" where there is none; a second of the same is none."""
-        names = [name or "" for name in seen.ids] or [""] * len(seen.confidence)
-        return [name if name not in names[:i] else "" for i, name in enumerate(names)]
+        """Return the detector's identities, "" for none and for the second of two equal ones."""
+        identities = [identity or "" for identity in seen.identities] or [""] * len(seen.confidence)
+        return [
+            identity if identity not in identities[:i] else ""
+            for i, identity in enumerate(identities)
+        ]
 
     def _next(self, used: list[str]) -> str:
-        """Return a name that no object has had."""
+        """Return an identity that no object has had."""
         self._count += 1
-        name = f"{_NAME}{self._count}"
-        return self._next(used) if name in used else name
+        identity = f"{_NAME}{self._count}"
+        return self._next(used) if identity in used else identity
 
 
 def _tracks(seen: Observation, which: list[int], now: float) -> _Tracks:
-    """Return some of the objects, each with a keypoint at least, without names."""
+    """Return some of the objects, each with a keypoint at least, without identities."""
     points, visible = seen.points[which], (seen.confidence[which] > 0).astype(np.float32)
     weight = visible[..., None] / visible.sum(1)[:, None, None]
     spread = points - (points * weight).sum(1, keepdims=True)
@@ -104,15 +112,19 @@ def _tracks(seen: Observation, which: list[int], now: float) -> _Tracks:
 
 def _part(tracks: _Tracks, which: NDArray[np.bool_]) -> _Tracks:
     """Return some of the tracks."""
-    names = [name for name, chosen in zip(tracks.names, which.tolist(), strict=True) if chosen]
+    identities = [
+        identity
+        for identity, chosen in zip(tracks.identities, which.tolist(), strict=True)
+        if chosen
+    ]
     _, points, visible, size, time = tracks
-    return _Tracks(names, points[which], visible[which], size[which], time[which])
+    return _Tracks(identities, points[which], visible[which], size[which], time[which])
 
 
 def _joined(a: _Tracks, b: _Tracks) -> _Tracks:
     """Return the tracks of both."""
     return _Tracks(
-        a.names + b.names,
+        a.identities + b.identities,
         np.concatenate([a.points, b.points]),
         np.concatenate([a.visible, b.visible]),
         np.concatenate([a.size, b.size]),

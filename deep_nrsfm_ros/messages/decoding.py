@@ -78,8 +78,8 @@ def read(
     mapping = _mapping(input_type)
     try:
         if mapping:
-            values, ids = mapping(message, keypoints, size)
-            return observation(values, min_confidence, ids)
+            values, identities = mapping(message, keypoints, size)
+            return observation(values, min_confidence, identities)
         if isinstance(input_type, str) and (reader := _READERS.get(input_type)):
             return observation(reader(message, keypoints), min_confidence)
     except MessageError:

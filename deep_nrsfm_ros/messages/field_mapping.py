@@ -31,7 +31,7 @@ class FieldMapping:
 
     type: of the message, "package/Type".
     objects: the list of objects; "" if the message itself is the only one.
-    object_id: identity, from an object; "" if there is none.
+    identity: that of an object, from the object; "" if there is none.
     keypoints: the list of keypoints, from an object. An object without any is left out.
     x, y, score: from a keypoint; score may be "".
     keypoint_id: which one it is, from a keypoint: a number that counts from `first_id`, or one of
@@ -47,7 +47,7 @@ class FieldMapping:
     y: str = "y"
     score: str = ""
     objects: str = ""
-    object_id: str = ""
+    identity: str = ""
     keypoint_id: str = ""
     first_id: int = 0
     names: tuple[str, ...] = ()
@@ -63,11 +63,11 @@ class FieldMapping:
         Raises MessageError for numbers that do not fit, and what a message without such fields
         raises.
         """
-        rows, ids = [], []
+        rows, identities = [], []
         for item in self._items(message):
             if len(points := self._keypoints(item)):
                 rows.append(self._row(points, keypoints))
-                ids.append(_known(self._identity(item)))
+                identities.append(_known(self._identity(item)))
         width = 3 if self.score else 2
         values = np.array(rows, np.float64).reshape(len(rows), keypoints, width)
         if self.missing is not None:
@@ -80,7 +80,7 @@ class FieldMapping:
         if self.units == NORMALISED:
             with np.errstate(over="ignore"):  # what is farther than any image counts as missing
                 values[..., :2] *= np.array(size)
-        return values, tuple(ids)
+        return values, tuple(identities)
 
     def count(self, message: Any) -> int:
         """Return how many keypoints the objects have, 0 if there is no object.
@@ -108,7 +108,7 @@ class FieldMapping:
     @cached_property
     def _identity(self) -> Callable[[Any], Any]:
         """Return what gives the identity of an object."""
-        return attrgetter(self.object_id) if self.object_id else lambda _: ""
+        return attrgetter(self.identity) if self.identity else lambda _: ""
 
     @cached_property
     def _keypoint_id(self) -> Callable[[Any], Any]:
@@ -157,7 +157,7 @@ class FieldMapping:
 YOLO = FieldMapping(
     "yolo_msgs/DetectionArray",
     objects="detections",
-    object_id="id",
+    identity="id",
     keypoints="keypoints.data",
     x="point.x",
     y="point.y",

@@ -56,7 +56,7 @@ def _mapping(given: dict[Any, Any]) -> FieldMapping:
         value = given.get(name, 0)
         if isinstance(value, bool) or not isinstance(value, kind):
             raise ValueError(f"{name} is {words(value)}; it must be a number")
-    for name in ("objects", "object_id", "keypoints", "x", "y", "score", "keypoint_id"):
+    for name in ("objects", "identity", "keypoints", "x", "y", "score", "keypoint_id"):
         path = given.get(name, "x")
         if not isinstance(path, str) or not _FIELD.fullmatch(path):
             raise ValueError(f"{name} is {words(path)}; it must be a field, like position.x")

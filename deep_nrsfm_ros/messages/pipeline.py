@@ -117,25 +117,25 @@ class Pipeline:
                 f"message has {len(seen.confidence)} objects; expected at most "
                 f"{self._max_objects} (max_objects)"
             )
-        return header, Observation(*self._map(seen.points, seen.confidence), seen.ids)
+        return header, Observation(*self._map(seen.points, seen.confidence), seen.identities)
 
     @property
     def steadies(self) -> bool:
-        """Tell whether objects are filtered over time, for which their names matter."""
+        """Tell whether objects are filtered over time, for which their identities matter."""
         return self._steadying.enabled
 
     def lift(
         self,
         seen: Observation,
         intrinsics: Intrinsics | None,
-        names: tuple[str, ...],
+        identities: tuple[str, ...],
         topic: str,
         time: float,
     ) -> tuple[Lifted, tuple[str, ...]]:
-        """Return the shapes of the objects and their names, all in one pass, steadied if asked for.
+        """Return the shapes of the objects, smoothed if so configured, and their identities.
 
         intrinsics: of the camera, for the shapes to be at their place; None: they are centred.
-        names: n identities of the objects on their topic, which may be none. time: of the message,
+        identities: n, of the objects on their topic; "" where there is none. time: of the message,
         in seconds. Objects that are bridged come last; there may be none at all. Objects that
         cannot be lifted are NaN, unless all are: then MessageError is raised.
         """
@@ -147,8 +147,8 @@ class Pipeline:
         steady = self._steady.get(topic)
         if steady is None:
             steady = self._steady[topic] = Smoother(self._steadying)
-        lifted, names = steady(lifted, names, time)
-        if names and np.isnan(lifted.residual).all():
+        lifted, identities = steady(lifted, identities, time)
+        if identities and np.isnan(lifted.residual).all():
             most = (confidence > 0).sum(1).max()
             if most >= self._min_visible:
                 raise MessageError(
@@ -159,4 +159,4 @@ class Pipeline:
                 f"message has at most {most} visible keypoints of the "
                 f"model's {len(self.model.layout)} in an object; min_visible is {self._min_visible}"
             )
-        return lifted, names
+        return lifted, identities

@@ -133,16 +133,18 @@ class LifterNode(Node):
             header, seen = self._pipeline.observe(raw, source.reader, self._camera.size)
             told = self._objects.get_subscription_count()
             wanted = told or self._tf or self._pipeline.steadies
-            names = source.tracker(seen, started) if wanted else ("",) * len(seen.confidence)
+            identities = source.tracker(seen, started) if wanted else ("",) * len(seen.confidence)
             header = header or self._now()
             if not header.frame_id:
                 header = header._replace(frame_id=self._camera.frame)
             seconds = 1e-9 * (header.stamp or self._now().stamp)
-            lifted, names = self._pipeline.lift(seen, intrinsics, names, source.topic, seconds)
+            lifted, identities = self._pipeline.lift(
+                seen, intrinsics, identities, source.topic, seconds
+            )
         except Exception as problem:  # whatever it is, the next message may be fine
             self._reject(source, problem)
             return
-        if not names:
+        if not identities:
             self._health.saw_nothing()
             return
         placed = self._camera.wanted
@@ -150,9 +152,9 @@ class LifterNode(Node):
         if not math.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
         if told:
-            self._objects.publish(publishing.objects(header, lifted, names, placed=placed))
+            self._objects.publish(publishing.objects(header, lifted, identities, placed=placed))
         if self._tf:
-            self._tf.send(header, lifted, names)
+            self._tf.send(header, lifted, identities)
         if self._markers.get_subscription_count():
             edges = self._pipeline.edges
             self._markers.publish(publishing.markers(header, lifted, edges, placed=placed))

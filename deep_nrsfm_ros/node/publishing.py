@@ -98,7 +98,7 @@ def to_header(header: Header) -> std_msgs.Header:
 
 
 def objects(
-    header: Header, lifted: Lifted, names: Sequence[str], *, placed: bool = False
+    header: Header, lifted: Lifted, identities: Sequence[str], *, placed: bool = False
 ) -> MultiDOFJointState:
     """Return who is in which row of the point cloud, and how each is turned.
 
@@ -106,12 +106,12 @@ def objects(
     each: an object before a camera is a floating joint. (TFMessage is in a package that this one
     does not need; an id as a field of the cloud would have to be a number.)
 
-    names: n, "" for an object without one. A transform leads from the axes of the object, its
+    identities: n, "" for an object without one. A transform leads from the axes of the object, its
     origin the mean of its keypoints, to those of the cloud: its rotation is that of
     ~/camera_rotation, its translation the object's place, zero unless the shapes are `placed`. NaN
     where the object could not be lifted.
     """
-    message = MultiDOFJointState(header=to_header(header), joint_names=list(names))
+    message = MultiDOFJointState(header=to_header(header), joint_names=list(identities))
     message.transforms = transforms(lifted, placed=placed)
     return message
 

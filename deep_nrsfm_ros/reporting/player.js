@@ -89,13 +89,13 @@ function drawSeen() {
       pen.beginPath(); pen.arc(...p, 3.5, 0, 7); pen.fill();
     });
     const shown = at.filter((_, i) => seen[i]);
-    if (frame.objects.length > 1 && shown.length) label(pen, shown, object.id);
+    if (frame.objects.length > 1 && shown.length) label(pen, shown, object.identity);
   });
 }
 
-function label(pen, points, id) {
+function label(pen, points, identity) {
   const [x, y] = points.reduce((top, p) => p[1] < top[1] ? p : top);
-  write(pen, x + 8, y - 6, `${id}`, "#222222");
+  write(pen, x + 8, y - 6, `${identity}`, "#222222");
 }
 
 function write(pen, x, y, word, fill) {
@@ -143,12 +143,12 @@ const orbit = new Orbit($("lifted"), 0, 0, () => {
       put(view.at(object), tip, stroke, 0.9, 1.5);
       words.push([project(tip), AXIS_NAMES[k], stroke]);
     });
-    orbit.joints.push({ id: object.id, at, sure: object.sure });
+    orbit.joints.push({ identity: object.identity, at, sure: object.sure });
   });
   orbit.lines(lines, view.reach);
-  orbit.joints.forEach(({ id, at, sure }) => {
+  orbit.joints.forEach(({ identity, at, sure }) => {
     orbit.dots(at, sure.map(colour), 3.5);
-    if (orbit.joints.length > 1) label(orbit.pen, at, id);
+    if (orbit.joints.length > 1) label(orbit.pen, at, identity);
   });
   words.forEach(([[x, y], word, fill]) => write(orbit.pen, x + 3, y + 4, word, fill));
 });
@@ -180,10 +180,10 @@ function show(next) {
 }
 
 function describe(object) {
-  if (!object.shape) return `${object.id}: not lifted`;
+  if (!object.shape) return `${object.identity}: not lifted`;
   const mean = object.sure.reduce((a, b) => a + b, 0) / object.sure.length;
   const residual = object.residual === null ? "" : `, residual ${object.residual.toFixed(3)}`;
-  return `${object.id}: confidence ${mean.toFixed(2)}${residual}`;
+  return `${object.identity}: confidence ${mean.toFixed(2)}${residual}`;
 }
 
 function seek(next) {

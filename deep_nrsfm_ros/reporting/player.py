@@ -43,22 +43,25 @@ class Stage:
         stamp: int,
         seen: Observation,
         lifted: Lifted | None = None,
-        ids: Sequence[str] | None = None,
+        identities: Sequence[str] | None = None,
     ) -> Scene:
         """Return a frame as the page wants it, short enough for thousands.
 
-        stamp: ns. seen: its n objects; lifted: what came of them, if anything did; ids: whose they
-        are, their places if None. The scene: `t` in s; `camera`, its place, None if unknown;
-        `objects`, each with `id`, `seen` (q x 3), and if it was lifted `shape` (p x 3, camera
-        axes, centred), `sure` (p), `place` (3) and `size` of the shape, `rotation` (9 or None) and
-        `residual`.
+        stamp: ns. seen: its n objects; lifted: what came of them, if anything did; identities: of
+        the n objects, their places if None. The scene: `t` in s; `camera`, its place, None if
+        unknown; `objects`, each with `identity`, `seen` (q x 3), and if it was lifted `shape`
+        (p x 3, camera axes, centred), `sure` (p), `place` (3) and `size` of the shape, `rotation`
+        (9 or None) and `residual`.
         """
         objects = []
         for i, points in enumerate(seen.points):
             both = np.concatenate(
                 [_rounded(points, 5), _rounded(seen.confidence[i, :, None], 2)], 1
             )
-            one: Scene = {"id": str(i) if ids is None else ids[i], "seen": _flat(both)}
+            one: Scene = {
+                "identity": str(i) if identities is None else identities[i],
+                "seen": _flat(both),
+            }
             if lifted is not None and np.isfinite(lifted.shapes[i]).all():
                 one |= self._lifted(Lifted(*(part[i] for part in lifted)))
             objects.append(one)
@@ -126,7 +129,9 @@ def scenes(recording: Recording, every: int = 1, stage: Stage | None = None) -> 
         rows = slice(ends[frame], ends[frame + 1])
         observation = Observation(seen.points[rows], seen.confidence[rows])
         there = Lifted(*(part[rows] for part in lifted))
-        yield stage.scene(int(seen.stamps[frame]), observation, there, seen.ids[rows].tolist())
+        yield stage.scene(
+            int(seen.stamps[frame]), observation, there, seen.identities[rows].tolist()
+        )
 
 
 def stride(recording: Recording, most: int) -> int:

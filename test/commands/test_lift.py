@@ -72,7 +72,7 @@ def test_the_largest_alone(
         ]
     )
     frames = json.loads((tmp_path / "out.json").read_text())["frames"]
-    assert [[one["id"] for one in frame["objects"]] for frame in frames] == [["0"]] * 3 + [
+    assert [[one["identity"] for one in frame["objects"]] for frame in frames] == [["0"]] * 3 + [
         ["1"],
         ["0"],
     ]
@@ -136,7 +136,7 @@ def test_with_intrinsics_people_come_out_at_their_place(people: Path, tmp_path: 
     )
     with np.load(tmp_path / "out.npz") as file:
         x, _, z = file["shapes"].mean(1).T
-        small = file["ids"][file["frame"] == 3].tolist().index("0")
+        small = file["identities"][file["frame"] == 3].tolist().index("0")
         here = np.flatnonzero(file["frame"] == 3)
         # 60 pixels of 600 from shoulders to hips, 0.5 m apart: 0.5 * 600 / 60 m away.
         np.testing.assert_allclose(z[file["frame"] < 3], 0.5 * 600 / 60, rtol=0.25)

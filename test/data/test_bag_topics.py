@@ -22,7 +22,7 @@ ANIMAL = KeypointLayout("animal", ("head", "tail", "paw", "ear"))
 MAPPING = FieldMapping(
     "my_msgs/Animals",
     objects="found",
-    object_id="number",
+    identity="number",
     keypoints="joints",
     x="place.u",
     y="place.v",

@@ -52,7 +52,7 @@ def write_openpose(folder: Path, seen: Detections) -> list[str]:
 
 
 def assert_same(found: Detections, expected: Detections) -> None:
-    for name in ("confidence", "frame", "ids", "stamps"):
+    for name in ("confidence", "frame", "identities", "stamps"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
     np.testing.assert_array_equal(found.points, expected.points)
 
@@ -85,7 +85,7 @@ def write(kind: str, folder: Path, seen: Detections) -> Path:
             points=seen.points[order],
             confidence=seen.confidence[order],
             frame=seen.frame[order],
-            ids=seen.ids[order],
+            identities=seen.identities[order],
             stamps=seen.stamps,
         )
         return path
@@ -106,7 +106,7 @@ KINDS = ("openpose folder", "jsonl", "jsonl.gz", "coco", "npz", "mcap", "sqlite3
 def test_every_kind_gives_the_same_people(kind: str, tmp_path: Path, seen: Detections) -> None:
     found = read_keypoints(write(kind, tmp_path, seen), Q, rate=10)
     if kind == "npz":  # the objects of a frame stay in their order, which was turned round
-        found = found[np.lexsort((found.ids, found.frame))]
+        found = found[np.lexsort((found.identities, found.frame))]
     assert_same(found, seen)
 
 
@@ -119,14 +119,14 @@ def test_coco_results_without_images(tmp_path: Path, seen: Detections) -> None:
     (tmp_path / "results.json").write_text(json.dumps(results))
     found = read_keypoints(tmp_path / "results.json", Q)
     assert found.frame.tolist() == [0, 1, 1, 2, 2, 2, 3]  # the frame of nobody is not told of
-    assert sorted(found.ids.tolist()) == sorted(map(str, range(7, 14)))
+    assert sorted(found.identities.tolist()) == sorted(map(str, range(7, 14)))
     np.testing.assert_array_equal(found.points[0], seen.points[0])
 
 
 def test_plain_npz_is_a_frame_each(tmp_path: Path, seen: Detections) -> None:
     np.savez(tmp_path / "a.npz", points=seen.points)
     found = read_keypoints(tmp_path / "a.npz", Q, rate=50)
-    assert found.frame.tolist() == list(range(7)) and set(found.ids) == {"0"}
+    assert found.frame.tolist() == list(range(7)) and set(found.identities) == {"0"}
     assert found.stamps.tolist() == [20_000_000 * i for i in range(7)]
     np.testing.assert_array_equal(found.confidence > 0, (seen.points != 0).any(-1))
 
@@ -135,7 +135,7 @@ def test_largest_is_one_a_frame(seen: Detections) -> None:
     seen.points[seen.frame == 3] *= np.array([0.1, 1, 0.5], np.float32)[:, None, None]
     found = seen.largest()
     assert found.frame.tolist() == [0, 2, 3, 4]
-    assert found.ids[2] == "1"
+    assert found.identities[2] == "1"
     np.testing.assert_array_equal(found.stamps, seen.stamps)
 
 
@@ -156,7 +156,10 @@ def test_low_confidence_is_missing(tmp_path: Path, seen: Detections) -> None:
         ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, -1])}, "counted from 0"),
         ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, 2**60])}, "at most 1000000 frames"),
         ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, np.nan])}, "no whole one"),
-        ({"points": np.zeros((2, 17, 2)), "ids": np.array(["a"])}, r"`ids` is \(1,\); \(2,\)"),
+        (
+            {"points": np.zeros((2, 17, 2)), "identities": np.array(["a"])},
+            r"`identities` is \(1,\); \(2,\)",
+        ),
         ({"points": np.zeros((2, 17, 2)), "stamps": np.zeros(1)}, r"`stamps` is .* \(2,\)"),
     ],
 )

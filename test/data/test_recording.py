@@ -117,7 +117,7 @@ def test_npz_holds_every_object(tmp_path: Path, recording: Recording) -> None:
     with np.load(tmp_path / "out.npz") as file:
         for name, values in recording.lifted._asdict().items():
             np.testing.assert_array_equal(file[name], values)
-        assert file["frame"].tolist() == [0, 0, 2, 3] and file["ids"].tolist() == [
+        assert file["frame"].tolist() == [0, 0, 2, 3] and file["identities"].tolist() == [
             "0",
             "1",
             "0",
@@ -134,7 +134,7 @@ def test_json_leaves_out_who_was_not_lifted(tmp_path: Path, recording: Recording
     document = json.loads((tmp_path / "out.json").read_text())
     assert [len(frame["objects"]) for frame in document["frames"]] == [2, 0, 1, 0]
     second = document["frames"][0]["objects"][1]
-    assert second["id"] == "1" and document["keypoints"] == list(HUMAN17.keypoints)
+    assert second["identity"] == "1" and document["keypoints"] == list(HUMAN17.keypoints)
     np.testing.assert_allclose(second["shapes"], recording.lifted.shapes[1], atol=1e-5)
     np.testing.assert_allclose(second["rotations"], recording.lifted.rotations[1], atol=1e-5)
 

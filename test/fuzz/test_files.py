@@ -164,7 +164,7 @@ def test_a_keypoint_file_is_read_or_refused(bench, fuzz, tmp_path):
         "confidence": np.ones((4, p)),
         "frame": np.array([0, 0, 1, 3]),
         "stamps": np.arange(5) * 10**7,
-        "ids": np.array(["a", "b", "a", "c"]),
+        "identities": np.array(["a", "b", "a", "c"]),
     }
 
     def jsonl(content: object) -> bytes:
@@ -175,7 +175,9 @@ def test_a_keypoint_file_is_read_or_refused(bench, fuzz, tmp_path):
         if kind == "npz":
             arrays = {name: value.copy() for name, value in values.items()}
             name = spoiler.choice([*arrays])
-            changed = spoiler.anything(arrays[name].ravel()) if name != "ids" else arrays[name][1:]
+            changed = (
+                spoiler.anything(arrays[name].ravel()) if name != "identities" else arrays[name][1:]
+            )
             keep = isinstance(changed, np.ndarray) and changed.size == arrays[name].size
             arrays[name] = changed.reshape(arrays[name].shape) if keep else np.array(changed)
             content = npz(**arrays)

@@ -24,7 +24,7 @@ BY_NUMBER = FieldMapping(
 BY_NAME = FieldMapping(
     "my_msgs/Zoo",
     objects="found",
-    object_id="number",
+    identity="number",
     keypoints="joints",
     x="place.u",
     y="place.v",

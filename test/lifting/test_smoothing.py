@@ -58,8 +58,8 @@ def test_off_it_changes_nothing() -> None:
     steady, lifted = Smoother(SmoothingOptions()), both(one(), nothing())
     assert not SmoothingOptions().enabled
     for time in (0.0, 0.1):
-        same, ids = steady(lifted, ("a", "b"), time)
-        assert same is lifted and ids == ("a", "b")
+        same, identities = steady(lifted, ("a", "b"), time)
+        assert same is lifted and identities == ("a", "b")
 
 
 def test_what_trembles_is_held_still() -> None:
@@ -120,8 +120,8 @@ def test_each_object_has_a_filter_of_its_own_wherever_it_stands_in_the_message()
     for i in range(20):
         order = ("a", "b") if i % 2 else ("b", "a")
         pair = both(a[i], b[i]) if i % 2 else both(b[i], a[i])
-        together, ids = steady(pair, order, i / RATE)
-        assert ids == order
+        together, identities = steady(pair, order, i / RATE)
+        assert identities == order
         np.testing.assert_array_equal(together.shapes[order.index("a")], alone.shapes[i])
 
 
@@ -129,15 +129,15 @@ def test_each_object_has_a_filter_of_its_own_wherever_it_stands_in_the_message()
 def test_a_gap_is_bridged_for_its_time_and_less_sure(listed: bool) -> None:
     steady = Smoother(dataclasses.replace(ON, bridge=0.4))
     empty = Lifted(*(part[:0] for part in one()))
-    gone, ids = (nothing(), ("a",)) if listed else (empty, ())
+    gone, identities = (nothing(), ("a",)) if listed else (empty, ())
     steady(one(), ("a",), 10.0)
     for wait, left in ((0.1, 0.75), (0.3, 0.25)):
-        held, names = steady(gone, ids, 10 + wait)
-        assert names == ("a",)
+        held, found = steady(gone, identities, 10 + wait)
+        assert found == ("a",)
         np.testing.assert_allclose(held.shapes[0], SHAPE, atol=1e-6)
         np.testing.assert_allclose(held.confidence, 0.8 * left, rtol=1e-5)
-    after, names = steady(gone, ids, 10.5)
-    assert names == ids and np.isnan(after.residual).all()
+    after, found = steady(gone, identities, 10.5)
+    assert found == identities and np.isnan(after.residual).all()
     assert (after.confidence == 0).all()
 
 

@@ -1,4 +1,4 @@
-"""Objects keep their names while they are seen."""
+"""Objects keep their identities while they are seen."""
 
 import numpy as np
 from hypothesis import given
@@ -10,13 +10,13 @@ from deep_nrsfm_ros.lifting.tracking import MEMORY, Tracker
 BODY = np.random.default_rng(0).uniform(-50, 50, (8, 2)).astype(np.float32)
 
 
-def seen(*places: tuple[float, float], ids: Identities = ()) -> Observation:
+def seen(*places: tuple[float, float], identities: Identities = ()) -> Observation:
     """Return bodies at some places in the image."""
     points = np.array([BODY + place for place in places], np.float32).reshape(-1, 8, 2)
-    return Observation(points, np.ones(points.shape[:2], np.float32), ids)
+    return Observation(points, np.ones(points.shape[:2], np.float32), identities)
 
 
-def test_objects_that_move_and_change_places_in_the_message_keep_their_names() -> None:
+def test_objects_that_move_and_change_places_in_the_message_keep_their_identities() -> None:
     tracker = Tracker()
     a, b = tracker(seen((100, 100), (500, 100)), 0.0)
     assert a != b
@@ -61,15 +61,18 @@ def test_only_keypoints_that_both_show_are_compared() -> None:
     assert tracker(other, 0.2) != (a,)
 
 
-def test_the_detectors_names_stay_and_a_second_of_the_same_is_another() -> None:
+def test_the_detectors_identities_stay_and_a_second_of_the_same_is_another() -> None:
     tracker = Tracker()
-    x, y, z = tracker(seen((0, 0), (300, 0), (600, 0), ids=("7", None, "7")), 0.0)
+    x, y, z = tracker(seen((0, 0), (300, 0), (600, 0), identities=("7", None, "7")), 0.0)
     assert x == "7" and len({x, y, z}) == 3
-    assert tracker(seen((300, 0), (0, 0), ids=(None, "7")), 0.1) == (y, "7")
+    assert tracker(seen((300, 0), (0, 0), identities=(None, "7")), 0.1) == (y, "7")
 
 
-def test_the_detectors_names_are_not_given_again() -> None:
-    assert Tracker()(seen((0, 0), (300, 0), ids=("object1", None)), 0.0) == ("object1", "object2")
+def test_the_detectors_identities_are_not_given_again() -> None:
+    assert Tracker()(seen((0, 0), (300, 0), identities=("object1", None)), 0.0) == (
+        "object1",
+        "object2",
+    )
 
 
 def test_an_object_without_keypoints_has_no_name() -> None:
@@ -78,10 +81,10 @@ def test_an_object_without_keypoints_has_no_name() -> None:
     assert Tracker()(nothing, 0.0)[1] == ""
 
 
-def test_names_of_one_topic_among_several() -> None:
+def test_identities_of_one_topic_among_several() -> None:
     tracker = Tracker("body_ab")
     assert tracker(seen((0, 0)), 0.0) == ("body_ab",)
-    assert tracker(seen((0, 0), ids=("3",)), 0.1) == ("body_ab/3",)
+    assert tracker(seen((0, 0), identities=("3",)), 0.1) == ("body_ab/3",)
     assert tracker(seen((0, 0), (300, 0)), 0.2) == ("body_ab/object1", "body_ab/object2")
 
 
@@ -91,9 +94,11 @@ def test_names_of_one_topic_among_several() -> None:
         max_size=6,
     )
 )
-def test_names_differ_whatever_comes(frames: list[list[tuple[int, str | None]]]) -> None:
+def test_identities_differ_whatever_comes(frames: list[list[tuple[int, str | None]]]) -> None:
     tracker = Tracker()
     for time, frame in enumerate(frames):
         places = [(float(x), 0.0) for x, _ in frame]
-        names = tracker(seen(*places, ids=tuple(name for _, name in frame)), time / 10)
-        assert len(set(names)) == len(frame) and all(names)
+        identities = tracker(
+            seen(*places, identities=tuple(identity for _, identity in frame)), time / 10
+        )
+        assert len(set(identities)) == len(frame) and all(identities)

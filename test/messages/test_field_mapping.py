@@ -18,7 +18,7 @@ from deep_nrsfm_ros.messages.field_mapping import (
 ANIMALS = FieldMapping(
     "my_msgs/Animals",
     objects="found",
-    object_id="number",
+    identity="number",
     keypoints="joints",
     x="place.u",
     y="place.v",
@@ -43,13 +43,13 @@ def test_yolo_detections(detectors: Any) -> None:
         ]
     )
     seen = read(message, YOLO.type, 17)
-    assert seen.ids == ("7", None)
+    assert seen.identities == ("7", None)
     np.testing.assert_allclose(seen.points[0], a[:, :2], rtol=1e-6)
     np.testing.assert_allclose(seen.confidence[0], a[:, 2], rtol=1e-6)
     np.testing.assert_array_equal(np.flatnonzero(seen.confidence[1]), [0, 5, 16])
     np.testing.assert_allclose(seen.points[1, 16], b[16, :2], rtol=1e-6)
     empty = read(detectors.detections([]), YOLO.type, 17)
-    assert empty.points.shape == (0, 17, 2) and empty.ids == ()
+    assert empty.points.shape == (0, 17, 2) and empty.identities == ()
 
 
 def test_yolo_of_another_layout_says_so(detectors: Any) -> None:
@@ -65,7 +65,7 @@ def test_skeletons_are_normalised_by_width_and_height_apart(detectors: Any) -> N
     seen = read(message, SKELETON_2D.type, 18, size=(640, 480))
     np.testing.assert_allclose(seen.points[0], given[:, :2] * [640, 480], rtol=1e-5)
     assert seen.confidence[0, 3] == 0 and (np.delete(seen.confidence[0], 3) > 0).all()
-    assert seen.ids == (None,)
+    assert seen.identities == (None,)
     with pytest.raises(MessageError, match="size of the image is needed; set image_width"):
         read(message, SKELETON_2D.type, 18)
     with pytest.raises(MessageError, match=r"18 keypoints \(skeleton\).*has 17"):
@@ -77,7 +77,7 @@ def test_a_type_of_ones_own_with_names(detectors: Any) -> None:
         [(3, {"paw": (1, 2), "head": (3, 4)}), (5, {}), (9, {"tail": (5, 6), "ear": (0, 0)})]
     )
     seen = read(message, ANIMALS, 4)
-    assert seen.ids == ("3", "9")
+    assert seen.identities == ("3", "9")
     np.testing.assert_array_equal(seen.points[0], [[3, 4], [0, 0], [1, 2], [0, 0]])
     np.testing.assert_array_equal(seen.confidence, [[1, 0, 1, 0], [0, 1, 0, 0]])
     with pytest.raises(MessageError, match="label is 'hoof'; the mapping names head, tail"):
@@ -96,9 +96,9 @@ def test_a_value_may_stand_for_missing() -> None:
 
 @pytest.mark.parametrize("none", ["", "-1", -1])
 def test_what_trackers_write_for_none_is_none(none: Any) -> None:
-    mapping = FieldMapping("a/B", keypoints="points", object_id="id")
+    mapping = FieldMapping("a/B", keypoints="points", identity="id")
     point = SimpleNamespace(x=1, y=1)
-    assert read(SimpleNamespace(points=[point], id=none), mapping, 1).ids == (None,)
+    assert read(SimpleNamespace(points=[point], id=none), mapping, 1).identities == (None,)
 
 
 @pytest.mark.parametrize("mapping", [*MAPPINGS.values(), ANIMALS], ids=lambda m: m.type)

@@ -11,7 +11,7 @@ SHIPPED = sorted((Path(__file__).parents[2] / "config" / "mappings").glob("*.yam
 WHOLE = """
 type: my_msgs/msg/Animals
 objects: found
-object_id: number
+identity: number
 keypoints: joints
 x: place.u
 y: place.v
@@ -30,7 +30,7 @@ def test_every_field_is_read(tmp_path: Path) -> None:
     assert read_mapping(path) == FieldMapping(
         "my_msgs/Animals",
         objects="found",
-        object_id="number",
+        identity="number",
         keypoints="joints",
         x="place.u",
         y="place.v",

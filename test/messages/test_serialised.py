@@ -72,7 +72,7 @@ def outcome(call: Callable[[], tuple[Header | None, Any]]) -> Any:
     except Exception as error:
         return type(error), str(error)
     arrays = [(a.shape, a.dtype, a.tobytes(), a.flags.c_contiguous) for a in seen[:2]]
-    return header, arrays, seen.ids
+    return header, arrays, seen.identities
 
 
 def long_way(raw: bytes, origin: str, *how: Any) -> Any:

@@ -23,7 +23,7 @@ NUMBERS = count(1)
 FIGURES = """
 type: visualization_msgs/MarkerArray
 objects: markers
-object_id: ns
+identity: ns
 keypoints: points
 """
 POSES = """

@@ -20,7 +20,7 @@ def frame(t: float) -> dict[str, Any]:
     seen = [v for i in range(17) for v in (100 + i, 100 + 10 * i + t, 0.9)]
     shape = [v for i in range(17) for v in (0.1 * i - 0.8, 0.1 * i - 0.8 + t / 100, 0.0)]
     lifted = {"shape": shape, "sure": [0.9] * 17, "place": [0, 0, 0], "size": 1, "residual": None}
-    one = {"id": "0", "seen": seen, "rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1], **lifted}
+    one = {"identity": "0", "seen": seen, "rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1], **lifted}
     return {"t": t, "camera": None, "objects": [one]}
 
 
