@@ -38,7 +38,7 @@ def run(*command, cwd, **variables):
     return done.stdout
 
 
-def colcon(verb, *arguments, workspace):
+def colcon(verb, *arguments, workspace: Path):
     command = Path(sysconfig.get_path("scripts")) / "colcon"
     return run(
         *(sys.executable, command, "--log-base", workspace / "log", verb, *arguments), cwd=workspace
@@ -46,7 +46,7 @@ def colcon(verb, *arguments, workspace):
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory):
+def workspace(tmp_path_factory: pytest.TempPathFactory):
     """A colcon workspace with a copy of this package that has one test, which passes."""
     workspace = tmp_path_factory.mktemp("workspace")
     source = workspace / "src" / NAME
@@ -70,7 +70,7 @@ def workspace(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def installed_by_pip(workspace, tmp_path_factory):
+def installed_by_pip(workspace: Path, tmp_path_factory: pytest.TempPathFactory):
     """The prefix of a fresh environment after `pip install .`; no network is used.
 
     The build tool comes from this environment, and requirements stay out.
@@ -87,18 +87,18 @@ def installed_by_pip(workspace, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def built_by_colcon(workspace):
+def built_by_colcon(workspace: Path):
     """The prefix of the package after `colcon build`."""
     colcon("build", "--event-handlers", "console_direct+", workspace=workspace)
     return workspace / "install" / NAME
 
 
 @pytest.fixture(params=["installed_by_pip", "built_by_colcon"])
-def prefix(request):
+def prefix(request: pytest.FixtureRequest):
     return request.getfixturevalue(request.param)
 
 
-def test_executables_are_where_ros2_run_looks(prefix):
+def test_executables_are_where_ros2_run_looks(prefix: Path) -> None:
     folder = prefix / "lib" / NAME
     assert "lifter" in EXECUTABLES
     assert sorted(path.name for path in folder.iterdir()) == EXECUTABLES
@@ -106,7 +106,7 @@ def test_executables_are_where_ros2_run_looks(prefix):
 
 
 @pytest.mark.parametrize("name", [name for name in EXECUTABLES if name != "lifter"])
-def test_executable_runs_from_an_installation(prefix, name, tmp_path):
+def test_executable_runs_from_an_installation(prefix: Path, name: str, tmp_path: Path) -> None:
     here = next(prefix.glob("lib/python*/site-packages"))
     there = sysconfig.get_path("purelib")  # what the package requires
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
@@ -119,11 +119,11 @@ def test_executable_runs_from_an_installation(prefix, name, tmp_path):
     assert "usage:" in shown
 
 
-def test_ament_index_knows_the_package(prefix):
+def test_ament_index_knows_the_package(prefix: Path) -> None:
     assert (prefix / "share/ament_index/resource_index/packages" / NAME).is_file()
 
 
-def test_share_has_what_the_source_has(prefix):
+def test_share_has_what_the_source_has(prefix: Path) -> None:
     share = prefix / "share" / NAME
     assert (share / "package.xml").read_bytes() == (ROOT / "package.xml").read_bytes()
     for folder, patterns in {
@@ -140,14 +140,14 @@ def test_share_has_what_the_source_has(prefix):
         assert installed == expected
 
 
-def test_colcon_sees_an_ament_python_package(workspace):
+def test_colcon_sees_an_ament_python_package(workspace: Path) -> None:
     # colcon only warns of a package.xml that it cannot parse, and lists another type.
     assert colcon("list", workspace=workspace).split() == [
         *(NAME, f"src/{NAME}", "(ros.ament_python)")
     ]
 
 
-def test_colcon_test_runs_pytest(workspace, built_by_colcon):
+def test_colcon_test_runs_pytest(workspace: Path, built_by_colcon: Path) -> None:
     # Without an extra that names pytest, colcon runs 0 tests and calls it a success.
     colcon("test", workspace=workspace)
     assert "Summary: 1 test, 0 errors, 0 failures, 0 skipped" in colcon(
@@ -155,13 +155,13 @@ def test_colcon_test_runs_pytest(workspace, built_by_colcon):
     )
 
 
-def test_versions_agree():
+def test_versions_agree() -> None:
     declared = ElementTree.parse(ROOT / "package.xml").findtext("version")
     stated = run(sys.executable, "setup.py", "--version", cwd=ROOT).split()[-1]
     assert declared == stated == deep_nrsfm_ros.__version__
 
 
-def test_config_sets_parameters_that_the_lifter_has():
+def test_config_sets_parameters_that_the_lifter_has() -> None:
     (namespace, content), *others = yaml.safe_load(
         (ROOT / "config" / "lifter.yaml").read_text()
     ).items()

@@ -5,7 +5,7 @@ from benchmarks.furniture import CATEGORIES
 
 
 @pytest.mark.parametrize("make", CATEGORIES.values(), ids=CATEGORIES.keys())
-def test_furniture_stands_on_its_feet_and_is_symmetric(make):
+def test_furniture_stands_on_its_feet_and_is_symmetric(make) -> None:
     S = make(np.random.default_rng(0), 50)
     assert S.shape[0] == 50
     assert S[..., 2].min() >= 0
@@ -13,7 +13,7 @@ def test_furniture_stands_on_its_feet_and_is_symmetric(make):
 
 
 @pytest.mark.parametrize("make", CATEGORIES.values(), ids=CATEGORIES.keys())
-def test_furniture_varies_and_its_seed_fixes_it(make):
+def test_furniture_varies_and_its_seed_fixes_it(make) -> None:
     S, again, other = (make(np.random.default_rng(seed), 20) for seed in (0, 0, 1))
     np.testing.assert_array_equal(S, again)
     assert np.abs(S - other).max() > 0.05

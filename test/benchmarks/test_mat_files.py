@@ -1,3 +1,7 @@
+from __future__ import annotations
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -22,7 +26,7 @@ def centred(X):
     return X - X.mean(1, keepdims=True)
 
 
-def test_sequence_with_a_world_is_centred_images_and_truth(tmp_path, shapes):
+def test_sequence_with_a_world_is_centred_images_and_truth(tmp_path: Path, shapes) -> None:
     cameras = random_cameras(F, np.random.default_rng(1))
     savemat(tmp_path / "walk.mat", {"W": rows(shapes @ cameras), "S": rows(shapes)})
     sequence = read_sequence(tmp_path / "walk.mat")
@@ -34,7 +38,7 @@ def test_sequence_with_a_world_is_centred_images_and_truth(tmp_path, shapes):
     assert sequence.dataset.source == "walk"
 
 
-def test_sequence_without_a_world_has_its_truth_in_camera_axes(tmp_path, shapes):
+def test_sequence_without_a_world_has_its_truth_in_camera_axes(tmp_path: Path, shapes) -> None:
     truth = {"shape3D": rows(shapes)}
     savemat(tmp_path / "face.mat", {"W": rows(shapes[..., :2]), "GT": truth})
     sequence = read_sequence(tmp_path / "face.mat")
@@ -43,7 +47,7 @@ def test_sequence_without_a_world_has_its_truth_in_camera_axes(tmp_path, shapes)
     np.testing.assert_allclose(sequence.dataset.shapes[..., :2], sequence.dataset.points)
 
 
-def test_category_is_a_shape_an_object(tmp_path, shapes):
+def test_category_is_a_shape_an_object(tmp_path: Path, shapes) -> None:
     savemat(tmp_path / "faces.mat", {"X": shapes.transpose(2, 1, 0)})
     np.testing.assert_array_equal(read_category(tmp_path / "faces.mat"), shapes)
 
@@ -59,14 +63,14 @@ def test_category_is_a_shape_an_object(tmp_path, shapes):
     ],
     ids=["no images", "no truth", "too little truth", "half a frame", "truth of another name"],
 )
-def test_sequences_that_do_not_fit_are_refused_by_name(tmp_path, content):
+def test_sequences_that_do_not_fit_are_refused_by_name(tmp_path: Path, content) -> None:
     savemat(tmp_path / "bad.mat", content)
     with pytest.raises(ValueError, match=r"bad\.mat has no W"):
         read_sequence(tmp_path / "bad.mat")
 
 
 @pytest.mark.parametrize("content", [{"Y": np.zeros((3, 4, 5))}, {"X": np.zeros((4, 3, 5))}])
-def test_categories_that_do_not_fit_are_refused_by_name(tmp_path, content):
+def test_categories_that_do_not_fit_are_refused_by_name(tmp_path: Path, content) -> None:
     savemat(tmp_path / "bad.mat", content)
     with pytest.raises(ValueError, match=r"bad\.mat has no X"):
         read_category(tmp_path / "bad.mat")
@@ -76,7 +80,7 @@ def test_categories_that_do_not_fit_are_refused_by_name(tmp_path, content):
     "content", [b"", b"not a mat file at all" * 20, b"MATLAB 5.0" + bytes(200)]
 )
 @pytest.mark.parametrize("read", [read_sequence, read_category])
-def test_other_files_are_refused_by_name(tmp_path, read, content):
+def test_other_files_are_refused_by_name(tmp_path: Path, read, content) -> None:
     (tmp_path / "bad.mat").write_bytes(content)
     with pytest.raises(ValueError, match=r"bad\.mat"):
         read(tmp_path / "bad.mat")

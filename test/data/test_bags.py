@@ -319,7 +319,7 @@ def test_messages_without_objects_or_sense_do_not_count(tmp_path: Path) -> None:
         most_keypoints([tmp_path / "huge"], TOPIC)
 
 
-def test_more_frames_than_allowed_are_refused_before_they_fill_the_memory(tmp_path):
+def test_more_frames_than_allowed_are_refused_before_they_fill_the_memory(tmp_path: Path) -> None:
     path = tmp_path / "bag"
     points, confidence = np.ones((300, 17, 2)), np.ones((300, 17))
     write_bag(path, "/k", frames(points, confidence))

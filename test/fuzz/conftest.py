@@ -180,8 +180,11 @@ def bench() -> Bench:
     return Bench()
 
 
+Fuzz = Callable[..., None]
+
+
 @pytest.fixture
-def fuzz(capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
+def fuzz(capsys: pytest.CaptureFixture[str]) -> Fuzz:
     """Return what gives a reader its inputs and holds it to the promise.
 
     fuzz(name, one): `one` takes a Spoiler and returns in a word what became of its input. Anything

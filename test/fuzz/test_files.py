@@ -18,6 +18,7 @@ from deep_nrsfm_ros.layouts.object_file import ObjectFileError, read_object
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
 from deep_nrsfm_ros.messages.mapping_file import MappingError, read_mapping
 from deep_nrsfm_ros.model_files.model_file import ModelFileError, load_model, save_model
+from test.fuzz.conftest import Bench, Fuzz, Spoiler
 
 ROOT = Path(__file__).resolve().parents[2]
 YAML = (b"*a", b"&a", b"!!int ''", b"<<: ", b"[", b"{", b"? ", b": ", b"\n- ", b"'", b"\x00",
@@ -30,7 +31,7 @@ def views(f: int, p: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(50, 600, (f, p, 2))
 
 
-def test_a_bag_is_read_or_refused(bench, fuzz, tmp_path):
+def test_a_bag_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: Path) -> None:
     """Mostly its data is spoilt, as metadata.yaml takes long to read."""
     wholes, layout = {}, bench.layout
     for storage in ("sqlite3", "mcap"):
@@ -38,7 +39,7 @@ def test_a_bag_is_read_or_refused(bench, fuzz, tmp_path):
         write_bag(tmp_path / storage, "/k", frames(views(3, p), np.ones((3, p))), storage)
         wholes[storage] = {file.name: file.read_bytes() for file in (tmp_path / storage).iterdir()}
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         storage = spoiler.choice([*wholes])
         path, whole = tmp_path / storage, wholes[storage]
         data, metadata = sorted(whole, key=lambda name: name.endswith(".yaml"))
@@ -62,12 +63,12 @@ def test_a_bag_is_read_or_refused(bench, fuzz, tmp_path):
     fuzz("bag", one, touched=False)
 
 
-def test_an_object_file_is_read_or_refused(fuzz, tmp_path):
+def test_an_object_file_is_read_or_refused(fuzz: Fuzz, tmp_path: Path) -> None:
     texts = [p.read_bytes() for p in (ROOT / "config" / "objects").glob("*.yaml")]
     texts.append(b"name: t\nkeypoints: [a, b, c, d]\nedges: [[a, b]]\nreference: [a, b]\n")
     file = tmp_path / "object.yaml"
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         text = spoiler.choice(texts[-1:] * 8 + texts)
         file.write_bytes(spoiler.spoil_text(text, YAML))
         try:
@@ -79,7 +80,9 @@ def test_an_object_file_is_read_or_refused(fuzz, tmp_path):
     fuzz("object file", one)
 
 
-def test_a_mapping_file_is_read_or_refused_and_what_is_read_reads_messages(bench, fuzz, tmp_path):
+def test_a_mapping_file_is_read_or_refused_and_what_is_read_reads_messages(
+    bench: Bench, fuzz: Fuzz, tmp_path: Path
+) -> None:
     texts = [p.read_bytes() for p in (ROOT / "config" / "mappings").glob("*.yaml")]
     texts.append(
         b"type: a/B\nobjects: found\nobject_id: number\nkeypoints: joints\nx: place.u\ny: place.v\n"
@@ -93,7 +96,7 @@ def test_a_mapping_file_is_read_or_refused_and_what_is_read_reads_messages(bench
     some = SimpleNamespace(found=[SimpleNamespace(number=7, joints=joints)])
     pipeline = bench.pipeline(quick=True)
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         file.write_bytes(spoiler.spoil_text(spoiler.choice(texts[-1:] * 8 + texts), YAML))
         try:
             mapping = read_mapping(file)
@@ -110,7 +113,9 @@ def test_a_mapping_file_is_read_or_refused_and_what_is_read_reads_messages(bench
     fuzz("mapping file", one)
 
 
-def test_a_model_file_is_read_or_refused_and_what_is_read_lifts(bench, fuzz, tmp_path):
+def test_a_model_file_is_read_or_refused_and_what_is_read_lifts(
+    bench: Bench, fuzz: Fuzz, tmp_path: Path
+) -> None:
     save_model(tmp_path / "whole.safetensors", bench.model)
     whole = (tmp_path / "whole.safetensors").read_bytes()
     length, p = int.from_bytes(whole[:8], "little"), len(bench.layout)
@@ -119,7 +124,7 @@ def test_a_model_file_is_read_or_refused_and_what_is_read_lifts(bench, fuzz, tmp
     valid = bags._ENCODERS[POINT_CLOUD](next(frames(views(1, p), np.ones((1, p)))))
     file = tmp_path / "spoilt.safetensors"
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         content = spoiler.spoil_bytes(whole)
         if spoiler.random() < 0.7:
             changed = json.loads(json.dumps(said))
@@ -152,7 +157,7 @@ def npz(**arrays: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def test_a_keypoint_file_is_read_or_refused(bench, fuzz, tmp_path):
+def test_a_keypoint_file_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: Path) -> None:
     p = len(bench.layout)
     rows = np.concatenate([views(4, p), np.ones((4, p, 1))], -1).reshape(4, -1).tolist()
     images = [{"id": i, "file_name": f"{i}.jpg"} for i in range(3)]
@@ -170,7 +175,7 @@ def test_a_keypoint_file_is_read_or_refused(bench, fuzz, tmp_path):
     def jsonl(content: object) -> bytes:
         return b"\n".join([json.dumps(content).encode()] * 2)
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         kind = spoiler.choice(("json", "jsonl", "jsonl.gz", "npz"))
         if kind == "npz":
             arrays = {name: value.copy() for name, value in values.items()}

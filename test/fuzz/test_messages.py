@@ -13,9 +13,10 @@ from rosbags.typesys import Stores, get_typestore
 from deep_nrsfm_ros.data import bags
 from deep_nrsfm_ros.data.bags import frames
 from deep_nrsfm_ros.messages.camera_info import read_camera_info
-from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY, POINT_CLOUD, POLYGON, read
+from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY, POINT_CLOUD, POLYGON, InputType, read
 from deep_nrsfm_ros.messages.field_mapping import SKELETON_2D, YOLO, FieldMapping
 from deep_nrsfm_ros.messages.serialised import Reader
+from test.fuzz.conftest import Bench, Fuzz, Spoiler
 
 KINDS = (POINT_CLOUD, MULTI_ARRAY, POLYGON)
 BY_NUMBER = FieldMapping(
@@ -72,13 +73,15 @@ def message(kind: str, p: int) -> Any:
     [*KINDS, YOLO.type, SKELETON_2D.type, BY_NUMBER, BY_NAME],
     ids=lambda kind: kind if isinstance(kind, str) else f"{kind.type} by a field mapping",
 )
-def test_a_message_is_lifted_or_refused_and_leaves_no_trace(bench, fuzz, request, input_type):
+def test_a_message_is_lifted_or_refused_and_leaves_no_trace(
+    bench: Bench, fuzz: Fuzz, request: pytest.FixtureRequest, input_type: InputType
+) -> None:
     kind = input_type if isinstance(input_type, str) else input_type.type
     pipeline, quick = bench.pipeline(), bench.pipeline(quick=True)
     valid = bench.loose(message(kind, len(bench.layout)))
     expected = bench.lift(pipeline, valid, input_type)
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         spoilt = bench.loose(valid)
         spoiler.spoil(spoilt)
         try:
@@ -98,14 +101,16 @@ def test_a_message_is_lifted_or_refused_and_leaves_no_trace(bench, fuzz, request
     fuzz(request.node.callspec.id, one)
 
 
-def test_bytes_on_the_wire_are_read_or_refused_by_the_short_way_as_by_the_long(bench, fuzz):
+def test_bytes_on_the_wire_are_read_or_refused_by_the_short_way_as_by_the_long(
+    bench: Bench, fuzz: Fuzz
+) -> None:
     store, p = get_typestore(Stores.ROS2_JAZZY), len(bench.layout)
     names = {kind: kind.replace("/", "/msg/") for kind in KINDS}
     raws = {k: bytes(store.serialize_cdr(message(k, p), names[k])) for k in KINDS}
     decoders = {k: lambda raw, k=k: store.deserialize_cdr(raw, names[k]) for k in KINDS}
     readers = {k: Reader(k, decoders[k]) for k in KINDS}
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         kind = spoiler.choice(KINDS)
         reader = readers[kind]
         reader(raws[kind], p)  # what comes next may be like it
@@ -130,7 +135,7 @@ def test_bytes_on_the_wire_are_read_or_refused_by_the_short_way_as_by_the_long(b
     fuzz("serialised message", one)
 
 
-def test_a_camera_info_is_used_or_refused(bench, fuzz):
+def test_a_camera_info_is_used_or_refused(bench: Bench, fuzz: Fuzz) -> None:
     pipeline = bench.pipeline()
     p, f = len(bench.layout), 500.0
     cameras = [
@@ -151,7 +156,7 @@ def test_a_camera_info_is_used_or_refused(bench, fuzz):
     sound = read_camera_info(cameras[0])
     expected = bench.lift(pipeline, valid, POINT_CLOUD, sound)
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         spoilt = bench.loose(spoiler.choice(cameras))
         spoiler.spoil(spoilt)
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,15 +27,16 @@ from deep_nrsfm_ros.training.job import parse_progress
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.record import look, record_file
 from deep_nrsfm_ros.training.request import TrainingOptions, sandboxed
+from test.fuzz.conftest import Bench, Fuzz, Spoiler
 
 PATHS = ("thing", "link", "link.safetensors", "/etc/passwd", "~", "~x/y.yaml", "coco17", "model",
          "thing.safetensors", "../" * 9, "numbered", "a.yaml", "x" * 5000)  # fmt: skip
 
 
-def test_what_a_training_says_and_leaves_is_understood_or_not(fuzz, tmp_path):
+def test_what_a_training_says_and_leaves_is_understood_or_not(fuzz: Fuzz, tmp_path: Path) -> None:
     line = b'{"state": "training", "step": 3, "steps": 9, "loss": 0.5, "seconds_left": 7, "a": [1]}'
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         text = spoiler.spoil_bytes(line)
         text = text if spoiler.random() < 0.9 else b"[" * spoiler.randrange(60000)
         record_file(tmp_path, "mine").write_bytes(text)
@@ -45,7 +47,9 @@ def test_what_a_training_says_and_leaves_is_understood_or_not(fuzz, tmp_path):
     fuzz("training", one)
 
 
-def test_parameters_are_accepted_or_refused_and_leave_no_trace(bench, fuzz, tmp_path):
+def test_parameters_are_accepted_or_refused_and_leave_no_trace(
+    bench: Bench, fuzz: Fuzz, tmp_path: Path
+) -> None:
     """As the lifter considers them, and as it makes a training request of them."""
     save_model(tmp_path / "thing.safetensors", bench.model)
     (tmp_path / "link.safetensors").symlink_to("/etc/passwd")
@@ -63,7 +67,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(bench, fuzz, tmp_
     known += [(SmoothingOptions, "smoothing.")]
     defaults = [(name_of(f, prefix), f.default) for c, prefix in known for f, _, _ in options(c)]
 
-    def value(spoiler, default: Any) -> Any:
+    def value(spoiler: Spoiler, default: Any) -> Any:
         if isinstance(default, bool):
             return spoiler.random() < 0.5
         if isinstance(default, int):
@@ -77,7 +81,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(bench, fuzz, tmp_
         ]
         return words if isinstance(default, tuple) else words[0]
 
-    def one(spoiler) -> str:
+    def one(spoiler: Spoiler) -> str:
         chosen = spoiler.choices(defaults, k=spoiler.choice((1, 1, 2, 5)))
         changes = [Parameter(name, value=value(spoiler, default)) for name, default in chosen]
         result = LifterNode._consider(stub, changes)

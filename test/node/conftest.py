@@ -139,10 +139,12 @@ class LifterProcess:
         return code
 
 
+StartLifter = Callable[..., LifterProcess]
+"""Starts a lifter: start(program, listens, **parameters), see `start_lifter`."""
+
+
 @pytest.fixture
-def start_lifter(
-    domain: int, models: Path, tmp_path: Path
-) -> Iterator[Callable[..., LifterProcess]]:
+def start_lifter(domain: int, models: Path, tmp_path: Path) -> Iterator[StartLifter]:
     """Start a lifter with the model `person` and the parameters given; it must end cleanly."""
     started: list[LifterProcess] = []
 
@@ -290,8 +292,11 @@ def values(status: DiagnosticStatus) -> dict[str, str]:
     return {pair.key: pair.value for pair in status.values}
 
 
+Connect = Callable[[], Client]
+
+
 @pytest.fixture
-def connect(domain: int) -> Iterator[Callable[[], Client]]:
+def connect(domain: int) -> Iterator[Connect]:
     """Make a client on the test's domain; call it once the lifter listens.
 
     Two participants find each other within 0.2 s if the waiting one is the lifter, and within

@@ -19,6 +19,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray
 
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
+from test.node.conftest import Connect, StartLifter
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = (str(ROOT / "scripts" / "lifter"),)
@@ -72,7 +73,7 @@ def catches_signals(pid: int) -> bool:
     return bool(caught & 1 << (signal.SIGTERM - 1))
 
 
-def test_a_signal_at_any_moment_of_the_start_ends_it_with_code_0(start_lifter):
+def test_a_signal_at_any_moment_of_the_start_ends_it_with_code_0(start_lifter: StartLifter) -> None:
     moments = random.Random(0)
     for i in range(MANY):
         lifter = start_lifter(SCRIPT, listens=False)
@@ -88,7 +89,9 @@ def test_a_signal_at_any_moment_of_the_start_ends_it_with_code_0(start_lifter):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_as_a_training_starts_leaves_no_process(start_lifter, connect, models, number):
+def test_a_signal_as_a_training_starts_leaves_no_process(
+    start_lifter: StartLifter, connect: Connect, models: Path, number: signal.Signals
+) -> None:
     bag = str(models / "joints.safetensors")
     lifter = start_lifter(STAND_IN, train={"bags": [bag], "name": "wait"})
     client = connect()
@@ -98,7 +101,9 @@ def test_a_signal_as_a_training_starts_leaves_no_process(start_lifter, connect, 
     wait_until(lambda: not any(map(state_of, children)), "the end of the training")
 
 
-def test_a_training_that_ended_leaves_no_zombie(start_lifter, connect, models):
+def test_a_training_that_ended_leaves_no_zombie(
+    start_lifter: StartLifter, connect: Connect, models: Path
+) -> None:
     bag = str(models / "joints.safetensors")
     lifter = start_lifter(STAND_IN, train={"bags": [bag], "name": "crash"})
     client = connect()
@@ -109,7 +114,9 @@ def test_a_training_that_ended_leaves_no_zombie(start_lifter, connect, models):
         assert children_of(lifter.process.pid) == []
 
 
-def test_a_lifter_that_is_killed_and_started_again_is_heard_again(start_lifter, connect):
+def test_a_lifter_that_is_killed_and_started_again_is_heard_again(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     first = start_lifter()
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -122,7 +129,9 @@ def test_a_lifter_that_is_killed_and_started_again_is_heard_again(start_lifter, 
         assert client.exchange(publisher, cloud()).data == before.data
 
 
-def test_what_becomes_of_the_model_file_does_not_matter(start_lifter, connect, models):
+def test_what_becomes_of_the_model_file_does_not_matter(
+    start_lifter: StartLifter, connect: Connect, models: Path
+) -> None:
     lifter = start_lifter(qos_overrides=RELIABLE)
     client = connect()
     publisher, file = client.publisher(PointCloud2), models / "person.safetensors"
@@ -146,7 +155,9 @@ def test_what_becomes_of_the_model_file_does_not_matter(start_lifter, connect, m
     assert lifter.process.poll() is None
 
 
-def test_parameter_changes_at_full_rate_cost_no_message(start_lifter, connect):
+def test_parameter_changes_at_full_rate_cost_no_message(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter(qos_overrides=RELIABLE)
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -170,7 +181,9 @@ def test_parameter_changes_at_full_rate_cost_no_message(start_lifter, connect):
     assert {message.width for message in heard} == {P}
 
 
-def test_publishers_come_and_go_and_stamps_may_be_any(start_lifter, connect):
+def test_publishers_come_and_go_and_stamps_may_be_any(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter(qos_overrides=RELIABLE)
     client = connect()
     stamps = [5, 5, 3, 2**31 - 1, 0, -1, 4][: max(MANY, 4)]
@@ -182,7 +195,7 @@ def test_publishers_come_and_go_and_stamps_may_be_any(start_lifter, connect):
         client.node.destroy_publisher(publisher)
 
 
-def test_two_lifters_in_namespaces_keep_apart(start_lifter, connect):
+def test_two_lifters_in_namespaces_keep_apart(start_lifter: StartLifter, connect: Connect) -> None:
     for side, length in (("left", 1.0), ("right", 3.0)):
         words = ("--ros-args", "-r", f"__ns:=/{side}", "--")
         start_lifter((*SCRIPT, *words), reference_length=length)
@@ -199,7 +212,9 @@ def test_two_lifters_in_namespaces_keep_apart(start_lifter, connect):
     assert sizes["right"] == pytest.approx(3 * sizes["left"], rel=1e-4)
 
 
-def test_simulated_time_may_stand_still_and_jump(start_lifter, connect):
+def test_simulated_time_may_stand_still_and_jump(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter(use_sim_time=True, **MULTI_ARRAY)
     client = connect()
     clock = client.publisher(Clock, topic="/clock")
@@ -221,7 +236,9 @@ def test_simulated_time_may_stand_still_and_jump(start_lifter, connect):
     client.wait_for_health(lambda status, v: int(v["messages lifted"]) > 5)
 
 
-def test_bytes_that_are_no_message_are_counted_and_harm_nothing(start_lifter, connect):
+def test_bytes_that_are_no_message_are_counted_and_harm_nothing(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     lifter = start_lifter(qos_overrides=RELIABLE)
     client, sent = connect(), []
     raw_publisher = client.publisher(PointCloud2)
@@ -248,7 +265,7 @@ def test_bytes_that_are_no_message_are_counted_and_harm_nothing(start_lifter, co
     assert lifter.process.poll() is None and "Traceback" not in lifter.log
 
 
-def test_what_comes_too_fast_is_counted(start_lifter, connect):
+def test_what_comes_too_fast_is_counted(start_lifter: StartLifter, connect: Connect) -> None:
     start_lifter()  # best effort, depth 1
     client, sent = connect(), []
     publisher = client.publisher(PointCloud2)

@@ -24,6 +24,7 @@ from deep_nrsfm_ros.messages.decoding import (
     POLYGON,
     pack_points,
 )
+from test.node.conftest import Connect, StartLifter
 
 P = len(HUMAN17)
 
@@ -85,7 +86,9 @@ def unpack(message: PointCloud2) -> np.ndarray:
     ],
     ids=["cloud", "multi_array", "polygon"],
 )
-def test_keypoints_of_every_type_are_lifted(start_lifter, connect, input_type, message, n):
+def test_keypoints_of_every_type_are_lifted(
+    start_lifter: StartLifter, connect: Connect, input_type: str, message: Any, n: int
+) -> None:
     lifter = start_lifter(input_type=input_type)
     client = connect()
     points = client.exchange(client.publisher(type(message)), message)
@@ -128,7 +131,9 @@ def bad_clouds() -> dict[str, PointCloud2]:
     }
 
 
-def test_bad_input_is_counted_and_the_next_message_lifted(start_lifter, connect):
+def test_bad_input_is_counted_and_the_next_message_lifted(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     reliable = {"reliability": "reliable", "history": "keep_all"}
     lifter = start_lifter(qos_overrides={"/keypoints": {"subscription": reliable}})
     client = connect()
@@ -146,7 +151,9 @@ def test_bad_input_is_counted_and_the_next_message_lifted(start_lifter, connect)
     assert "dropped" in lifter.log
 
 
-def test_a_detector_that_sees_nobody_is_no_trouble(start_lifter, connect):
+def test_a_detector_that_sees_nobody_is_no_trouble(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter()
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -158,7 +165,9 @@ def test_a_detector_that_sees_nobody_is_no_trouble(start_lifter, connect):
     assert unpack(client.exchange(publisher, cloud(pixels(1)))).shape == (1, P, 4)
 
 
-def test_nothing_but_bad_input_is_an_error_and_silence_a_warning(start_lifter, connect):
+def test_nothing_but_bad_input_is_an_error_and_silence_a_warning(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter()
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -173,7 +182,9 @@ def test_nothing_but_bad_input_is_an_error_and_silence_a_warning(start_lifter, c
     client.wait_for_health(lambda status, v: v["model"] == "person" and float(v["rate [Hz]"]) > 0)
 
 
-def test_an_object_with_too_few_keypoints_is_nan_beside_the_others(start_lifter, connect):
+def test_an_object_with_too_few_keypoints_is_nan_beside_the_others(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter()
     client = connect()
     confidence = np.ones((2, P))
@@ -185,7 +196,7 @@ def test_an_object_with_too_few_keypoints_is_nan_beside_the_others(start_lifter,
     assert np.isfinite(xyzc[1]).all() and not points.is_dense
 
 
-def test_markers_come_when_someone_listens(start_lifter, connect):
+def test_markers_come_when_someone_listens(start_lifter: StartLifter, connect: Connect) -> None:
     start_lifter()
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -206,7 +217,9 @@ def test_markers_come_when_someone_listens(start_lifter, connect):
     assert all(m.scale.x > 0 for m in markers)
 
 
-def test_steadied_it_follows_slower_and_bridges_a_gap(start_lifter, connect):
+def test_steadied_it_follows_slower_and_bridges_a_gap(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter(**{"smoothing.enabled": True, "smoothing.bridge": 5.0})
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -235,7 +248,9 @@ def test_steadied_it_follows_slower_and_bridges_a_gap(start_lifter, connect):
     assert np.abs(steadied - alone)[..., :3].max() < 0.05 * np.abs(alone[..., :3]).max()
 
 
-def test_parameters_change_what_the_next_message_gets(start_lifter, connect):
+def test_parameters_change_what_the_next_message_gets(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     lifter = start_lifter()
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -272,7 +287,9 @@ def test_parameters_change_what_the_next_message_gets(start_lifter, connect):
     assert lifter.process.poll() is None
 
 
-def test_a_model_is_changed_and_changed_back_by_one_parameter(start_lifter, connect):
+def test_a_model_is_changed_and_changed_back_by_one_parameter(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter()
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -290,7 +307,9 @@ def test_a_model_is_changed_and_changed_back_by_one_parameter(start_lifter, conn
         np.testing.assert_array_equal(unpack(client.exchange(publisher, human)), first)
 
 
-def test_the_detectors_order_may_come_from_an_object_file(start_lifter, connect, tmp_path):
+def test_the_detectors_order_may_come_from_an_object_file(
+    start_lifter: StartLifter, connect: Connect, tmp_path: Path
+) -> None:
     # The model's own keypoints backwards, and one that it does not know.
     path = tmp_path / "backwards.yaml"
     names = [*reversed(HUMAN17.keypoints), "hat"]
@@ -311,7 +330,7 @@ def test_the_detectors_order_may_come_from_an_object_file(start_lifter, connect,
     np.testing.assert_allclose(own_order, backwards, atol=1e-4)
 
 
-def test_parameters_describe_themselves(start_lifter, connect):
+def test_parameters_describe_themselves(start_lifter: StartLifter, connect: Connect) -> None:
     start_lifter()
     client = connect()
     model, share, layout, bags = client.describe_parameters(
@@ -326,7 +345,9 @@ def test_parameters_describe_themselves(start_lifter, connect):
     assert not model.read_only
 
 
-def test_a_publisher_that_cannot_be_heard_is_reported_with_the_mend(start_lifter, connect):
+def test_a_publisher_that_cannot_be_heard_is_reported_with_the_mend(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     lifter = start_lifter(
         qos_overrides={"/keypoints": {"subscription": {"reliability": "reliable"}}}
     )
@@ -336,7 +357,9 @@ def test_a_publisher_that_cannot_be_heard_is_reported_with_the_mend(start_lifter
     lifter.wait_for_log("qos_overrides./keypoints.subscription.reliability")
 
 
-def test_a_publisher_of_another_type_is_reported(start_lifter, connect):
+def test_a_publisher_of_another_type_is_reported(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     lifter = start_lifter()
     client = connect()
     connect().node.create_publisher(PolygonStamped, "keypoints", 1)
@@ -357,14 +380,18 @@ def test_a_publisher_of_another_type_is_reported(start_lifter, connect):
         ({"min_confidence": 7}, "min_confidence is 7"),
     ],
 )
-def test_a_lifter_that_cannot_start_says_why(start_lifter, parameters, reason):
+def test_a_lifter_that_cannot_start_says_why(
+    start_lifter: StartLifter, parameters: dict[str, Any], reason: str
+) -> None:
     lifter = start_lifter(listens=False, **parameters)
     assert lifter.process.wait(60) == 1
     assert reason in lifter.log and "Traceback" not in lifter.log
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_cleanly(start_lifter, connect, number):
+def test_signals_end_it_cleanly(
+    start_lifter: StartLifter, connect: Connect, number: signal.Signals
+) -> None:
     lifter = start_lifter()
     client = connect()
     client.exchange(client.publisher(PointCloud2), cloud(pixels(1)))

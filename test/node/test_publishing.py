@@ -41,7 +41,7 @@ def lifted(n: int, p: int = 5, seed: int = 0) -> Lifted:
     )
 
 
-def test_clouds_of_any_size_follow_each_other():
+def test_clouds_of_any_size_follow_each_other() -> None:
     for n, p in [(1, 5), (3, 5), (3, 4), (1, 5)]:
         wanted = lifted(n, p, seed=n + p)
         raw = publishing.point_cloud(Header(frame_id="camera"), wanted)
@@ -55,7 +55,7 @@ def test_clouds_of_any_size_follow_each_other():
         np.testing.assert_array_equal(confidence, wanted.confidence)
 
 
-def test_a_cloud_with_nan_is_not_dense():
+def test_a_cloud_with_nan_is_not_dense() -> None:
     part = lifted(2)
     part.residual[1] = np.nan
     raw = publishing.point_cloud(Header(), part)
@@ -96,7 +96,7 @@ def test_what_is_serialised_is_what_ros_would_send(sent: list[tuple[Header, int,
         assert_same_bytes(publishing.camera_rotation(header, R), turned)
 
 
-def test_objects_are_named_and_turned_row_by_row():
+def test_objects_are_named_and_turned_row_by_row() -> None:
     both = lifted(2)
     both.rotations[0] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     both.rotations[1] = np.nan
@@ -110,7 +110,7 @@ def test_objects_are_named_and_turned_row_by_row():
     assert message.transforms[0].translation.x == 0
 
 
-def test_the_rotation_turns_the_object_into_the_camera():
+def test_the_rotation_turns_the_object_into_the_camera() -> None:
     # A quarter turn about z: the object's x axis comes to lie on the camera's y axis.
     R = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
     raw = publishing.camera_rotation(Header(), R)
@@ -118,7 +118,7 @@ def test_the_rotation_turns_the_object_into_the_camera():
     assert (q.x, q.y, q.z, q.w) == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
 
 
-def test_markers_draw_edges_and_put_objects_side_by_side():
+def test_markers_draw_edges_and_put_objects_side_by_side() -> None:
     part = lifted(3)
     part.residual[1] = np.nan
     markers = publishing.markers(Header(frame_id="camera"), part, [(0, 1), (1, 4)]).markers
@@ -133,7 +133,7 @@ def test_markers_draw_edges_and_put_objects_side_by_side():
 
 def test_markers_are_not_made_when_nobody_listens(
     domain: int, models: Path, monkeypatch: pytest.MonkeyPatch
-):
+) -> None:
     made: list[object] = []
     monkeypatch.setattr(publishing, "markers", lambda *arguments: made.append(arguments))
     settings = ["-p", "model:=person", "-p", f"models_dir:={models}"]

@@ -6,6 +6,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
+from test.node.conftest import Connect, StartLifter
+
 POLICY = Path(__file__).resolve().parents[2] / "config" / "security" / "lifter.policy.xml"
 KINDS = ("publish", "subscribe", "reply", "request")
 
@@ -24,7 +26,9 @@ def allowed(enclave: str) -> dict[str, set[str]]:
     return found
 
 
-def test_the_lifter_may_do_what_it_does_and_no_more(start_lifter, connect):
+def test_the_lifter_may_do_what_it_does_and_no_more(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     tf = {"tf_prefix": "person_"} if find_spec("tf2_msgs") else {}  # it is not on PyPI
     start_lifter(use_sim_time=True, camera_info="camera_info", **tf)
     client = connect()
@@ -46,7 +50,7 @@ def test_the_lifter_may_do_what_it_does_and_no_more(start_lifter, connect):
         client.wait(same, f"{kind}: {lifter[kind]}, and is {ask('lifter', '/')}")
 
 
-def test_others_may_ask_only_for_what_the_lifter_offers():
+def test_others_may_ask_only_for_what_the_lifter_offers() -> None:
     lifter, user, operator = map(allowed, ("/lifter", "/lifter_user", "/lifter_operator"))
     everybody = {"/parameter_events", "/rosout"}
     for other in (user, operator):

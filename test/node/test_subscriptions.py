@@ -16,6 +16,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, POLYGON, pack_points
+from test.node.conftest import Connect, StartLifter
 
 P = len(HUMAN17)
 OBJECTS = "/lifter/objects"
@@ -101,7 +102,7 @@ def mapping(folder: Path, text: str) -> str:
     return str(path)
 
 
-def test_the_type_is_that_of_the_publisher(start_lifter, connect):
+def test_the_type_is_that_of_the_publisher(start_lifter: StartLifter, connect: Connect) -> None:
     lifter = start_lifter(listens=False, input_type="auto")
     lifter.wait_for_log("waiting for a publisher on /keypoints")
     client = connect()
@@ -116,7 +117,9 @@ def test_the_type_is_that_of_the_publisher(start_lifter, connect):
     assert unpack(client.exchange(publisher, polygon(pixels(0)))).shape == (1, P, 4)
 
 
-def test_a_publisher_of_no_known_type_is_reported(start_lifter, connect):
+def test_a_publisher_of_no_known_type_is_reported(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     lifter = start_lifter(listens=False, input_type="auto")
     lifter.wait_for_log("waiting for a publisher")
     client = connect()
@@ -128,7 +131,9 @@ def test_a_publisher_of_no_known_type_is_reported(start_lifter, connect):
     assert unpack(client.exchange(publisher, cloud(pixels(0)))).shape == (1, P, 4)
 
 
-def test_several_people_of_any_message_with_the_detectors_names(start_lifter, connect, tmp_path):
+def test_several_people_of_any_message_with_the_detectors_names(
+    start_lifter: StartLifter, connect: Connect, tmp_path: Path
+) -> None:
     start_lifter(input_type=mapping(tmp_path, FIGURES))
     client = connect()
     publisher = client.publisher(MarkerArray)
@@ -142,7 +147,9 @@ def test_several_people_of_any_message_with_the_detectors_names(start_lifter, co
     np.testing.assert_array_equal(xyzc, reference)
 
 
-def test_normalised_keypoints_wait_for_the_size_of_the_image(start_lifter, connect, tmp_path):
+def test_normalised_keypoints_wait_for_the_size_of_the_image(
+    start_lifter: StartLifter, connect: Connect, tmp_path: Path
+) -> None:
     start_lifter(input_type=mapping(tmp_path, POSES))
     client = connect()
     publisher = client.publisher(PoseArray)
@@ -163,7 +170,9 @@ def test_normalised_keypoints_wait_for_the_size_of_the_image(start_lifter, conne
     np.testing.assert_allclose(ratio, [640 / 480, 1], rtol=0.05)
 
 
-def test_names_without_a_detectors_follow_the_place(start_lifter, connect):
+def test_names_without_a_detectors_follow_the_place(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     start_lifter()
     client = connect()
     publisher = client.publisher(PointCloud2)
@@ -174,7 +183,7 @@ def test_names_without_a_detectors_follow_the_place(start_lifter, connect):
     assert objects.joint_names == [second, first]
 
 
-def test_bodies_on_topics_that_come_and_go(start_lifter, connect):
+def test_bodies_on_topics_that_come_and_go(start_lifter: StartLifter, connect: Connect) -> None:
     lifter = start_lifter(listens=False, input_type=POLYGON, topics=["/humans/bodies/*/skeleton2d"])
     lifter.wait_for_log("waiting for a publisher on /humans/bodies/*/skeleton2d")
     client = connect()
@@ -190,7 +199,7 @@ def test_bodies_on_topics_that_come_and_go(start_lifter, connect):
     exchange(client, publishers["cd34"], polygon(pixels(0)))
 
 
-def test_several_topics_are_told_apart(start_lifter, connect):
+def test_several_topics_are_told_apart(start_lifter: StartLifter, connect: Connect) -> None:
     start_lifter(topics=["left/keypoints", "right/keypoints"])
     client = connect()
     for side in ("left", "right"):
@@ -199,7 +208,9 @@ def test_several_topics_are_told_apart(start_lifter, connect):
         assert objects.joint_names == [f"{side}/keypoints"]
 
 
-def test_a_wildcard_passes_by_what_is_not_meant(start_lifter, connect):
+def test_a_wildcard_passes_by_what_is_not_meant(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
     # The lifter's own points are of the same type.
     start_lifter(listens=False, topics=["/*/points"]).wait_for_log("waiting for")
     client = connect()
@@ -214,13 +225,13 @@ def test_a_wildcard_passes_by_what_is_not_meant(start_lifter, connect):
     client.node.destroy_timer(sender)
 
 
-def test_names_that_are_no_topics_are_refused(start_lifter):
+def test_names_that_are_no_topics_are_refused(start_lifter: StartLifter) -> None:
     lifter = start_lifter(listens=False, topics=["no topic"])
     assert lifter.process.wait(60) == 1
     assert "cannot start: topics names 'no topic', which is no name" in lifter.log
 
 
-def test_a_lifter_that_cannot_listen_says_why(start_lifter, tmp_path):
+def test_a_lifter_that_cannot_listen_says_why(start_lifter: StartLifter, tmp_path: Path) -> None:
     for number, (input_type, reason) in enumerate(
         {
             "yolo_msgs/DetectionArray": "need the package yolo_msgs",

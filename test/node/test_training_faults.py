@@ -27,6 +27,7 @@ from deep_nrsfm_ros.node.publishing import point_cloud
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint
 from deep_nrsfm_ros.training.record import checkpoint_file, look, record_file
+from test.node.conftest import Connect, StartLifter
 
 P = 17
 KILLS, MANY_KILLS = 5, int(os.environ.get("KILLS", "50"))
@@ -101,8 +102,8 @@ def recorded(models: Path) -> bool:
 
 
 def test_kills_at_random_moments_cost_no_message_and_no_model(
-    start_lifter, connect, models, tmp_path
-):
+    start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path
+) -> None:
     (models / "broken.safetensors").unlink()
     lifter = start_lifter(
         qos_overrides=EVERY_MESSAGE,
@@ -154,8 +155,12 @@ def test_kills_at_random_moments_cost_no_message_and_no_model(
 @pytest.mark.long
 @pytest.mark.timeout(7200)
 def test_many_kills_each_gone_on_with_end_in_the_model_of_a_training_left_alone(
-    start_lifter, connect, models, tmp_path, capsys
-):
+    start_lifter: StartLifter,
+    connect: Connect,
+    models: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Half of the kills come anywhere, half of them within a second of a checkpoint."""
     (models / "broken.safetensors").unlink()
     lifter = start_lifter(
@@ -225,7 +230,9 @@ def test_many_kills_each_gone_on_with_end_in_the_model_of_a_training_left_alone(
     assert not [path.name for path in models.iterdir() if path.name.startswith(".killed.")]
 
 
-def test_a_new_lifter_finds_what_was_cut_off(start_lifter, connect, models, tmp_path):
+def test_a_new_lifter_finds_what_was_cut_off(
+    start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path
+) -> None:
     train = {"bags": [write(tmp_path / "bag")], "name": "fresh", "steps": 1000000, "seeds": 1}
     first = start_lifter(train=train)
     client = connect()
@@ -246,7 +253,9 @@ def test_a_new_lifter_finds_what_was_cut_off(start_lifter, connect, models, tmp_
 
 
 @pytest.mark.parametrize("state", ["starting", "reading", "training"])
-def test_a_training_can_be_cancelled_in_any_state(start_lifter, connect, models, tmp_path, state):
+def test_a_training_can_be_cancelled_in_any_state(
+    start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path, state: str
+) -> None:
     bag = write(tmp_path / "bag")
     start_lifter(train={"bags": [bag], "name": "fresh", "steps": 1000000, "seeds": 1})
     client = connect()
@@ -265,8 +274,8 @@ def test_a_training_can_be_cancelled_in_any_state(start_lifter, connect, models,
 
 
 def test_data_that_cannot_be_trained_on_is_refused_with_advice(
-    start_lifter, connect, models, tmp_path
-):
+    start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path
+) -> None:
     good = write(tmp_path / "bag")
     flat = write(tmp_path / "flat", flat=True)
     start_lifter(train={"name": "fresh", "steps": 5, "seeds": 1, "batch": 8})
@@ -295,8 +304,8 @@ def test_data_that_cannot_be_trained_on_is_refused_with_advice(
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 def test_a_cut_bag_is_used_as_far_as_it_goes_and_the_loss_is_told(
-    start_lifter, connect, models, tmp_path, storage
-):
+    start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path, storage: str
+) -> None:
     bag = write(tmp_path / "bag", 4000 if storage == "mcap" else 400, storage)
     (file,) = (f for f in (tmp_path / "bag").iterdir() if f.suffix != ".yaml")
     os.truncate(file, int(0.8 * file.stat().st_size))

@@ -19,6 +19,7 @@ from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from test.node.conftest import Connect, LifterProcess, StartLifter
 
 P = 17
 STAND_IN = (str(Path(__file__).with_name("lifter_with_stand_in_training.py")),)
@@ -42,11 +43,13 @@ def assert_ends(pid: int) -> None:
 
 
 @pytest.fixture
-def lifter(start_lifter):
+def lifter(start_lifter: StartLifter):
     return start_lifter(STAND_IN, input_type="std_msgs/Float32MultiArray")
 
 
-def test_a_training_from_request_to_use(lifter, connect, models):
+def test_a_training_from_request_to_use(
+    lifter: LifterProcess, connect: Connect, models: Path
+) -> None:
     client = connect()
     publisher = client.publisher(Float32MultiArray)
     assert values(client.wait_for_training("idle"))["state"] == "idle"
@@ -80,7 +83,9 @@ def test_a_training_from_request_to_use(lifter, connect, models):
     client.wait_for_health(lambda _, v: v["model"] == "joints")
 
 
-def test_a_training_that_fails_leaves_the_lifter_as_it_was(lifter, connect, models):
+def test_a_training_that_fails_leaves_the_lifter_as_it_was(
+    lifter: LifterProcess, connect: Connect, models: Path
+) -> None:
     client = connect()
     publisher = client.publisher(Float32MultiArray)
     client.set_parameters(train__bags=[str(models / "broken.safetensors")])
@@ -102,7 +107,9 @@ def test_a_training_that_fails_leaves_the_lifter_as_it_was(lifter, connect, mode
 @pytest.mark.parametrize(
     ("number", "behaviour"), [(signal.SIGINT, "wait"), (signal.SIGTERM, "deaf")]
 )
-def test_signals_end_lifter_and_training(lifter, connect, models, number, behaviour):
+def test_signals_end_lifter_and_training(
+    lifter: LifterProcess, connect: Connect, models: Path, number: signal.Signals, behaviour: str
+) -> None:
     client = connect()
     bag = str(models / "joints.safetensors")
     client.set_parameters(train__bags=[bag], train__name=behaviour)
@@ -113,7 +120,9 @@ def test_signals_end_lifter_and_training(lifter, connect, models, number, behavi
     assert_ends(training)
 
 
-def test_a_killed_lifter_leaves_no_training_behind(lifter, connect, models):
+def test_a_killed_lifter_leaves_no_training_behind(
+    lifter: LifterProcess, connect: Connect, models: Path
+) -> None:
     client = connect()
     client.set_parameters(train__bags=[str(models / "joints.safetensors")], train__name="wait")
     assert client.call("/lifter/train").success
@@ -142,8 +151,8 @@ def write_bag(path: Path, frames: int, p: int = P) -> None:
 
 
 def test_the_real_training_turns_a_bag_into_the_model_in_use(
-    start_lifter, connect, models, tmp_path
-):
+    start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path
+) -> None:
     write_bag(tmp_path / "bag", 200)
     lifter = start_lifter(
         input_type="std_msgs/Float32MultiArray",
@@ -166,8 +175,8 @@ PAW = KeypointLayout("paw", ("heel", "toe_1", "toe_2", "toe_3", "toe_4"))
 
 
 def test_an_object_that_is_no_preset_is_trained_anew_from_its_model_and_by_number(
-    start_lifter, connect, models, tmp_path
-):
+    start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path
+) -> None:
     write_bag(tmp_path / "bag", 200, len(PAW))
     network = initialise(Architecture(widths=(8, 4)), len(PAW), np.random.default_rng(0))
     paw = Model("paw", network, PAW, Normaliser(), np.eye(3, dtype=np.float32))

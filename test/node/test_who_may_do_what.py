@@ -7,7 +7,10 @@ from array import array
 from pathlib import Path
 
 import numpy as np
+import pytest
 from std_msgs.msg import Float32MultiArray
+
+from test.node.conftest import Connect, StartLifter
 
 STAND_IN = (str(Path(__file__).with_name("lifter_with_stand_in_training.py")),)
 
@@ -18,8 +21,11 @@ def keypoints() -> Float32MultiArray:
 
 
 def test_paths_outside_are_refused_and_the_lifter_goes_on(
-    start_lifter, connect, models: Path, tmp_path_factory
-):
+    start_lifter: StartLifter,
+    connect: Connect,
+    models: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     outside = tmp_path_factory.mktemp("outside")
     stolen = Path(shutil.copy(models / "joints.safetensors", outside / "joints.safetensors"))
     (outside / "door.yaml").write_text("name: door\nkeypoints: [a, b, c, d]")
@@ -54,7 +60,9 @@ def test_paths_outside_are_refused_and_the_lifter_goes_on(
     assert lifter.process.poll() is None
 
 
-def test_a_request_beyond_the_owners_limits_is_refused(start_lifter, connect, models):
+def test_a_request_beyond_the_owners_limits_is_refused(
+    start_lifter: StartLifter, connect: Connect, models: Path
+) -> None:
     train = {"bags": [str(models / "joints.safetensors")], "max_minutes": 5, "free_disk": 1e9}
     start_lifter(STAND_IN, train=train)
     client = connect()

@@ -53,7 +53,7 @@ def assert_gone(pid: int) -> None:
         os.kill(pid, 0)
 
 
-def test_progress_and_the_finished_model_are_reported():
+def test_progress_and_the_finished_model_are_reported() -> None:
     job, listener = start("finish")
     training, finished = listener.until_end()
     assert training.state == "training"
@@ -63,7 +63,7 @@ def test_progress_and_the_finished_model_are_reported():
     assert_gone(job.pid)
 
 
-def test_the_process_is_in_its_own_session_and_yields_to_others():
+def test_the_process_is_in_its_own_session_and_yields_to_others() -> None:
     job, listener = start("finish")
     values = listener.next().values
     assert values["session"] == job.pid
@@ -74,13 +74,13 @@ def test_the_process_is_in_its_own_session_and_yields_to_others():
 
 
 @pytest.mark.skipif(not AUTOGROUP.exists(), reason="this kernel does not group by session")
-def test_its_session_yields_to_others_too():
+def test_its_session_yields_to_others_too() -> None:
     job, _ = start("wait")
     assert Path(f"/proc/{job.pid}/autogroup").read_text().endswith("nice 10\n")
     job.close(DEADLINE)
 
 
-def test_cancel_keeps_what_there_is():
+def test_cancel_keeps_what_there_is() -> None:
     job, listener = start("wait")
     listener.next()
     job.cancel()
@@ -91,7 +91,7 @@ def test_cancel_keeps_what_there_is():
     assert_gone(job.pid)
 
 
-def test_a_process_deaf_to_cancel_is_killed():
+def test_a_process_deaf_to_cancel_is_killed() -> None:
     job, listener = start("deaf", grace=0.2)
     listener.next()
     job.cancel()
@@ -100,7 +100,7 @@ def test_a_process_deaf_to_cancel_is_killed():
     assert_gone(job.pid)
 
 
-def test_close_kills_a_deaf_process_in_time():
+def test_close_kills_a_deaf_process_in_time() -> None:
     job, listener = start("deaf")
     listener.next()
     job.close(0.2)
@@ -108,7 +108,7 @@ def test_close_kills_a_deaf_process_in_time():
     assert_gone(job.pid)
 
 
-def test_close_does_not_wait_for_a_process_that_cannot_die(monkeypatch):
+def test_close_does_not_wait_for_a_process_that_cannot_die(monkeypatch: pytest.MonkeyPatch) -> None:
     job, listener = start("deaf")
     listener.next()
     with monkeypatch.context() as patch:
@@ -120,7 +120,7 @@ def test_close_does_not_wait_for_a_process_that_cannot_die(monkeypatch):
     assert_gone(job.pid)
 
 
-def test_a_crash_is_reported_with_its_last_words():
+def test_a_crash_is_reported_with_its_last_words() -> None:
     _, listener = start("crash")
     end = listener.until_end()[-1]
     assert end.state == "failed"
@@ -128,7 +128,7 @@ def test_a_crash_is_reported_with_its_last_words():
     assert "the dictionary caught fire" in end.message
 
 
-def test_a_killed_process_is_reported():
+def test_a_killed_process_is_reported() -> None:
     job, listener = start("wait")
     listener.next()
     os.kill(job.pid, 9)
@@ -137,23 +137,23 @@ def test_a_killed_process_is_reported():
     assert "SIGKILL" in end.message
 
 
-def test_the_reason_of_a_refusal_is_passed_on():
+def test_the_reason_of_a_refusal_is_passed_on() -> None:
     _, listener = start("refuse")
     end = listener.until_end()[-1]
     assert (end.state, end.message) == ("failed", "topic /nowhere is not in the bag")
 
 
-def test_a_process_that_never_says_how_it_ended_has_failed():
+def test_a_process_that_never_says_how_it_ended_has_failed() -> None:
     _, listener = start("mute")
     assert listener.until_end()[-1].state == "failed"
 
 
-def test_a_command_that_does_not_exist_is_an_error_at_once():
+def test_a_command_that_does_not_exist_is_an_error_at_once() -> None:
     with pytest.raises(OSError, match="no-such-program"):
         TrainingJob([], lambda _: None, command=["/no-such-program"])
 
 
-def test_the_process_ends_when_its_owner_is_killed():
+def test_the_process_ends_when_its_owner_is_killed() -> None:
     owner = subprocess.Popen(
         [
             sys.executable,
@@ -188,7 +188,7 @@ def _alive(pid: int) -> bool:
 
 @settings(deadline=None)
 @given(st.text())
-def test_no_line_of_output_upsets_the_parser(line: str):
+def test_no_line_of_output_upsets_the_parser(line: str) -> None:
     progress = parse_progress(line)
     assert progress is None or progress.state
 
@@ -198,7 +198,7 @@ def test_no_line_of_output_upsets_the_parser(line: str):
     st.sampled_from(ENDED),
     st.dictionaries(st.text(), st.none() | st.booleans() | st.text() | st.lists(st.integers())),
 )
-def test_a_report_keeps_its_plain_values(state: str, values: dict[str, object]):
+def test_a_report_keeps_its_plain_values(state: str, values: dict[str, object]) -> None:
     progress = parse_progress(json.dumps({**values, "state": state}))
     assert progress is not None and progress.ended
     kept = {k: v for k, v in values.items() if not isinstance(v, list)}

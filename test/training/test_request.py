@@ -34,7 +34,7 @@ def request(recipe: Recipe | None = None, **options: object) -> TrainingRequest:
     )
 
 
-def test_the_training_command_understands_every_word(tmp_path):
+def test_the_training_command_understands_every_word(tmp_path: Path) -> None:
     recipe = Recipe(
         **{
             field.name: {
@@ -67,7 +67,7 @@ def test_the_training_command_understands_every_word(tmp_path):
     assert override(LayoutLossWeights(), given) == layout_loss
 
 
-def test_what_the_lifter_knows_of_the_messages_goes_along():
+def test_what_the_lifter_knows_of_the_messages_goes_along() -> None:
     wanted = dataclasses.replace(
         request(), input_type="cats.yaml", image_width=640, image_height=480
     )
@@ -76,12 +76,12 @@ def test_what_the_lifter_knows_of_the_messages_goes_along():
 
 
 @pytest.mark.parametrize("name", ["", ".", "../up", "a/b", "-x", "a b", "x" * 101])
-def test_a_name_that_is_no_plain_file_name_is_refused(tmp_path, name):
+def test_a_name_that_is_no_plain_file_name_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match=r"train\.name"):
         request(bags=(str(tmp_path),), name=name).check()
 
 
-def test_bags_must_be_named_and_exist(tmp_path):
+def test_bags_must_be_named_and_exist(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"train\.bags"):
         request().check()
     with pytest.raises(ValueError, match="nowhere"):
@@ -124,7 +124,7 @@ def save(path: Path, layout: KeypointLayout) -> Path:
     return path
 
 
-def test_layouts_and_start_are_checked_before_anything_starts(tmp_path):
+def test_layouts_and_start_are_checked_before_anything_starts(tmp_path: Path) -> None:
     wanted = request(bags=(str(tmp_path),))
     assert wanted.check() == ""
     assert (
@@ -149,7 +149,7 @@ def test_layouts_and_start_are_checked_before_anything_starts(tmp_path):
             dataclasses.replace(wanted, **changes).check()
 
 
-def test_resuming_keeps_to_what_was_asked_and_tells_what_differs(tmp_path):
+def test_resuming_keeps_to_what_was_asked_and_tells_what_differs(tmp_path: Path) -> None:
     wanted = dataclasses.replace(request(resume=True, name="mine", threads=2), output=tmp_path)
     with pytest.raises(ValueError, match=r"no unfinished training of 'mine'.*\(unfinished: none\)"):
         wanted.check()
@@ -168,7 +168,7 @@ def test_resuming_keeps_to_what_was_asked_and_tells_what_differs(tmp_path):
         dataclasses.replace(wanted, options=TrainingOptions(resume=True, name="other")).check()
 
 
-def test_a_checkpoint_without_a_record_goes_on_with_the_parameters(tmp_path):
+def test_a_checkpoint_without_a_record_goes_on_with_the_parameters(tmp_path: Path) -> None:
     (tmp_path / ".mine.checkpoint").touch()
     wanted = dataclasses.replace(request(resume=True, name="mine"), output=tmp_path)
     with pytest.raises(ValueError, match=r"train\.bags"):

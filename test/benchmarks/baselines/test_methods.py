@@ -20,7 +20,7 @@ class Seen(NamedTuple):
     points: np.ndarray  # (f, 20, 2)
 
 
-def seen(deformation, frames=150, noise=0.0, seed=0):
+def seen(deformation, frames=150, noise=0.0, seed: int = 0):
     """An object of 20 points, its codes Gaussian, each frame from a random camera."""
     rng = np.random.default_rng(seed)
     mean, modes = rng.standard_normal((20, 3)), rng.standard_normal((MODES, 20, 3))
@@ -36,12 +36,12 @@ def deforming():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_rigid_factorisation_is_exact_on_a_rigid_object(seed):
+def test_rigid_factorisation_is_exact_on_a_rigid_object(seed: int) -> None:
     shapes, points = seen(0.0, seed=seed)
     assert shape_errors(rigid(points), shapes).unscaled < 1e-6
 
 
-def test_rigid_factorisation_gives_every_frame_the_same_shape(deforming):
+def test_rigid_factorisation_gives_every_frame_the_same_shape(deforming) -> None:
     S = rigid(deforming.points)
     assert S.shape == deforming.shapes.shape
     assert np.ptp(S, axis=0).max() == 0
@@ -49,27 +49,27 @@ def test_rigid_factorisation_gives_every_frame_the_same_shape(deforming):
 
 
 @pytest.mark.parametrize("method", DEFORMING.values(), ids=DEFORMING.keys())
-def test_methods_for_deforming_objects_recover_one_that_is_of_their_rank(method, deforming):
+def test_methods_for_deforming_objects_recover_one_that_is_of_their_rank(method, deforming) -> None:
     errors = shape_errors(method(deforming.points), deforming.shapes)
     assert errors.unscaled < 0.01
     assert errors.mirrored == 0
 
 
 @pytest.mark.parametrize("method", DEFORMING.values(), ids=DEFORMING.keys())
-def test_methods_for_deforming_objects_bear_noise(method):
+def test_methods_for_deforming_objects_bear_noise(method) -> None:
     shapes, points = seen(0.3, noise=0.05)
     assert shape_errors(method(points), shapes).proper < 0.12
 
 
 @pytest.mark.parametrize("method", DEFORMING.values(), ids=DEFORMING.keys())
-def test_methods_for_deforming_objects_take_a_rank_beyond_that_of_the_images(method):
+def test_methods_for_deforming_objects_take_a_rank_beyond_that_of_the_images(method) -> None:
     shapes, points = seen(0.0, frames=30)
     errors = shape_errors(method.func(points, 20), shapes)
     assert errors.shape < 0.01
 
 
 @pytest.mark.parametrize("method", [rigid, *DEFORMING.values()], ids=["rigid", *DEFORMING])
-def test_one_object_frame_serves_all_frames(method, deforming):
+def test_one_object_frame_serves_all_frames(method, deforming) -> None:
     # One camera for each frame must explain it: the mean over frames is near the mean shape.
     mean = deforming.shapes.mean(0)
     S = method(deforming.points).mean(0)
@@ -77,13 +77,13 @@ def test_one_object_frame_serves_all_frames(method, deforming):
 
 
 @pytest.mark.parametrize("method", [rigid, *DEFORMING.values()], ids=["rigid", *DEFORMING])
-def test_the_order_of_the_frames_does_not_matter(method, deforming):
+def test_the_order_of_the_frames_does_not_matter(method, deforming) -> None:
     order = np.random.default_rng(1).permutation(len(deforming.points))
     S, shuffled = method(deforming.points), method(deforming.points[order])
     assert shape_errors(shuffled, S[order]).shape < 1e-3
 
 
-def test_batches_cover_every_frame_once_and_say_which():
+def test_batches_cover_every_frame_once_and_say_which() -> None:
     points = np.random.default_rng(0).standard_normal((2 * BATCH + 100, 4, 2))
     sizes = []
 
@@ -98,6 +98,6 @@ def test_batches_cover_every_frame_once_and_say_which():
     np.testing.assert_array_equal(S[..., :2], points[frames])
 
 
-def test_few_frames_are_one_batch():
+def test_few_frames_are_one_batch() -> None:
     S, frames = in_batches(rigid, seen(0.0, frames=10).points, np.random.default_rng(0))
     assert len(S) == len(frames) == 10

@@ -1,4 +1,7 @@
+from __future__ import annotations
+
 import csv
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,7 +39,7 @@ def turned(shapes, cameras):
 
 
 @pytest.fixture
-def data(tmp_path, shapes, cameras, turned):
+def data(tmp_path: Path, shapes, cameras, turned):
     """A folder of two sequences of the same object."""
     folder = tmp_path / "data" / "nrsfm"
     folder.mkdir(parents=True)
@@ -46,32 +49,36 @@ def data(tmp_path, shapes, cameras, turned):
     return folder.parent
 
 
-def test_error_counts_in_standard_deviations_of_the_truth(shapes):
+def test_error_counts_in_standard_deviations_of_the_truth(shapes) -> None:
     larger = 1.1 * shapes  # no rotation mends it
     expected = 0.1 * np.linalg.norm(shapes, axis=2).mean() / shapes.std(1).mean()
     assert normalised_error(larger, shapes) == pytest.approx(expected)
     assert normalised_error(10 * larger, 10 * shapes) == pytest.approx(expected)
 
 
-def test_error_forgives_one_reflection(shapes):
+def test_error_forgives_one_reflection(shapes) -> None:
     turn = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
     turn *= -np.sign(np.linalg.det(turn))
     assert normalised_error(shapes @ turn, shapes) < 1e-9
 
 
-def test_error_frame_by_frame_forgives_what_the_other_does_not(shapes, turned):
+def test_error_frame_by_frame_forgives_what_the_other_does_not(shapes, turned) -> None:
     assert normalised_error(turned, shapes) > 0.1
     assert normalised_error(turned, shapes, by_frame=True) < 1e-6
 
 
 @pytest.mark.parametrize("mirror", [1, -1])
-def test_shapes_are_taken_to_the_axes_of_their_images_up_to_depth(shapes, cameras, turned, mirror):
+def test_shapes_are_taken_to_the_axes_of_their_images_up_to_depth(
+    shapes, cameras, turned, mirror
+) -> None:
     found = in_camera_axes(shapes @ np.diag([1, 1, mirror]), shapes @ cameras)
     np.testing.assert_allclose(found[..., :2], turned[..., :2], atol=1e-6)
     np.testing.assert_allclose(found[..., 2], mirror * turned[..., 2], atol=1e-6)
 
 
-def test_command_compares_all_methods_on_each_sequence(data, tmp_path, capsys, monkeypatch):
+def test_command_compares_all_methods_on_each_sequence(
+    data, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(classic_sequences, "RANKS", (2,))
     output = tmp_path / "output"
     main(
@@ -91,7 +98,9 @@ def test_command_compares_all_methods_on_each_sequence(data, tmp_path, capsys, m
         assert float(by_method["default recipe, network alone"]["e3D"]) > 0.05
 
 
-def test_command_says_which_sequence_it_cannot_read(data, capsys):
+def test_command_says_which_sequence_it_cannot_read(
+    data, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["--data", str(data), "--subjects", "yoga"])
     assert stopped.value.code == 2

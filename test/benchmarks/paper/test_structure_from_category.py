@@ -1,4 +1,7 @@
+from __future__ import annotations
+
 import csv
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ from deep_nrsfm_ros.commands.evaluate import LIFTING
 
 
 @pytest.fixture
-def data(tmp_path):
+def data(tmp_path: Path):
     """A folder of 30 faces of 10 points."""
     rng = np.random.default_rng(0)
     faces = rng.standard_normal((10, 3)) + 0.1 * rng.standard_normal((30, 10, 3))
@@ -24,12 +27,14 @@ def data(tmp_path):
 
 
 @pytest.fixture
-def session(data, tmp_path):
+def session(data, tmp_path: Path):
     return Session(data, tmp_path / "output", (), (0,), 20, 1)
 
 
 @pytest.mark.parametrize("category", [FACES, *CATEGORIES])
-def test_each_object_is_seen_by_cameras_of_its_own(session, category, monkeypatch):
+def test_each_object_is_seen_by_cameras_of_its_own(
+    session, category, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(structure_from_category, "OBJECTS", 30)
     dataset = images(session, category)
     assert len(dataset) == 30 * CAMERAS
@@ -45,7 +50,9 @@ def test_each_object_is_seen_by_cameras_of_its_own(session, category, monkeypatc
     np.testing.assert_array_equal(dataset.points, again.points)
 
 
-def test_command_compares_all_methods_on_each_category(data, tmp_path, capsys, monkeypatch):
+def test_command_compares_all_methods_on_each_category(
+    data, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(batches, "RANKS", (3,))
     monkeypatch.setattr(structure_from_category, "OBJECTS", 30)
     output = tmp_path / "output"
@@ -66,7 +73,7 @@ def test_command_compares_all_methods_on_each_category(data, tmp_path, capsys, m
         assert 0 < float(row["shape %"]) < 100
 
 
-def test_command_lists_the_categories_there_are(data, capsys):
+def test_command_lists_the_categories_there_are(data, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["--data", str(data), "--subjects", "wardrobe"])
     assert stopped.value.code == 2
