@@ -14,7 +14,7 @@
 
 PYTHON3 ?= python3
 # Pins that exist for the oldest Python exist for the newer ones too.
-LOCK_PYTHON ?= python3.10
+LOCK_PYTHON ?= python3.11
 LOCK_TORCH ?= torch==2.13.0
 
 # In order: what an earlier one has trained, the later ones find in the output folder.
@@ -66,8 +66,8 @@ benchmark-speed: $(READY)
 
 # Editable, so that a stale copy never shadows the source; the tests install real copies elsewhere.
 $(READY): requirements.lock setup.py
-	@$(PYTHON3) -c 'import sys; (3, 10) <= sys.version_info < (3, 14) or sys.exit( \
-	    "Python 3.10 to 3.13 is needed and $(PYTHON3) is %d.%d; choose one: " \
+	@$(PYTHON3) -c 'import sys; (3, 11) <= sys.version_info < (3, 14) or sys.exit( \
+	    "Python 3.11 to 3.13 is needed and $(PYTHON3) is %d.%d; choose one: " \
 	    "make PYTHON3=python3.12" % sys.version_info[:2])'
 	$(PYTHON3) -m venv .venv
 	$(PYTHON) -m pip install --requirement requirements.lock
@@ -76,7 +76,7 @@ $(READY): requirements.lock setup.py
 
 $(EXAMPLES_READY): $(READY)
 	@$(PYTHON) -c 'import sys; sys.version_info < (3, 13) or sys.exit( \
-	    "MediaPipe 0.10.14 is made for Python 3.10 to 3.12 and .venv has %d.%d; choose one: " \
+	    "MediaPipe 0.10.14 is made for Python 3.11 to 3.12 and .venv has %d.%d; choose one: " \
 	    "rm -rf .venv; make PYTHON3=python3.12 demo-live" % sys.version_info[:2])'
 	$(PYTHON) -m pip install --constraint requirements.lock --no-build-isolation --editable '.[examples]'
 	touch $@

@@ -2,6 +2,7 @@
 
 import os
 from glob import glob
+from pathlib import Path
 
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
@@ -15,6 +16,12 @@ REQUIRED = os.environ.get(REQUIRE_KERNEL) == "1"
 
 class BuildKernel(build_ext):
     """Compiles the kernel; says how to mend it where it is required and cannot be compiled."""
+
+    def run(self) -> None:
+        """Remove in-place builds for one version alone: Python prefers them to `.abi3.so`."""
+        for path in Path(NAME, "kernel").glob("_kernel.cpython-*.so") if self.inplace else ():
+            path.unlink()
+        super().run()
 
     def build_extension(self, extension: Extension) -> None:
         """Compile and link one extension."""
@@ -35,7 +42,7 @@ setup(
     version="0.1.0",
     description="3D shape and camera from 2D keypoints, learned from 2D alone, for ROS 2",
     license="Apache-2.0",
-    python_requires=">=3.10",
+    python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={
         NAME: ["py.typed", "kernel/*.pyi", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]
@@ -56,6 +63,9 @@ setup(
             ],
             extra_link_args=["-pthread"],
             optional=not REQUIRED,
+            # The stable ABI of CPython 3.11, the first with Py_buffer: one wheel for all versions.
+            define_macros=[("Py_LIMITED_API", "0x030B0000")],
+            py_limited_api=True,
         )
     ],
     # data_files, because `pip install` ignores setup.cfg's install_scripts and `ros2 run` needs

@@ -119,6 +119,13 @@ def test_executable_runs_from_an_installation(prefix: Path, name: str, tmp_path:
     assert "usage:" in shown
 
 
+def test_the_kernel_is_built_for_the_stable_abi(installed_by_pip: Path) -> None:
+    (kernel,) = installed_by_pip.glob(f"lib/python*/site-packages/{NAME}/kernel/*.so")
+    assert kernel.name == "_kernel.abi3.so"
+    (wheel,) = installed_by_pip.glob(f"lib/python*/site-packages/{NAME}-*.dist-info/WHEEL")
+    assert "Tag: cp311-abi3-" in wheel.read_text()
+
+
 def test_ament_index_knows_the_package(prefix: Path) -> None:
     assert (prefix / "share/ament_index/resource_index/packages" / NAME).is_file()
 
