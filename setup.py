@@ -45,7 +45,10 @@ setup(
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={
-        NAME: ["py.typed", "kernel/*.pyi", "reporting/*.j2", "reporting/*.css", "reporting/*.js"]
+        NAME: [
+            *("py.typed", "kernel/*.pyi", "layouts/presets/*.yaml"),
+            *("reporting/*.j2", "reporting/*.css", "reporting/*.js"),
+        ]
     },
     cmdclass={"build_ext": BuildKernel},
     # Without a C compiler NumPy and torch compute the same, some ten and three times slower.
@@ -75,7 +78,7 @@ setup(
         (SHARE, ["package.xml"]),
         (f"{SHARE}/launch", glob("launch/*.launch.py")),
         (f"{SHARE}/config", glob("config/*.*")),
-        (f"{SHARE}/config/objects", glob("config/objects/*.yaml")),
+        (f"{SHARE}/config/layouts", glob("config/layouts/*.yaml")),
         (f"{SHARE}/config/security", glob("config/security/*.xml")),
         (f"{SHARE}/config/mappings", glob("config/mappings/*.yaml")),
         (f"{SHARE}/models", glob("models/*.safetensors") + glob("models/*.md")),
@@ -88,7 +91,7 @@ setup(
         "safetensors",  # model files: weights and metadata, never pickle
         "torch>=2.2",  # training only; the node lifts without it
         "rosbags",  # reads and writes rosbag2 without a ROS installation
-        "pyyaml",  # object files, parameter files and bag metadata
+        "pyyaml",  # layout files, parameter files and bag metadata
         "jinja2",  # reports and recordings as pages: templates that escape whatever comes from data
         "tqdm",  # progress of training, evaluation and lifting
         "ros-jazzy-rclpy",  # the node

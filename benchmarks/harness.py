@@ -19,7 +19,7 @@ from benchmarks.table import Table
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.commands.evaluate import evaluate, figures, read_split
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset

@@ -11,7 +11,7 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import centre
 
 

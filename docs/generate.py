@@ -10,7 +10,7 @@ from typing import Any
 
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.curation import Curation
-from deep_nrsfm_ros.layouts.keypoint_layout import LAYOUTS
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.pipeline import InputOptions

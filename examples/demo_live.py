@@ -21,7 +21,7 @@ from sensor_msgs.msg import PointCloud2
 from deep_nrsfm_ros.commands.demo.__main__ import LOG, evaluate, fetch_wheel, launch, say
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter, node
 from deep_nrsfm_ros.data.pose2sim import View, extract_videos, read_session
-from deep_nrsfm_ros.layouts.keypoint_layout import MEDIAPIPE33
+from deep_nrsfm_ros.layouts.presets import MEDIAPIPE33
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read
 from deep_nrsfm_ros.model_files.folders import model_folders

@@ -136,7 +136,7 @@ def test_share_has_what_the_source_has(prefix: Path) -> None:
     for folder, patterns in {
         "launch": ["*.launch.py"],
         "config": ["*.yaml", "*.rviz", "*.xml"],
-        "config/objects": ["*.yaml"],
+        "config/layouts": ["*.yaml"],
         "config/security": ["*.xml"],
         "config/mappings": ["*.yaml"],
         "models": ["*.safetensors", "*.md"],

@@ -21,7 +21,8 @@ from benchmarks.robustness.smoothing import VIDEO, Clip, filmed
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.mocap import read_trials, trials
 from deep_nrsfm_ros.data.pose2sim import JOINTS
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31, HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions, lift_all
 from deep_nrsfm_ros.lifting.perspective import lift_at_place

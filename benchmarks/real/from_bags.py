@@ -32,7 +32,7 @@ from deep_nrsfm_ros.commands.evaluate import figures as errors_in_words
 from deep_nrsfm_ros.data.bags import Frame, frames, read_bags, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.openpose import read_people
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25, CMU31, HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25, CMU31, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.perspective import lift_at_place
 from deep_nrsfm_ros.model_files.find_layout import find_layout
@@ -48,7 +48,7 @@ Floats = NDArray[Any]
 TOPIC = "/keypoints"
 VIDEO = "detections/long_video_body25.jsonl.gz"
 VIDEO_RATE, CMU_RATE = 30.0, 120.0
-EXCAVATOR = Path(__file__).parents[2] / "config/objects/excavator.yaml"
+EXCAVATOR = Path(__file__).parents[2] / "config/layouts/excavator.yaml"
 WORK, WORK_LATER = 6000, 1500
 """Frames of the machine to learn from, and of other work to lift."""
 STEPS = {"video": 30_000, "layout_loss": 6000, "tuned": 100, "machine": 8000, "mocap": 3000}
@@ -164,7 +164,7 @@ def video(session: Session) -> Table:
 
 
 def machine(session: Session) -> Table:
-    """Train on an excavator at work, described by its object file; lift other work of it."""
+    """Train on an excavator at work, described by its layout file; lift other work of it."""
     recordings = {
         "excavator_bag": excavator.record(WORK, 0),
         "excavator_later_bag": excavator.record(WORK_LATER, 1),
@@ -175,7 +175,7 @@ def machine(session: Session) -> Table:
     model = session.trained("excavator", "machine", *words)
     legend = {
         "metres": "mean distance of points, aligned by a proper rotation only: the output is in "
-        f"metres, as the object file gives a length; the machine is about {_size(recordings)}",
+        f"metres, as the layout file gives a length; the machine is about {_size(recordings)}",
         "camera known": "lifted with the camera's intrinsics, as with camera_info; the model has "
         "seen the machine without",
         "rigid": "factorisation (Tomasi-Kanade) of the same frames",

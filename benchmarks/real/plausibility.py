@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.bones import shares
 from deep_nrsfm_ros.nrsfm.geometry import centre
 

@@ -19,13 +19,9 @@ from benchmarks.scenes import LIMBS, Scene, scenes
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.pose2sim import JOINTS
-from deep_nrsfm_ros.layouts.keypoint_layout import (
-    BODY25B,
-    HUMAN17,
-    MEDIAPIPE33,
-    KeypointLayout,
-    KeypointMap,
-)
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import BODY25B, HUMAN17, MEDIAPIPE33
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import observation

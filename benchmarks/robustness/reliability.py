@@ -15,7 +15,8 @@ from benchmarks.table import Table
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.pose2sim import JOINTS, read_session
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.presets import BODY25B
 from deep_nrsfm_ros.lifting.confidence import CALIBRATED, NEAR, Calibration, evidence
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.numpy_backend import Constants, Fit, Float32

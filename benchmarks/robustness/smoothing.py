@@ -16,7 +16,8 @@ from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
 from deep_nrsfm_ros.data.openpose import largest, read_people
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, read_session
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25, BODY25B, HUMAN17, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders

@@ -14,7 +14,7 @@ from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.outliers import find_outliers
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 
 SUBJECTS = ("01", "05", "49", "127")
 SHARE = 0.05

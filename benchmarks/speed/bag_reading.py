@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks.speed.harness import arguments, by_turns, on_one_thread, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.bags import STORAGES, frames, read_bags, write_bag
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.layouts.presets import CMU31
 
 TOPIC = "/keypoints"
 BARE, OURS = "rosbags alone", "read_bags"

@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.speed.harness import arguments, show
 from benchmarks.speed.round_trip import LOSSLESS, NODES, Contender, keypoints, started
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.layouts.presets import CMU31
 
 P = len(CMU31)
 RATIO = "ratio to the relay"

@@ -22,7 +22,7 @@ from benchmarks.speed.harness import arguments, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, evaluate, figures, read_split
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.loop import finish, train

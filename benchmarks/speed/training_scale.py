@@ -18,7 +18,7 @@ from benchmarks.speed.harness import arguments, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.curation import curate
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 
 EXPONENT = "exponent"

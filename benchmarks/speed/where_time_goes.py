@@ -24,7 +24,8 @@ from benchmarks.speed.harness import arguments, fresh_domain, on_one_thread, sho
 from benchmarks.speed.round_trip import keypoints
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.client import node
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting import lifter as lifting
 from deep_nrsfm_ros.lifting.smoothing import Smoother
 from deep_nrsfm_ros.messages.serialised import Reader

@@ -15,7 +15,7 @@ import numpy as np
 
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter
 from deep_nrsfm_ros.data.bags import frames, write_bag
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training.job import ENDED
 

@@ -142,7 +142,7 @@ def check_bags() -> Finding:
     import numpy as np
 
     from deep_nrsfm_ros.data.bags import STORAGES, frames, read_bags, write_bag
-    from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+    from deep_nrsfm_ros.layouts.presets import HUMAN17
 
     points = np.random.default_rng(0).uniform(50, 600, (10, 17, 2))
     for storage in STORAGES:

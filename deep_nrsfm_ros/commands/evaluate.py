@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.commands.program import program
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import HEIGHT_18, protocol_split, read_trials, trials
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model

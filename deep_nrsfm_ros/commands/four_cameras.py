@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.pose2sim import JOINTS, Session, View
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.presets import BODY25B
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.observation import observation
 from deep_nrsfm_ros.lifting.perspective import lift_at_place

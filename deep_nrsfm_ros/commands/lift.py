@@ -17,7 +17,7 @@ from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import KINDS, read_keypoints
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
 from deep_nrsfm_ros.data.recording import Recording, lift_recording
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER, InputOptions

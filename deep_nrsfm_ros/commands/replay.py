@@ -23,7 +23,7 @@ from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.keypoint_files import KINDS, is_bag
 from deep_nrsfm_ros.data.lifted_bags import has_answers, read_answers
 from deep_nrsfm_ros.data.recording import Recording, lifted_before
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.reporting.player import (

@@ -25,7 +25,8 @@ from deep_nrsfm_ros.data.bags import most_keypoints, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.sufficiency import Variation
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
@@ -88,7 +89,7 @@ def arguments() -> argparse.ArgumentParser:
     result.add_argument(
         "--object",
         default="",
-        help="the model's layout: a preset, an object file (.yaml), a model file, or 'numbered' "
+        help="the model's layout: a preset, a layout file (.yaml), a model file, or 'numbered' "
         "for points without names (default: that of --from, or human17)",
     )
     result.add_argument("--name", default="trained", help="name of the model")

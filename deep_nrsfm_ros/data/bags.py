@@ -17,7 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.dataset import Dataset, EnsembleBuilder
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.decoding import (
     MULTI_ARRAY,

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31, HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
 METRES = 0.0254 / 0.45

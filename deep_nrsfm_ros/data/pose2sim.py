@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from deep_nrsfm_ros.data.cameras import Array, Camera, triangulate
 from deep_nrsfm_ros.data.openpose import largest, read_people
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25B, HUMAN17
 from deep_nrsfm_ros.lifting.observation import Observation
 
 RATE = 60.0

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.detections import Detections, gather
 from deep_nrsfm_ros.data.lifted_bags import Answer
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.observation import Observation

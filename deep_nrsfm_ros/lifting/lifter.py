@@ -60,7 +60,7 @@ class LiftingOptions:
         0.0,
         "length of the layout's reference pair (of people: neck to mid-hip) in the output; about "
         "0.5 makes the points of an adult metres. Layouts without one: RMS radius of the shape. "
-        "0: the length in metres that the model's object file gave, or 1 if it gave none",
+        "0: the length in metres that the model's layout file gave, or 1 if it gave none",
         low=0.0,
         high=1e6,
     )

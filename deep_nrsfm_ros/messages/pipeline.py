@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation
@@ -56,7 +57,7 @@ class InputOptions:
     image_height: int = option(0, "height of the image in pixels, likewise", low=0, high=1000000)
     keypoint_layout: str = option(
         MODEL_ORDER,
-        "order of the detector's keypoints: a preset, the path of an object file, or 'model' for "
+        "order of the detector's keypoints: a preset, the path of a layout file, or 'model' for "
         "the order of the model's own",
     )
     max_objects: int = option(

@@ -1,31 +1,43 @@
-"""Keypoint layouts by the name of a preset, an object file or a model file."""
+"""Keypoint layouts by the name of a preset, a layout file or a model file."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from deep_nrsfm_ros.layouts.keypoint_layout import LAYOUTS, KeypointLayout
-from deep_nrsfm_ros.layouts.object_file import OBJECT_SUFFIXES, read_object
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout_file import LAYOUT_SUFFIXES, LayoutFileError, read_layout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS, preset
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, load_model
 
 NUMBERED = "numbered"
-"""Stands for an object that nobody has described, where its points tell how many they are."""
+"""Stands for a layout of points without names, as many as the data has."""
 
 
-def find_layout(option: str, word: str) -> KeypointLayout:
-    """Return the layout that `word`, given by `option`, stands for.
+def find_layout(option: str, name_or_path: str) -> KeypointLayout:
+    """Return the keypoint layout that the value of an option stands for.
 
-    word: the name of a preset, the path of an object file, or that of a model file, which gives
-        the layout of its model. Raises ValueError for anything else, or for a damaged file.
+    Args:
+        option: name of the option, for error messages.
+        name_or_path: name of a preset, path of a layout file (.yaml), or path of a model file
+            (.safetensors), whose layout it is.
+
+    Raises:
+        ValueError: the value is none of these, or the file is missing or damaged.
+        LayoutFileError: a layout file is wrong, or its layout has the name of a preset.
     """
-    if word in LAYOUTS:
-        return LAYOUTS[word]
-    path = Path(word).expanduser()
-    if path.suffix in OBJECT_SUFFIXES:
-        return read_object(path)
+    if name_or_path in LAYOUTS:
+        return preset(name_or_path)
+    path = Path(name_or_path).expanduser()
+    if path.suffix in LAYOUT_SUFFIXES:
+        layout = read_layout(path)
+        if layout.name in LAYOUTS:
+            raise LayoutFileError(
+                f"layout file {path}: name {layout.name!r} is that of a preset; choose another"
+            )
+        return layout
     if path.suffix == MODEL_SUFFIX:
         return load_model(path).layout
     raise ValueError(
-        f"{option} is {word!r}; name a preset ({', '.join(LAYOUTS)}), "
-        f"an object file ({OBJECT_SUFFIXES[0]}) or a model file ({MODEL_SUFFIX})"
+        f"{option} is {name_or_path!r}; name a preset ({', '.join(LAYOUTS)}), "
+        f"a layout file ({LAYOUT_SUFFIXES[0]}) or a model file ({MODEL_SUFFIX})"
     )

@@ -1,4 +1,4 @@
-"""Where models, bags and object files are looked for."""
+"""Where models, bags and layout files are looked for."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def model_folders(models_dir: Path) -> list[Path]:
     return [models_dir, *_shared("models"), _SOURCE_TREE / "models"]
 
 
-def object_folders() -> list[Path]:
-    """Return the folders of the object files that come with the package."""
-    return [*_shared("config/objects"), _SOURCE_TREE / "config" / "objects"]
+def layout_folders() -> list[Path]:
+    """Return the folders of the layout files that come with the package."""
+    return [*_shared("config/layouts"), _SOURCE_TREE / "config" / "layouts"]
 
 
 def _ros_home() -> Path:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load, save_file
 
 from deep_nrsfm_ros.configuration import check
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, weight_shapes
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser

@@ -11,9 +11,9 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from deep_nrsfm_ros.layouts.keypoint_layout import LAYOUTS
-from deep_nrsfm_ros.layouts.object_file import OBJECT_SUFFIXES
-from deep_nrsfm_ros.model_files.folders import model_folders, object_folders
+from deep_nrsfm_ros.layouts.layout_file import LAYOUT_SUFFIXES
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.model_files.folders import layout_folders, model_folders
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, ModelFileError, find_model
 
 
@@ -36,8 +36,8 @@ class PathSandbox:
         self._owners = frozenset(named_at_start)
         _, *packaged = model_folders(models_dir)
         self._packaged_models = {Path(os.path.abspath(folder)) for folder in packaged}
-        objects = {Path(os.path.abspath(folder)) for folder in object_folders()}
-        self._packaged = self._packaged_models | objects
+        layouts = {Path(os.path.abspath(folder)) for folder in layout_folders()}
+        self._packaged = self._packaged_models | layouts
 
     def model(self, option: str, word: str) -> Path:
         """Return the file of a model, given by name or path.
@@ -68,7 +68,7 @@ class PathSandbox:
         if word in LAYOUTS or not word:
             return word
         path = _expanded(option, word)
-        if path.suffix not in (*OBJECT_SUFFIXES, MODEL_SUFFIX):
+        if path.suffix not in (*LAYOUT_SUFFIXES, MODEL_SUFFIX):
             return word
         if word in self._owners:
             return os.path.abspath(path)

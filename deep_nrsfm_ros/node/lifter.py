@@ -37,7 +37,7 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.data.curation import Curation
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER, InputOptions, Pipeline

@@ -17,7 +17,7 @@ from deep_nrsfm_ros.data.detections import gather
 from deep_nrsfm_ros.data.keypoint_files import stamp_of
 from deep_nrsfm_ros.data.lifted_bags import Answer
 from deep_nrsfm_ros.data.recording import Recording, lifted_before
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, read, read_points
 from deep_nrsfm_ros.messages.field_mapping import Size

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout, Tetrahedron
+from deep_nrsfm_ros.layouts.layout import KeypointLayout, Tetrahedron
 from deep_nrsfm_ros.nrsfm.geometry import centre
 
 Floats = NDArray[Any]

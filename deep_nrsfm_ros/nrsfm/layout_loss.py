@@ -1,6 +1,6 @@
 """What a layout knows of an object, as a loss: bones keep their lengths, the front is in front.
 
-Not of the paper, and no 3D label: edges and handedness are what an object file says in words. Views
+Not of the paper, and no 3D label: edges and handedness are what a layout file says in words. Views
 from one side only tell too little about depth: which way each limb goes, and how far what hardly
 moves, is then a matter of chance, unless this is asked for (`recipe.LayoutLossWeights`).
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 
 _FRONT_MARGIN = 0.1

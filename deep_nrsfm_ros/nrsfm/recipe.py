@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
@@ -79,7 +79,7 @@ class LayoutLossWeights:
             if asked and not getattr(layout, field):
                 raise ValueError(
                     f"{weight} is {asked:g}, but layout {layout.name!r} has no {field}; give it "
-                    "some in an object file, or ask for 0"
+                    "some in a layout file, or ask for 0"
                 )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.recording import Recording
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.reporting.drawing import edge_colours

@@ -22,7 +22,7 @@ import dataclasses
 
 import numpy as np
 
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import Array
 from deep_nrsfm_ros.nrsfm.network import Network

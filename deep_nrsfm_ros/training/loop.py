@@ -15,7 +15,7 @@ from torch import Tensor
 
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.configuration import check
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.correction import bone_lengths, error_covariance
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import Floats

@@ -9,7 +9,8 @@ from typing import Any
 
 from deep_nrsfm_ros.configuration import option, to_arguments
 from deep_nrsfm_ros.data.curation import Curation
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
@@ -37,7 +38,7 @@ class TrainingOptions:
     topic: str = option("", "topic in the bags; empty: the one that the lifter listens to")
     object: str = option(
         "",
-        "layout of the new model: a preset, the path of an object file or of a model file, or "
+        "layout of the new model: a preset, the path of a layout file or of a model file, or "
         "'numbered' for points without names; empty: that of train.from, or of the present model",
     )
     keypoint_layout: str = option(

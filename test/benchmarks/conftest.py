@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.layouts.presets import CMU31
 
 SUBJECTS = ("01", "02", "03", "05", "14", "49", "60", "61", "86", "127", "131")
 TRIALS, FRAMES = 5, 8

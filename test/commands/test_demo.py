@@ -18,7 +18,7 @@ import deep_nrsfm_ros
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL, fetch_wheel
 from deep_nrsfm_ros.commands.demo.evaluation import read_points
 from deep_nrsfm_ros.data.cameras import Camera
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser

@@ -10,7 +10,7 @@ import pytest
 
 from deep_nrsfm_ros.commands.evaluate import main
 from deep_nrsfm_ros.data.cameras import Camera
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser

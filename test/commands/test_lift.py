@@ -11,7 +11,7 @@ import pytest
 from deep_nrsfm_ros.commands.lift import arguments, main
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.keypoint_files import read_keypoints
-from deep_nrsfm_ros.layouts.keypoint_layout import COCO17
+from deep_nrsfm_ros.layouts.presets import COCO17
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 
 HEIGHTS = {

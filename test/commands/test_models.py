@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.commands import models
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser

@@ -20,7 +20,7 @@ from deep_nrsfm_ros.commands.replay import main
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.detections import Detections, stamps_at
 from deep_nrsfm_ros.data.lifted_bags import write_answers
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 

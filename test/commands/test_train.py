@@ -21,8 +21,8 @@ import deep_nrsfm_ros
 from deep_nrsfm_ros.commands import train
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import COCO17, HUMAN17
-from deep_nrsfm_ros.layouts.object_file import read_object
+from deep_nrsfm_ros.layouts.layout_file import read_layout
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
@@ -280,7 +280,7 @@ BAD: dict[str, tuple[list[str], str]] = {
         ["--bag", "BAG", "--keypoint-layout", "horse"],
         "--keypoint-layout is 'horse'; name a preset",
     ),
-    "absent object file": (["--bag", "BAG", "--object", "FOLDER/a.yaml"], "a.yaml: cannot be read"),
+    "absent layout file": (["--bag", "BAG", "--object", "FOLDER/a.yaml"], "a.yaml: cannot be read"),
     "numbered with names": (
         ["--bag", "BAG", "--object", "numbered", "--keypoint-layout", "coco17"],
         "leave out --keypoint-layout",
@@ -389,14 +389,14 @@ def write_paws(folder: Path, name: str = "paws") -> Path:
     return folder / name
 
 
-def test_an_object_file_makes_a_model_in_metres(
+def test_a_layout_file_makes_a_model_in_metres(
     tmp_path: Path, models: Path, in_process: Callable[..., int]
 ) -> None:
     (tmp_path / "paw.yaml").write_text(PAW)
     words = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"))
     assert in_process(*words, *QUICK, "--steps", "3", "--output", str(models)) == 0
     model = assert_lifts(models / "mine.safetensors")
-    assert model.layout == read_object(tmp_path / "paw.yaml")
+    assert model.layout == read_layout(tmp_path / "paw.yaml")
     points, confidence = people(4)
     shapes = Lifter(model)(points[:, :5], confidence[:, :5]).shapes
     np.testing.assert_allclose(np.linalg.norm(shapes[:, 1] - shapes[:, 4], axis=1), 0.04, rtol=1e-4)

@@ -9,13 +9,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.bags import most_keypoints, read_bags
-from deep_nrsfm_ros.layouts.keypoint_layout import (
-    COCO17,
-    HUMAN17,
-    REP155,
-    KeypointLayout,
-    KeypointMap,
-)
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17, REP155
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 
 ANIMAL = KeypointLayout("animal", ("head", "tail", "paw", "ear"))

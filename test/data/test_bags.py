@@ -19,13 +19,9 @@ from deep_nrsfm_ros.data.bags import (
     read_bags,
     write_bag,
 )
-from deep_nrsfm_ros.layouts.keypoint_layout import (
-    BODY25,
-    COCO17,
-    HUMAN17,
-    KeypointLayout,
-    KeypointMap,
-)
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN17
 from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY, POINT_CLOUD, POLYGON
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

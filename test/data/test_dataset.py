@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 
 FIVE = KeypointLayout.numbered(5)
 

@@ -13,7 +13,7 @@ import pytest
 from deep_nrsfm_ros.data.bags import Frame, write_bag
 from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
-from deep_nrsfm_ros.layouts.keypoint_layout import COCO17
+from deep_nrsfm_ros.layouts.presets import COCO17
 from deep_nrsfm_ros.lifting.observation import observation
 from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY
 

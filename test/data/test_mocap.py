@@ -20,7 +20,7 @@ from deep_nrsfm_ros.data.mocap import (
     read_trials,
     trials,
 )
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31, COCO17, HUMAN17, layout
+from deep_nrsfm_ros.layouts.presets import CMU31, COCO17, HUMAN17, preset
 from deep_nrsfm_ros.nrsfm.handedness import votes
 
 PARENT = dict(CMU31.edges)
@@ -324,5 +324,5 @@ def test_the_paper_counts_9502_frames_of_subject_127() -> None:
 @needs_data
 @pytest.mark.parametrize("name", KEYPOINTS_OF)
 def test_real_people_are_right_handed(name: str) -> None:
-    dataset = read_trials(trials(Path(str(DATA)) / "cmu", "02")[:3], layout(name))
+    dataset = read_trials(trials(Path(str(DATA)) / "cmu", "02")[:3], preset(name))
     assert ((votes(dataset.shapes, dataset.layout) > 0).mean(0) > 0.9).all()

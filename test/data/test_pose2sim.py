@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from deep_nrsfm_ros.data.cameras import Camera
 from deep_nrsfm_ros.data.pose2sim import JOINTS, read_session
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B
+from deep_nrsfm_ros.layouts.presets import BODY25B
 
 WHEEL = "pose2sim-0.6.0-py3-none-any.whl"
 LIMBS = [BODY25B.index(joint) for joint in JOINTS]

@@ -25,7 +25,8 @@ from deep_nrsfm_ros.data.lifted_bags import (
 )
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
 from deep_nrsfm_ros.data.recording import Recording, lift_recording, lifted_before
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25, HUMAN17, KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation, observation
 from deep_nrsfm_ros.model_files.model_file import Model

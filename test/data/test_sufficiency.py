@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.sufficiency import examine
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
 P = 14

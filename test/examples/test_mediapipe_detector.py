@@ -22,7 +22,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 
 from deep_nrsfm_ros.data.pose2sim import JOINTS, extract_videos, read_session
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, MEDIAPIPE33
+from deep_nrsfm_ros.layouts.presets import BODY25B, MEDIAPIPE33
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, MessageError, read
 
 SIZE = (40, 60)  # height and width

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.decoding import InputType

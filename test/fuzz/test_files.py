@@ -14,7 +14,7 @@ import numpy as np
 from deep_nrsfm_ros.data import bags
 from deep_nrsfm_ros.data.bags import BagError, frames, read_bags, write_bag
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
-from deep_nrsfm_ros.layouts.object_file import ObjectFileError, read_object
+from deep_nrsfm_ros.layouts.layout_file import LayoutFileError, read_layout
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
 from deep_nrsfm_ros.messages.mapping_file import MappingError, read_mapping
 from deep_nrsfm_ros.model_files.model_file import ModelFileError, load_model, save_model
@@ -63,8 +63,8 @@ def test_a_bag_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: Path) -> N
     fuzz("bag", one, touched=False)
 
 
-def test_an_object_file_is_read_or_refused(fuzz: Fuzz, tmp_path: Path) -> None:
-    texts = [p.read_bytes() for p in (ROOT / "config" / "objects").glob("*.yaml")]
+def test_a_layout_file_is_read_or_refused(fuzz: Fuzz, tmp_path: Path) -> None:
+    texts = [p.read_bytes() for p in (ROOT / "config" / "layouts").glob("*.yaml")]
     texts.append(b"name: t\nkeypoints: [a, b, c, d]\nedges: [[a, b]]\nreference: [a, b]\n")
     file = tmp_path / "object.yaml"
 
@@ -72,12 +72,12 @@ def test_an_object_file_is_read_or_refused(fuzz: Fuzz, tmp_path: Path) -> None:
         text = spoiler.choice(texts[-1:] * 8 + texts)
         file.write_bytes(spoiler.spoil_text(text, YAML))
         try:
-            return f"read {'with' if read_object(file).edges else 'without'} edges"
-        except ObjectFileError as refusal:
+            return f"read {'with' if read_layout(file).edges else 'without'} edges"
+        except LayoutFileError as refusal:
             assert "object.yaml" in str(refusal)
             return "refused"
 
-    fuzz("object file", one)
+    fuzz("layout file", one)
 
 
 def test_a_mapping_file_is_read_or_refused_and_what_is_read_reads_messages(

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.kernel import AVAILABLE, _kernel
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.compiled_backend import Kernel
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.numpy_backend import Fit

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors

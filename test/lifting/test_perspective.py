@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import EQUIDISTANT, Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import aim, lift_at_place

@@ -18,7 +18,8 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 from safetensors.torch import save_file as save_tensors
 
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31, HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.model_files.model_file import (
     MODEL_SUFFIX,
     Model,

@@ -94,7 +94,7 @@ def test_what_is_inside_is_found_by_name_and_by_path(sandbox: PathSandbox, place
 def test_what_comes_with_the_package_may_be_named(sandbox: PathSandbox) -> None:
     human = sandbox.model("model", "human")
     assert human.is_file() and sandbox.model("model", str(human)) == human
-    hand = human.parents[1] / "config" / "objects" / "hand.yaml"
+    hand = human.parents[1] / "config" / "layouts" / "hand.yaml"
     assert sandbox.layout("train.object", str(hand)) == str(hand)
 
 

@@ -30,7 +30,8 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 import deep_nrsfm_ros
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31, HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser

@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray, Header, MultiArrayDimension
 
-from deep_nrsfm_ros.layouts.keypoint_layout import COCO17, HUMAN17
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.messages.decoding import (
     MULTI_ARRAY,
     POINT_CLOUD,
@@ -307,7 +307,7 @@ def test_a_model_is_changed_and_changed_back_by_one_parameter(
         np.testing.assert_array_equal(unpack(client.exchange(publisher, human)), first)
 
 
-def test_the_detectors_order_may_come_from_an_object_file(
+def test_the_detectors_order_may_come_from_a_layout_file(
     start_lifter: StartLifter, connect: Connect, tmp_path: Path
 ) -> None:
     # The model's own keypoints backwards, and one that it does not know.
@@ -341,7 +341,7 @@ def test_parameters_describe_themselves(start_lifter: StartLifter, connect: Conn
         0.0,
         1.0,
     )
-    assert "object file" in layout.description
+    assert "layout file" in layout.description
     assert not model.read_only
 
 

@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2, PointField
 
 from deep_nrsfm_ros.data.recording import Recording
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
 from deep_nrsfm_ros.node.lifter_client import Watcher
 

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.tracking import Tracker
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read

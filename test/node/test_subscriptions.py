@@ -14,7 +14,7 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, POLYGON, pack_points
 from test.node.conftest import Connect, StartLifter
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 from deep_nrsfm_ros.nrsfm.handedness import disagreement, mirrored, object_frame, votes
 

@@ -12,7 +12,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31, HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.handedness import votes
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss

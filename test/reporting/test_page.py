@@ -16,7 +16,8 @@ import pytest
 from deep_nrsfm_ros.data.curation import Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.sufficiency import examine
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise

@@ -12,7 +12,8 @@ import pytest
 
 from deep_nrsfm_ros.data.detections import gather, stamps_at
 from deep_nrsfm_ros.data.recording import Recording
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.nrsfm.geometry import centre

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.reporting.player import live_page
 from deep_nrsfm_ros.reporting.serving import HOST, Broadcast, in_real_time, server
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, random_cameras, rotation_from_camera

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.kernel import _kernel
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.losses import Objective, Task
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, encode, initialise, whitening

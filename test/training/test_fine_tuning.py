@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import reprojection_error
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, forward, initialise

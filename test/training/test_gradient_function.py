@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.layouts.keypoint_layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import polar
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.losses import Frames, Objective

@@ -11,7 +11,8 @@ import pytest
 from deep_nrsfm_ros.commands.train import arguments
 from deep_nrsfm_ros.configuration import override
 from deep_nrsfm_ros.data.curation import Curation
-from deep_nrsfm_ros.layouts.keypoint_layout import COCO17, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import COCO17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser

@@ -23,7 +23,8 @@ from deep_nrsfm_ros.commands.demo.evaluation import read_points, table
 from deep_nrsfm_ros.commands.demo.picture import Panel, draw
 from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, Session, read_session
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B, KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import BODY25B
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.training.job import ENDED

@@ -9,7 +9,7 @@ from benchmarks.real import detector_joints
 from benchmarks.real.detector_joints import CAMERA, as_filmed, facing, proportions
 from benchmarks.robustness.smoothing import Clip
 from deep_nrsfm_ros.data.pose2sim import JOINTS
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 
 # Shoulders 0.8 torso lengths apart, hips 0.5; the nose 0.4 above the neck.
 TRUNK = np.array([[40, 100], [-40, 100], [25, 200], [-25, 200], [7, 60]], float)

@@ -8,7 +8,7 @@ from deep_nrsfm_ros.nrsfm.handedness import votes
 LAYOUT = find_layout("--object", str(EXCAVATOR))
 
 
-def test_it_is_the_machine_of_the_object_file() -> None:
+def test_it_is_the_machine_of_the_layout_file() -> None:
     truth = excavator.record(200, 0).truth
     assert truth.shape == (200, len(LAYOUT), 3)
     assert (votes(truth, LAYOUT) > 0).all()

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.real import from_bags
 from deep_nrsfm_ros.data.bags import read_bags
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25, HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 
 
 @pytest.fixture(autouse=True)

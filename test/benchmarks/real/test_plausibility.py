@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.real import plausibility
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras, rotation_from_camera
 
 POSE = {  # x front, y left, z up

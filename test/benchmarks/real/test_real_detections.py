@@ -18,7 +18,7 @@ from benchmarks.scenes import LIMBS, Seen
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.cameras import Camera
 from deep_nrsfm_ros.data.pose2sim import JOINTS
-from deep_nrsfm_ros.layouts.keypoint_layout import BODY25B
+from deep_nrsfm_ros.layouts.presets import BODY25B
 
 FRAMES = 12
 

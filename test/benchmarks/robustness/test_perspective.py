@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.robustness import perspective
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre
 
 

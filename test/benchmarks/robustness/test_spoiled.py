@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.robustness import spoiled
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
 

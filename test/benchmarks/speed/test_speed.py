@@ -30,7 +30,7 @@ from benchmarks.speed import (
     harness as speed,
 )
 from benchmarks.table import Table
-from deep_nrsfm_ros.layouts.keypoint_layout import CMU31
+from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import initialise
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS

@@ -1,6 +1,6 @@
-"""Object files: a keypoint layout in a few lines of YAML, for objects that have no preset.
+"""Layout files: keypoint layouts in YAML, those of the presets and those of users alike.
 
-`config/objects/` has examples that explain each field.
+`config/layouts/hand.yaml` explains each field; `layouts/presets/` has files to copy.
 """
 
 from __future__ import annotations
@@ -8,59 +8,63 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from deep_nrsfm_ros.layouts.keypoint_layout import LAYOUTS, Edge, KeypointLayout, Tetrahedron
+from deep_nrsfm_ros.layouts.layout import Edge, KeypointLayout, Tetrahedron
 from deep_nrsfm_ros.yaml_file import read_fields, words
 
-OBJECT_SUFFIXES = (".yaml", ".yml")
+LAYOUT_SUFFIXES = (".yaml", ".yml")
 FIELDS = (
     *("name", "keypoints", "edges", "rigid", "handedness"),
     *("reference", "reference_length", "derived"),
 )
 HANDEDNESS = ("left", "right", "up", "front")
-_FEWEST = 4  # W = S M has a unique shape from four points on
+_MIN_KEYPOINTS = 4  # W = S M has a unique shape from four points on
 
 
-class ObjectFileError(ValueError):
-    """An object file that is missing or says something that no layout can: names file and mend."""
+class LayoutFileError(ValueError):
+    """A layout file that is missing or wrong; the text names the file, the field and the mend."""
 
 
-def read_object(path: Path) -> KeypointLayout:
-    """Return the layout that an object file describes; raise ObjectFileError if it is none."""
+def read_layout(path: Path) -> KeypointLayout:
+    """Return the keypoint layout of a layout file.
+
+    Raises:
+        LayoutFileError: the file cannot be read, or a field of it is wrong.
+    """
     try:
         return _Description(read_fields(path, "name: hand")).layout()
-    except ObjectFileError as error:
-        raise ObjectFileError(f"object file {path}: {error}") from None
+    except LayoutFileError as error:
+        raise LayoutFileError(f"layout file {path}: {error}") from None
     except ValueError as error:
-        raise ObjectFileError(f"object file {path}: {error}") from error
+        raise LayoutFileError(f"layout file {path}: {error}") from error
 
 
 class _Description:
-    """The fields of an object file, each checked when it is asked for.
+    """The fields of a layout file, each checked when it is read.
 
-    Every complaint names the field and shows what was found there.
+    Every error names the field and shows its value.
     """
 
     def __init__(self, fields: dict[Any, Any]) -> None:
-        """Refuse fields that do not exist, and the lack of those that must."""
+        """Raise LayoutFileError for a field that does not exist or a required one that lacks."""
         unknown = [name for name in fields if name not in FIELDS]
         if unknown:
-            raise ObjectFileError(
+            raise LayoutFileError(
                 f"has no field {words(unknown[0])}; the fields are {', '.join(FIELDS)}"
             )
-        # A field without a value, as a template leaves it, is as good as none.
+        # A template leaves fields without a value; they count as absent.
         self._fields = {name: value for name, value in fields.items() if value is not None}
         for name in ("name", "keypoints"):
             if name not in self._fields:
-                raise ObjectFileError(f"lacks the field '{name}'")
+                raise LayoutFileError(f"lacks the field '{name}'")
 
     def layout(self) -> KeypointLayout:
-        """Return the layout; raise ValueError for what it cannot be."""
+        """Return the layout; raise ValueError for a wrong field."""
         name = self._text("name", self._fields["name"])
-        if name in LAYOUTS:
-            raise ObjectFileError(f"name {name!r} is that of a preset; choose another")
         keypoints = self._names("keypoints", self._fields["keypoints"])
-        if len(keypoints) < _FEWEST:
-            raise ObjectFileError(f"has {len(keypoints)} keypoints; at least {_FEWEST} are needed")
+        if len(keypoints) < _MIN_KEYPOINTS:
+            raise LayoutFileError(
+                f"has {len(keypoints)} keypoints; at least {_MIN_KEYPOINTS} are needed"
+            )
         reference = self._fields.get("reference")
         return KeypointLayout(
             name,
@@ -78,26 +82,26 @@ class _Description:
         return tuple(self._pair(f"{field}[{i}]", pair) for i, pair in enumerate(pairs))
 
     def _handedness(self) -> tuple[Tetrahedron, ...]:
-        given = self._fields.get("handedness", [])
-        if not isinstance(given, list):
-            return (self._tetrahedron("handedness", given),)
-        return tuple(self._tetrahedron(f"handedness[{i}]", four) for i, four in enumerate(given))
+        value = self._fields.get("handedness", [])
+        if not isinstance(value, list):
+            return (self._tetrahedron("handedness", value),)
+        return tuple(self._tetrahedron(f"handedness[{i}]", four) for i, four in enumerate(value))
 
     def _tetrahedron(self, where: str, value: Any) -> Tetrahedron:
-        given = self._mapping(where, value)
-        if set(given) != set(HANDEDNESS):
-            raise ObjectFileError(
-                f"{where} names {', '.join(map(words, given)) or 'nothing'}; "
+        corners = self._mapping(where, value)
+        if set(corners) != set(HANDEDNESS):
+            raise LayoutFileError(
+                f"{where} names {', '.join(map(words, corners)) or 'nothing'}; "
                 f"it must name {', '.join(HANDEDNESS)}"
             )
-        left, right, up, front = (self._text(f"{where}.{s}", given[s]) for s in HANDEDNESS)
+        left, right, up, front = (self._text(f"{where}.{c}", corners[c]) for c in HANDEDNESS)
         return left, right, up, front
 
     def _derived(self) -> dict[str, tuple[str, ...]]:
-        given = self._mapping("derived", self._fields.get("derived", {}))
+        derived = self._mapping("derived", self._fields.get("derived", {}))
         return {
             self._text("a name in derived", name): self._names(f"derived.{name}", parts)
-            for name, parts in given.items()
+            for name, parts in derived.items()
         }
 
     def _reference_length(self) -> float | None:
@@ -105,13 +109,13 @@ class _Description:
         if length is None:
             return None
         if isinstance(length, bool) or not isinstance(length, (int, float)):
-            raise ObjectFileError(f"reference_length is {words(length)}; it must be in metres")
+            raise LayoutFileError(f"reference_length is {words(length)}; it must be in metres")
         return float(length)
 
     def _pair(self, where: str, value: Any) -> Edge:
         names = self._names(where, value)
         if len(names) != 2:
-            raise ObjectFileError(f"{where} has {len(names)} names; it must have 2")
+            raise LayoutFileError(f"{where} has {len(names)} names; it must have 2")
         return names[0], names[1]
 
     def _names(self, where: str, value: Any) -> tuple[str, ...]:
@@ -120,16 +124,16 @@ class _Description:
 
     def _list(self, where: str, value: Any) -> list[Any]:
         if not isinstance(value, list):
-            raise ObjectFileError(f"{where} is {words(value)}; it must be a list")
+            raise LayoutFileError(f"{where} is {words(value)}; it must be a list")
         return value
 
     def _mapping(self, where: str, value: Any) -> dict[Any, Any]:
         if not isinstance(value, dict):
-            raise ObjectFileError(f"{where} is {words(value)}; it must be a mapping")
+            raise LayoutFileError(f"{where} is {words(value)}; it must be a mapping")
         return value
 
     def _text(self, where: str, value: Any) -> str:
         if isinstance(value, str) and value.strip():
             return value
-        # YAML reads `on`, `no` and 1 as something else than text.
-        raise ObjectFileError(f"{where} is {words(value)}; it must be a name, in quotes if need be")
+        # YAML reads `on` and `no` as booleans and 1 as a number.
+        raise LayoutFileError(f"{where} is {words(value)}; it must be a name, in quotes if need be")

@@ -1,4 +1,4 @@
-"""Object files say what a layout is; whatever else they hold is refused by name."""
+"""Layout files say what a layout is; whatever else they hold is refused by name."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.layouts.keypoint_layout import HUMAN17, KeypointLayout
-from deep_nrsfm_ros.layouts.object_file import ObjectFileError, read_object
+from deep_nrsfm_ros.layouts import presets
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout_file import LayoutFileError, read_layout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "config" / "objects").glob("*.yaml"))
+EXAMPLES = sorted((Path(__file__).parents[2] / "config" / "layouts").glob("*.yaml"))
 DOOR = """
 name: door
 keypoints: [hinge_top, hinge_bottom, handle, corner_top, corner_bottom]
@@ -42,16 +44,16 @@ def write(folder: Path, text: str | bytes, name: str = "thing.yaml") -> Path:
 
 
 def refused(path: Path) -> str:
-    with pytest.raises(ObjectFileError) as caught:
-        read_object(path)
+    with pytest.raises(LayoutFileError) as caught:
+        read_layout(path)
     message = str(caught.value)
-    assert isinstance(caught.value, ValueError) and message.startswith(f"object file {path}: ")
+    assert isinstance(caught.value, ValueError) and message.startswith(f"layout file {path}: ")
     assert len(message) < 1000 and "\n" not in message
     return message
 
 
 def test_every_field_arrives(tmp_path: Path) -> None:
-    assert read_object(write(tmp_path, DOOR)) == KeypointLayout(
+    assert read_layout(write(tmp_path, DOOR)) == KeypointLayout(
         "door",
         ("hinge_top", "hinge_bottom", "handle", "corner_top", "corner_bottom"),
         edges=(("hinge_top", "hinge_bottom"), ("corner_top", "corner_bottom")),
@@ -69,27 +71,27 @@ def test_handedness_may_be_several(tmp_path: Path) -> None:
         "  - {left: a, right: b, up: c, front: d}\n"
         "  - {front: c, up: a, right: d, left: b}\n"
     )
-    several = read_object(write(tmp_path, LEAST + text)).handedness
+    several = read_layout(write(tmp_path, LEAST + text)).handedness
     assert several == (("a", "b", "c", "d"), ("b", "d", "a", "c"))
 
 
 def test_name_and_keypoints_are_enough(tmp_path: Path) -> None:
     expected = KeypointLayout("thing", ("a", "b", "c", "d"))
-    assert read_object(write(tmp_path, LEAST)) == expected
+    assert read_layout(write(tmp_path, LEAST)) == expected
     empty = "edges:\nrigid:\nhandedness:\nreference:\nreference_length:\nderived:\n"
-    assert read_object(write(tmp_path, LEAST + empty)) == expected
+    assert read_layout(write(tmp_path, LEAST + empty)) == expected
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_the_examples_are_sound(path: Path) -> None:
-    layout = read_object(path)
+    layout = read_layout(path)
     assert layout.edges and layout.handedness and layout.reference and layout.reference_length
     joined = {name for edge in layout.edges for name in edge}
     assert joined == set(layout.keypoints)
 
 
 def test_there_are_examples() -> None:
-    names = {path.stem: read_object(path) for path in EXAMPLES}
+    names = {path.stem: read_layout(path) for path in EXAMPLES}
     assert set(names) == {"excavator", "hand"}
     # Places that MediaPipe documents.
     hand = names["hand"]
@@ -106,7 +108,6 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     "no name": ("keypoints: [a, b, c, d]", "lacks the field 'name'"),
     "no keypoints": ("name: thing", "lacks the field 'keypoints'"),
     "empty keypoints": ("name: thing\nkeypoints:", "lacks the field 'keypoints'"),
-    "name of a preset": ("name: coco17\nkeypoints: [a, b, c, d]", "'coco17' is that of a preset"),
     "name is a list": ("name: [a]\nkeypoints: [a, b, c, d]", "name is a list"),
     "keypoints are one text": (
         "name: x\nkeypoints: a b c d",
@@ -192,7 +193,7 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
     assert "not a regular file" in refused(tmp_path / "pipe.yaml")
 
 
-def test_a_layout_is_found_by_preset_object_file_and_model_file(
+def test_a_layout_is_found_by_preset_layout_file_and_model_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert find_layout("--object", "human17") is HUMAN17
@@ -208,15 +209,25 @@ def test_a_layout_is_found_by_preset_object_file_and_model_file(
 @pytest.mark.parametrize(
     ("word", "complaint"),
     [
-        ("horse", r"--object is 'horse'; name a preset \(human17.*object file \(\.yaml\)"),
+        ("horse", r"--object is 'horse'; name a preset \(human17.*layout file \(\.yaml\)"),
         ("", "--object is ''"),
-        ("absent.yaml", "object file absent.yaml: cannot be read"),
+        ("absent.yaml", "layout file absent.yaml: cannot be read"),
         ("absent.safetensors", "cannot read model absent.safetensors"),
     ],
 )
 def test_a_layout_that_is_not_there_is_refused(word: str, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         find_layout("--object", word)
+
+
+def test_a_copy_of_a_preset_needs_a_name_of_its_own(tmp_path: Path) -> None:
+    copy = write(tmp_path, Path(presets.__file__).with_name("coco17.yaml").read_bytes())
+    with pytest.raises(
+        LayoutFileError, match=f"layout file {copy}: name 'coco17' is that of a pre"
+    ):
+        find_layout("--object", str(copy))
+    copy.write_text(copy.read_text().replace("name: coco17", "name: mine"))
+    assert find_layout("--object", str(copy)).keypoints == presets.COCO17.keypoints
 
 
 def test_little_text_that_stands_for_much_is_refused(tmp_path: Path) -> None:
@@ -234,6 +245,6 @@ def test_little_text_that_stands_for_much_is_refused(tmp_path: Path) -> None:
         "name: !!python/object/apply:os.system [true]": "is not YAML",
     }.items():
         path.write_text(text)
-        with pytest.raises(ObjectFileError) as refusal:
-            read_object(path)
+        with pytest.raises(LayoutFileError) as refusal:
+            read_layout(path)
         assert complaint in str(refusal.value)

@@ -1,0 +1,74 @@
+"""Keypoints of one layout in the order of another, matched by name."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+
+_MIN_SHARED = 4  # a shape is unique from four points on
+
+
+class KeypointMap:
+    """Maps keypoints of a source layout to a target layout by name.
+
+    Attributes:
+        source: layout of the input.
+        target: layout of the output.
+        identical: True if both have the same keypoints in the same order.
+    """
+
+    def __init__(self, source: KeypointLayout, target: KeypointLayout) -> None:
+        """Match the names of the two layouts.
+
+        A keypoint of the target that the source lacks is derived, if the target says how, or
+        stays missing.
+
+        Raises:
+            ValueError: fewer than 4 keypoints match; no shape can be lifted from them.
+        """
+        self.source, self.target = source, target
+        self.identical = source.keypoints == target.keypoints
+        sources = {name: i for i, name in enumerate(source.keypoints)}
+        direct = [(t, sources[name]) for t, name in enumerate(target.keypoints) if name in sources]
+        self._to = np.array([t for t, _ in direct], int)
+        self._from = np.array([s for _, s in direct], int)
+        self._derived = [
+            (t, [sources[part] for part in target.derived[name]])
+            for t, name in enumerate(target.keypoints)
+            if name not in sources
+            and name in target.derived
+            and all(part in sources for part in target.derived[name])
+        ]
+        shared = len(direct) + len(self._derived)
+        if shared < _MIN_SHARED:
+            raise ValueError(
+                f"layouts {source.name!r} and {target.name!r} share {shared} keypoints; "
+                f"at least {_MIN_SHARED} are needed"
+            )
+
+    def __call__(
+        self, points: NDArray[np.float32], confidence: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return points and confidence in the target layout.
+
+        Args:
+            points: (n, q, 2) in the source layout.
+            confidence: (n, q) in [0, 1]; 0 marks a missing keypoint.
+
+        Returns:
+            Points (n, p, 2) and confidence (n, p). A derived keypoint is the mean of its parts,
+            with the least of their confidences. A missing keypoint is (0, 0) with confidence 0.
+        """
+        if self.identical:
+            return points, confidence
+        shape = (len(points), len(self.target))
+        mapped, mapped_confidence = np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32)
+        mapped[:, self._to] = points[:, self._from]
+        mapped_confidence[:, self._to] = confidence[:, self._from]
+        for t, parts in self._derived:
+            mapped[:, t] = points[:, parts].mean(1)
+            mapped_confidence[:, t] = confidence[:, parts].min(1)
+        mapped[mapped_confidence == 0] = 0
+        return mapped, mapped_confidence

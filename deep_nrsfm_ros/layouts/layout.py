@@ -1,0 +1,135 @@
+"""The keypoint layout: keypoints in order, edges, handedness and reference length."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+Edge = tuple[str, str]
+Tetrahedron = tuple[str, str, str, str]
+MAX_KEYPOINTS = 1000
+"""Most keypoints of a layout: time and memory of lifting grow with the square of the number."""
+
+
+@dataclass(frozen=True)
+class KeypointLayout:
+    """The contract between a detector, a model and a viewer: names of p keypoints in order.
+
+    Attributes:
+        name: name of the layout.
+        keypoints: p different names, in the order of the arrays.
+        edges: pairs of keypoints that are drawn as lines. They are bones too: training measures
+            how well each keeps its length.
+        handedness: fours (left, right, up, front) of keypoints. Seen from behind, `left` is left
+            of `right`, `up` is above them and `front` is in front of them, so their tetrahedron
+            has a positive volume. Each four is a vote on whether depth is mirrored; the first
+            also gives the object's axes. Empty: depth may come out mirrored.
+        reference: the pair of keypoints whose distance is the reference length. None: the RMS
+            radius of the shape is the reference length.
+        derived: keypoint -> keypoints whose mean it is, for sources that lack the keypoint.
+        reference_length: distance of the reference pair on the real object, in metres. The output
+            is in metres then. None: unknown.
+        rigid: pairs that keep their distance as bones do, and are not drawn.
+    """
+
+    name: str
+    keypoints: tuple[str, ...]
+    edges: tuple[Edge, ...] = ()
+    handedness: tuple[Tetrahedron, ...] = ()
+    reference: Edge | None = None
+    derived: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    reference_length: float | None = None
+    rigid: tuple[Edge, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a layout that repeats a keypoint or names one that it lacks."""
+        if len(self.keypoints) > MAX_KEYPOINTS:
+            raise ValueError(
+                f"layout {self.name!r} has {len(self.keypoints)} keypoints; at most "
+                f"{MAX_KEYPOINTS} are possible"
+            )
+        own = set(self.keypoints)
+        if len(own) != len(self.keypoints):
+            repeated = sorted({k for k in self.keypoints if self.keypoints.count(k) > 1})
+            raise ValueError(f"layout {self.name!r} names {', '.join(repeated)} more than once")
+        groups: list[tuple[str, int, tuple[str, ...]]]
+        groups = [("edge", 2, edge) for edge in self.edges]
+        groups += [("rigid pair", 2, pair) for pair in self.rigid]
+        groups += [("handedness", 4, four) for four in self.handedness]
+        groups += [("reference", 2, self.reference)] if self.reference else []
+        for kind, size, group in groups:
+            if isinstance(group, str) or len(group) != size:
+                raise ValueError(f"layout {self.name!r}: {kind} {group!r} must be {size} names")
+            if len(set(group)) != size:
+                raise ValueError(f"layout {self.name!r}: {kind} {group!r} repeats a name")
+        named = [name for _, _, group in groups for name in group]
+        for keypoint in [*named, *self.derived]:
+            if keypoint not in own:
+                raise ValueError(f"layout {self.name!r} has no keypoint {keypoint!r}")
+        for keypoint, parts in self.derived.items():
+            if isinstance(parts, str) or not parts:
+                raise ValueError(
+                    f"layout {self.name!r}: derived {keypoint!r} is a mean of no names"
+                )
+        if self.reference_length is not None:
+            self._check_reference_length(self.reference_length)
+
+    def _check_reference_length(self, length: float) -> None:
+        """Raise ValueError unless the length is positive, finite and of a reference pair."""
+        if not 0 < length < math.inf:
+            raise ValueError(f"layout {self.name!r}: reference_length is {length}, not above 0 m")
+        if not self.reference:
+            raise ValueError(
+                f"layout {self.name!r}: reference_length is of no pair; name reference"
+            )
+
+    def __len__(self) -> int:
+        """Return p, the number of keypoints."""
+        return len(self.keypoints)
+
+    def index(self, keypoint: str) -> int:
+        """Return the index of `keypoint`; raise KeyError if the layout lacks it."""
+        try:
+            return self.keypoints.index(keypoint)
+        except ValueError:
+            raise KeyError(f"layout {self.name!r} has no keypoint {keypoint!r}") from None
+
+    @property
+    def warning(self) -> str:
+        """A warning for whoever trains on this layout; "" if there is none."""
+        if self.handedness:
+            return ""
+        return (
+            f"layout {self.name!r} names no handedness: depth may come out mirrored as a whole; "
+            "a layout file can name it"
+        )
+
+    def edge_indices(self) -> list[tuple[int, int]]:
+        """Return the edges as pairs of indices."""
+        return [(self.index(a), self.index(b)) for a, b in self.edges]
+
+    def bone_indices(self) -> list[tuple[int, int]]:
+        """Return the bones, which are the edges and the rigid pairs, as pairs of indices."""
+        return [(self.index(a), self.index(b)) for a, b in (*self.edges, *self.rigid)]
+
+    def partners(self) -> list[int] | None:
+        """Return the permutation of the keypoints that exchanges left_ and right_.
+
+        Returns:
+            For each keypoint the index of its partner, which is its own index for a keypoint in
+            the middle. None if no keypoint has a partner, or if the layout has no handedness.
+        """
+        exchanged = {"left": "right", "right": "left"}
+        partners = []
+        for i, name in enumerate(self.keypoints):
+            side, _, part = name.partition("_")
+            other = f"{exchanged.get(side, '')}_{part}"
+            partners.append(self.index(other) if other in self.keypoints else i)
+        changed = partners != list(range(len(self)))
+        return partners if self.handedness and changed else None
+
+    @classmethod
+    def numbered(cls, p: int) -> KeypointLayout:
+        """Return a layout of p points named point_0, point_1, ..., for an object without names."""
+        return cls(name=f"points{p}", keypoints=tuple(f"point_{i}" for i in range(p)))

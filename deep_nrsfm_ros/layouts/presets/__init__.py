@@ -1,0 +1,63 @@
+"""The keypoint layouts that come with the package, each a layout file in this folder.
+
+A file is read when its layout is first used: `preset("coco17")`, `LAYOUTS["coco17"]` and
+`from deep_nrsfm_ros.layouts.presets import COCO17` give the same object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout_file import read_layout
+
+NAMES = ["human17", "cmu31", "coco17", "body25", "body25b", "openpose18", "rep155", "mediapipe33"]
+_FOLDER = Path(__file__).parent
+
+# Without values, so that `__getattr__` reads the file of a layout at its first use.
+HUMAN17: KeypointLayout
+CMU31: KeypointLayout
+COCO17: KeypointLayout
+BODY25: KeypointLayout
+BODY25B: KeypointLayout
+OPENPOSE18: KeypointLayout
+REP155: KeypointLayout
+MEDIAPIPE33: KeypointLayout
+
+
+@cache
+def preset(name: str) -> KeypointLayout:
+    """Return the preset called `name`; raise ValueError that lists the presets."""
+    if name not in NAMES:
+        raise ValueError(f"no keypoint layout {name!r}; presets: {', '.join(NAMES)}")
+    return read_layout(_FOLDER / f"{name}.yaml")
+
+
+class _Presets(Mapping[str, KeypointLayout]):
+    """The presets by name, each read at its first use."""
+
+    def __getitem__(self, name: str) -> KeypointLayout:
+        if name not in NAMES:
+            raise KeyError(name)
+        return preset(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in NAMES
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(NAMES)
+
+    def __len__(self) -> int:
+        return len(NAMES)
+
+
+LAYOUTS: Mapping[str, KeypointLayout] = _Presets()
+
+
+def __getattr__(name: str) -> KeypointLayout:
+    """Return the preset of a constant: HUMAN17 is that of human17."""
+    if name.lower() in NAMES and name.isupper():
+        return preset(name.lower())
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,76 @@
+"""Keypoints go from one layout to another by name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
+
+every_preset = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+
+
+def detections(source: KeypointLayout, n: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(1, 1000, (n, len(source), 2)).astype(np.float32)
+    confidence = rng.uniform(0.1, 1, points.shape[:2]).astype(np.float32)
+    return points, confidence
+
+
+@pytest.mark.parametrize("name", sorted(set(LAYOUTS) - {"cmu31"}))
+def test_maps_go_by_name(name: str) -> None:
+    source = LAYOUTS[name]
+    target = LAYOUTS["human17"]
+    points, confidence = detections(source)
+    mapped, sure = KeypointMap(source, target)(points, confidence)
+    assert mapped.shape == (5, 17, 2) and mapped.dtype == sure.dtype == np.float32
+    for t, keypoint in enumerate(target.keypoints):
+        parts = target.derived.get(keypoint, ())
+        if keypoint in source.keypoints:
+            np.testing.assert_array_equal(mapped[:, t], points[:, source.index(keypoint)])
+            np.testing.assert_array_equal(sure[:, t], confidence[:, source.index(keypoint)])
+        elif parts:  # neck and mid-hip
+            a, b = (source.index(part) for part in parts)
+            np.testing.assert_allclose(mapped[:, t], (points[:, a] + points[:, b]) / 2)
+            expected = np.minimum(confidence[:, a], confidence[:, b])
+            np.testing.assert_array_equal(sure[:, t], expected)
+        else:  # toes
+            assert not sure[:, t].any() and not mapped[:, t].any()
+
+
+def test_a_derived_point_is_missing_with_any_of_its_parts() -> None:
+    source, target = LAYOUTS["coco17"], LAYOUTS["human17"]
+    points, confidence = detections(source)
+    hidden = source.index("left_hip")
+    points[0, hidden] = confidence[0, hidden] = 0
+    mapped, sure = KeypointMap(source, target)(points, confidence)
+    at = target.index("mid_hip")
+    assert sure[0, at] == 0 and not mapped[0, at].any()
+    assert (sure[1:, at] > 0).all() and (sure[:, target.index("neck")] > 0).all()
+
+
+def test_a_derived_point_needs_its_parts_in_the_source() -> None:
+    source = KeypointLayout("headless", ("left_hip", "left_knee", "left_ankle", "nose"))
+    mapped, sure = KeypointMap(source, LAYOUTS["human17"])(*detections(source))
+    seen = {LAYOUTS["human17"].keypoints[t] for t in np.flatnonzero(sure.all(0))}
+    assert seen == set(source.keypoints)
+
+
+@every_preset
+def test_points_of_the_same_layout_pass_unchanged(layout: KeypointLayout) -> None:
+    points, confidence = detections(layout)
+    mapped, sure = KeypointMap(layout, layout)(points, confidence)
+    assert mapped is points and sure is confidence
+
+
+@pytest.mark.parametrize("shared", [0, 3, 4])
+def test_a_map_needs_four_shared_keypoints(shared: int) -> None:
+    names = (*LAYOUTS["human17"].keypoints[2 : 2 + shared], "tail", "wing", "fin", "horn")  # limbs
+    source = KeypointLayout("chimera", names)
+    if shared < 4:
+        with pytest.raises(ValueError, match=rf"'chimera'.*'human17'.*share {shared} "):
+            KeypointMap(source, LAYOUTS["human17"])
+    else:
+        assert KeypointMap(source, LAYOUTS["human17"])(*detections(source))[1].any(0).sum() == 4
