@@ -15,7 +15,7 @@ from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
-from deep_nrsfm_ros.node.parameters import name_of
+from deep_nrsfm_ros.node.parameters import parameter_name
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.request import TrainingOptions
@@ -49,7 +49,7 @@ def parameters_page() -> str:
             star = "*" if opt.read_only else ""
             allowed = ", ".join(opt.choices) or opt.allowed()
             shown = _SHOWN.get(field.name) or _default(field.default)
-            name = name_of(field, prefix)
+            name = parameter_name(field, prefix)
             rows.append(f"| `{name}`{star} | {shown} | {opt.description} | {allowed} |")
         parts += [f"## {title}", "\n".join(rows)]
     return "\n\n".join(parts) + "\n"

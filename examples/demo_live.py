@@ -23,7 +23,7 @@ from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifte
 from deep_nrsfm_ros.data.pose2sim import View, extract_videos, read_session
 from deep_nrsfm_ros.layouts.presets import MEDIAPIPE33
 from deep_nrsfm_ros.lifting.observation import Observation
-from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read_observation
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 
@@ -78,7 +78,7 @@ class Listener(Client):
         """Note when a detection came, and what it is; all points are missing where nobody is."""
         stamp = message.header.stamp
         self._heard[stamp.sec * 1_000_000_000 + stamp.nanosec] = time.perf_counter()
-        seen = read(message, POINT_CLOUD, len(MEDIAPIPE33))
+        seen = read_observation(message, POINT_CLOUD, len(MEDIAPIPE33))
         q = len(MEDIAPIPE33)
         nobody = Observation(np.zeros((1, q, 2), np.float32), np.zeros((1, q), np.float32))
         self._seen.append(seen if len(seen.points) else nobody)

@@ -25,7 +25,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions, lift_all
-from deep_nrsfm_ros.lifting.perspective import lift_at_place
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
@@ -113,7 +113,7 @@ def errors(lifter: Lifter, seen: Seen, *, intrinsics: bool) -> dict[str, float]:
     limbs = [HUMAN17.index(joint) for joint in JOINTS]
 
     def placed(points: Floats, confidence: Floats) -> Lifted:
-        return lift_at_place(lifter, CAMERA, points, confidence)
+        return lift_perspective(lifter, CAMERA, points, confidence)
 
     shapes = lift_all(placed if intrinsics else lifter, seen.points, seen.confidence).shapes
     found = np.isfinite(shapes).all((1, 2))

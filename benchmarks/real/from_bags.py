@@ -34,7 +34,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.openpose import read_people
 from deep_nrsfm_ros.layouts.presets import BODY25, CMU31, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
-from deep_nrsfm_ros.lifting.perspective import lift_at_place
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, find_model, load_model
@@ -290,7 +290,7 @@ def _at_place(model: Model, points: Floats, confidence: Floats) -> Floats:
     """Return the shapes (f, p, 3), centred, that a lifter with camera_info makes of points."""
     lifter = Lifter(model)
     parts = np.array_split(np.arange(len(points)), max(1, len(points) // _AT_ONCE))
-    found = [lift_at_place(lifter, excavator.CAMERA, points[i], confidence[i]) for i in parts]
+    found = [lift_perspective(lifter, excavator.CAMERA, points[i], confidence[i]) for i in parts]
     return centre(np.concatenate([one.shapes for one in found]))
 
 

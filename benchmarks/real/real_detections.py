@@ -24,8 +24,8 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25B, HUMAN17, MEDIAPIPE33
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
-from deep_nrsfm_ros.lifting.observation import observation
-from deep_nrsfm_ros.lifting.perspective import lift_at_place
+from deep_nrsfm_ros.lifting.observation import to_observation
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
@@ -151,13 +151,13 @@ def lift(
     """
     values = np.concatenate([points, confidence[..., None]], -1)
     layout = lifter.model.layout
-    found = observation(values, InputOptions().min_confidence)
+    found = to_observation(values, InputOptions().min_confidence)
     mapped = zip(*KeypointMap(detector, layout)(found.points, found.confidence), strict=True)
     shapes, seconds = [], []
     for one in mapped:
         begin = time.perf_counter()
         frame = one[0][None], one[1][None]
-        lifted = lift_at_place(lifter, intrinsics, *frame) if intrinsics else lifter(*frame)
+        lifted = lift_perspective(lifter, intrinsics, *frame) if intrinsics else lifter(*frame)
         shapes.append(lifted.shapes[0])
         seconds.append(time.perf_counter() - begin)
     places = [layout.index(joint) for joint in JOINTS]

@@ -15,7 +15,7 @@ from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
-from deep_nrsfm_ros.lifting.perspective import lift_at_place
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
@@ -97,7 +97,10 @@ def found(model: Model, scene: Scene, intrinsics: Intrinsics | None) -> dict[str
     else:
         parts = np.array_split(np.arange(len(certain)), len(certain) // 64 + 1)
         shapes = np.concatenate(
-            [lift_at_place(lifter, intrinsics, scene.pixels[i], certain[i]).shapes for i in parts]
+            [
+                lift_perspective(lifter, intrinsics, scene.pixels[i], certain[i]).shapes
+                for i in parts
+            ]
         )
         apart = np.linalg.norm(shapes.mean(1) - scene.shapes.mean(1), axis=1)
         places = {"place mm": 1000 * float(apart.mean())}

@@ -17,9 +17,14 @@ from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.pose2sim import JOINTS, read_session
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25B
-from deep_nrsfm_ros.lifting.confidence import CALIBRATED, NEAR, Calibration, evidence
+from deep_nrsfm_ros.lifting.confidence import (
+    CALIBRATED,
+    CORRECT_DISTANCE,
+    Calibration,
+    log_odds_terms,
+)
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
-from deep_nrsfm_ros.lifting.numpy_backend import Constants, Fit, Float32
+from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
@@ -46,8 +51,8 @@ LEGEND = {
     "real detections of pose2sim, where `make demo` has fetched them",
     "points %": "share of the points whose confidence is in the bin",
     "confidence %": "their mean confidence",
-    "near %": f"how many are in truth within {NEAR:.0%} of the object's size, 2 RMS radii, of "
-    "where they should be, in the camera's axes after the best scale",
+    "near %": f"how many are in truth within {CORRECT_DISTANCE:.0%} of the object's size, 2 RMS "
+    "radii, of where they should be, in the camera's axes after the best scale",
     "error %": "their mean distance from there, in the object's size",
     "off %": "over the bins, how far confidence and truth are apart on average",
     "rank points, objects": "Spearman correlation of confidence and error, of single points, and "
@@ -65,23 +70,23 @@ class Rated(NamedTuple):
 
     confidence: Floats  # (n, k)
     error: Floats  # (n, k) in sizes of the object
-    evidence: Floats  # (n, k, 5) what the log odds are a sum of, in the order of `Calibration`
+    log_odds_terms: Floats  # (n, k, 5) of which the log odds are a sum, ordered as `Calibration`
 
 
-class Witness(Fit):
-    """Keeps the evidence (n, p, 5) of what it has lifted, a part for each call."""
+class Witness(NumpyBackend):
+    """Keeps the terms of the log odds (n, p, 5) of what it has lifted, a part for each call."""
 
-    def __init__(self, known: Constants) -> None:
+    def __init__(self, known: LifterConstants) -> None:
         """Take what a lifter knows."""
         super().__init__(known)
         self.kept: list[Floats] = []
 
-    def sure(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
+    def keypoint_confidence(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
         """Return the confidence, and keep what it comes from."""
         visible = confidence > 0
-        known = evidence(visible, residual, self.spread(S))
+        known = log_odds_terms(visible, residual, self.spread(S))
         self.kept.append(np.concatenate([known, ~visible[..., None]], 2))
-        return super().sure(confidence, residual, S)
+        return super().keypoint_confidence(confidence, residual, S)
 
 
 class Observed(Lifter):
@@ -90,10 +95,10 @@ class Observed(Lifter):
     def __init__(self, model: Model) -> None:
         """Take the model."""
         super().__init__(model)
-        self.fit = self.witness = Witness(self.constants)
+        self.backend = self.witness = Witness(self.constants)
 
     def take(self) -> Floats:
-        """Return the evidence that was kept since the last time."""
+        """Return the terms that were kept since the last call."""
         kept, self.witness.kept = np.concatenate(self.witness.kept), []
         return kept
 
@@ -183,8 +188,8 @@ def fit(parts: Sequence[Rated]) -> Calibration:
 
     Takes points that were surely seen or surely missing: of confidence 1 or 0.
     """
-    X = np.concatenate([part.evidence.reshape(-1, 5) for part in parts]).astype(float)
-    y = np.concatenate([part.error.ravel() < NEAR for part in parts])
+    X = np.concatenate([part.log_odds_terms.reshape(-1, 5) for part in parts]).astype(float)
+    y = np.concatenate([part.error.ravel() < CORRECT_DISTANCE for part in parts])
     w, ridge = np.zeros(5), 1e-6 * len(X)
     for _ in range(_STEPS):
         chance = 1 / (1 + np.exp(-X @ w))
@@ -195,7 +200,7 @@ def fit(parts: Sequence[Rated]) -> Calibration:
 
 def reliability(confidence: Floats, error: Floats) -> Iterable[tuple[str, dict[str, float]]]:
     """Return the `FIGURES` of each bin of confidence (n, k), then over all."""
-    hit, share = error < NEAR, np.clip((confidence * BINS).astype(int), 0, BINS - 1)
+    hit, share = error < CORRECT_DISTANCE, np.clip((confidence * BINS).astype(int), 0, BINS - 1)
     off = 0.0
     for i in range(BINS):
         inside = share == i
@@ -227,7 +232,7 @@ def draw(table: Table, figure: Figure) -> None:
         for axes, name in ((left, "near %"), (right, "error %")):
             axes.plot(x, [figures[name] for figures in rows], "o-", label=" on ".join(labels))
     left.plot([0, 100], [0, 100], color="0.7", linestyle="--", zorder=0)
-    left.set(xlabel="confidence %", ylabel=f"within {NEAR:.0%} of the object's size, %")
+    left.set(xlabel="confidence %", ylabel=f"within {CORRECT_DISTANCE:.0%} of the object's size, %")
     right.set(xlabel="confidence %", ylabel="mean error, % of the object's size", ylim=(0, None))
     right.set_xlim(left.get_xlim())
     left.legend(fontsize="small")

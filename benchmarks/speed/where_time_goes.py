@@ -28,12 +28,12 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting import lifter as lifting
 from deep_nrsfm_ros.lifting.smoothing import Smoother
-from deep_nrsfm_ros.messages.serialised import Reader
+from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.node import lifter, publishing
 
 OBJECTS = (1, 5, 20)
 STEPS: dict[str, tuple[tuple[Any, str], ...]] = {
-    "read": ((Reader, "__call__"),),
+    "read": ((MessageReader, "__call__"),),
     "map": ((KeypointMap, "__call__"),),
     "lift": ((lifting.Lifter, "__call__"),),
     "steady (off)": ((Smoother, "__call__"),),

@@ -162,13 +162,13 @@ def check_dds(name: str, models_dir: Path, seconds: float) -> Finding:
 
     from deep_nrsfm_ros.model_files.folders import model_folders
     from deep_nrsfm_ros.model_files.model_file import find_model, load_model
-    from deep_nrsfm_ros.node.self_test import LoopbackError, ask_a_lifter
+    from deep_nrsfm_ros.node.self_test import SelfTestError, time_to_first_points
 
     path = find_model(name, model_folders(models_dir))
     points = np.random.default_rng(0).uniform(50, 600, (len(load_model(path).layout), 2))
     try:
-        took = ask_a_lifter(str(path), points, seconds)
-    except LoopbackError as error:
+        took = time_to_first_points(str(path), points, seconds)
+    except SelfTestError as error:
         mend = (
             "let the firewall pass UDP 7400-7500 and multicast on this machine, or set "
             "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; on a busy machine raise --timeout"

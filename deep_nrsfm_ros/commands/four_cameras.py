@@ -12,8 +12,8 @@ from deep_nrsfm_ros.data.pose2sim import JOINTS, Session, View
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25B
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
-from deep_nrsfm_ros.lifting.observation import observation
-from deep_nrsfm_ros.lifting.perspective import lift_at_place
+from deep_nrsfm_ros.lifting.observation import to_observation
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
@@ -54,12 +54,12 @@ def figures(model: Model, view: View, session: Session, *, intrinsics: bool) -> 
     intrinsics: whether the lifter is told them.
     """
     values = np.concatenate((view.points, view.confidence[..., None]), -1)
-    seen = observation(values, InputOptions().min_confidence)
+    seen = to_observation(values, InputOptions().min_confidence)
     points, confidence = KeypointMap(BODY25B, model.layout)(seen.points, seen.confidence)
     length = reference_length(session)
     lifter = Lifter(model, LiftingOptions(reference_length=length))
     if intrinsics:
-        lifted = lift_at_place(lifter, view.camera.intrinsics, points, confidence)
+        lifted = lift_perspective(lifter, view.camera.intrinsics, points, confidence)
     else:
         lifted = lifter(points, confidence)
     shapes = lifted.shapes[:, [model.layout.index(joint) for joint in JOINTS]]

@@ -115,7 +115,7 @@ def watch(given: argparse.Namespace, model: Model, source: KeypointLayout) -> No
         import rclpy  # only here: files need no ROS
         from rclpy.executors import ExternalShutdownException
 
-        from deep_nrsfm_ros.node.lifter_client import Watcher
+        from deep_nrsfm_ros.node.lifter_client import LifterClient
     except ImportError as error:
         raise ValueError(f"no ROS here ({error}); name a BAG to look at") from None
     inputs, stage = override(InputOptions(), given), Stage()
@@ -129,7 +129,7 @@ def watch(given: argparse.Namespace, model: Model, source: KeypointLayout) -> No
         try:
             topic = given.topic or "/keypoints"
             names = (given.lifter, topic, source, model.layout)
-            rclpy.spin(Watcher(*names, inputs.min_confidence, inputs.image_size, show))
+            rclpy.spin(LifterClient(*names, inputs.min_confidence, inputs.image_size, show))
         except ExternalShutdownException:
             raise KeyboardInterrupt from None
         finally:

@@ -17,7 +17,7 @@ _IDL = "=" * 80 + "\nIDL: "  # how a definition in the words of .idl begins
 
 
 class KeypointTopic(NamedTuple):
-    """A topic with keypoints, how `messages.read` reads it, and what makes messages of bytes."""
+    """A topic with keypoints, how `read_observation` reads it, and what makes messages of bytes."""
 
     topic: Topic
     input_type: InputType

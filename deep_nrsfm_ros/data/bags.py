@@ -27,12 +27,12 @@ from deep_nrsfm_ros.messages.decoding import (
     POINT_STEP,
     POLYGON,
     count_keypoints,
-    may_leave_out,
+    may_omit_keypoints,
     pack_points,
-    read,
+    read_observation,
 )
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping, Size
-from deep_nrsfm_ros.messages.serialised import Reader
+from deep_nrsfm_ros.messages.serialised import MessageReader
 
 STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
 Progress = Callable[[int, int], None]
@@ -87,11 +87,11 @@ def read_bags(
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
             for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
-                done, reader = messages, Reader(kind, decode)
+                done, reader = messages, MessageReader(kind, decode)
                 for raw in bag.messages(chosen):
                     messages += 1
                     try:
-                        if make := reader.known(raw, len(source)):
+                        if make := reader.find_format(raw, len(source)):
                             frames.take(make, raw)
                         else:
                             frames.add(reader(raw, len(source), min_confidence, size)[1])
@@ -128,13 +128,15 @@ def most_keypoints(paths: Sequence[Path], topic: str, mapping: FieldMapping | No
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
             for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
-                partial |= may_leave_out(kind)
+                partial |= may_omit_keypoints(kind)
                 for raw in islice(bag.messages(chosen), _SAMPLE):
                     try:
                         message = decode(raw)
                         count = count_keypoints(message, kind)
                         if count:
-                            read(message, kind, count, size=(1, 1))  # a damaged one says anything
+                            read_observation(
+                                message, kind, count, size=(1, 1)
+                            )  # a damaged one says anything
                             counts[count] += 1
                     except Exception as error:  # as in read_bags
                         reason = reason or _text(error)

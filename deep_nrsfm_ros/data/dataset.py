@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
-from deep_nrsfm_ros.messages.serialised import SerialisedMake
+from deep_nrsfm_ros.messages.serialised import SerialisedFormat
 
 _BLOCK = 4096  # objects mapped and stored together
 _RUN = 2**20  # bytes of messages of one make that are read together
@@ -85,14 +85,14 @@ class EnsembleBuilder:
         """Start empty; a keypoint of a message that is taken needs `min_confidence`."""
         self._map, self._min_confidence = keypoint_map, min_confidence
         self.count = 0
-        self._make: SerialisedMake | None = None
+        self._make: SerialisedFormat | None = None
         self._run: list[bytes] = []  # messages of that make, not yet read
         self._waiting: list[Observation] = []  # not yet mapped
         self._objects = 0  # in those
         self._points: list[NDArray[np.float32]] = []
         self._visible: list[NDArray[np.bool_]] = []
 
-    def take(self, make: SerialisedMake, raw: bytes) -> None:
+    def take(self, make: SerialisedFormat, raw: bytes) -> None:
         """Append the objects of a message of a known make, to be read with others of it."""
         if make is not self._make or len(self._run) * len(raw) > _RUN:
             self._read()

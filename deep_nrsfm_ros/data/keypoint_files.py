@@ -19,9 +19,9 @@ from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.bags import Progress
 from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.data.openpose import read_people
-from deep_nrsfm_ros.lifting.observation import Observation, observation
+from deep_nrsfm_ros.lifting.observation import Observation, to_observation
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping, Size
-from deep_nrsfm_ros.messages.serialised import Reader, header_of
+from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 
 KINDS = (
     "a bag (folder, .db3 or .mcap), an .npz with `points`, COCO keypoints (.json), a folder of "
@@ -113,7 +113,7 @@ def read_bag(
     seen, stamps, reason, camera, count = [], [], "", "", 0
     with closing(open_bag(path)) as bag:
         for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
-            reader = Reader(kind, decode)
+            reader = MessageReader(kind, decode)
             for record in bag.records(chosen):
                 count += 1
                 try:
@@ -137,7 +137,7 @@ def read_bag(
 
 def stamp_of(message: Any) -> int:
     """Return the stamp of a message's header in ns, 0 if it has none."""
-    header = header_of(message)
+    header = read_header(message)
     return header.stamp if header else 0
 
 
@@ -199,7 +199,7 @@ def _people(
 ) -> Observation:
     """Return the observation of annotations of one image."""
     values = np.reshape([row["keypoints"] for row in rows], (len(rows), keypoints, 3))
-    return observation(values.astype(np.float64), min_confidence)
+    return to_observation(values.astype(np.float64), min_confidence)
 
 
 def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Detections:
@@ -240,7 +240,7 @@ def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Dete
     identities = arrays.get("identities", _places(frame)).astype(str)
     if identities.shape != (m,):
         raise KeypointFileError(f"`identities` is {identities.shape}; ({m},) is needed")
-    seen = observation(points, min_confidence)
+    seen = to_observation(points, min_confidence)
     order = np.argsort(frame, kind="stable")
     return Detections(
         seen.points[order], seen.confidence[order], frame[order], identities[order], stamps

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.lifting.observation import Observation, observation
+from deep_nrsfm_ros.lifting.observation import Observation, to_observation
 
 
 def read_people(text: str | bytes, keypoints: int, min_confidence: float = 0.0) -> Observation:
@@ -26,7 +26,7 @@ def read_people(text: str | bytes, keypoints: int, min_confidence: float = 0.0) 
     for row in rows:
         if row.shape != (3 * keypoints,):
             raise ValueError(f"a person has {row.size / 3:g} keypoints; expected {keypoints}")
-    return observation(np.reshape(rows, (len(rows), keypoints, 3)), min_confidence)
+    return to_observation(np.reshape(rows, (len(rows), keypoints, 3)), min_confidence)
 
 
 def largest(people: Observation) -> int | None:

@@ -16,7 +16,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.observation import Observation
-from deep_nrsfm_ros.lifting.perspective import lift_at_place
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.nrsfm.geometry import centre, weak_perspective
 
 _TOGETHER = 50_000_000  # ns within which an answer and keypoints are of one frame
@@ -55,7 +55,7 @@ def lift_recording(
     """
     target = lifter.model.layout
     points, confidence = KeypointMap(source, target)(seen.points, seen.confidence)
-    lift = partial(lift_at_place, lifter, intrinsics) if intrinsics else lifter
+    lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter
     return Recording(source, target, seen, lift_all(lift, points, confidence, on_progress))
 
 

@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.kernel import _kernel
-from deep_nrsfm_ros.lifting.confidence import CALIBRATED, LEAST_RESIDUAL
-from deep_nrsfm_ros.lifting.correction import UNKNOWN
-from deep_nrsfm_ros.lifting.numpy_backend import NEAREST, RESIDUAL_SPREAD, Constants
+from deep_nrsfm_ros.lifting.confidence import CALIBRATED, RESIDUAL_OFFSET
+from deep_nrsfm_ros.lifting.correction import UNKNOWN_VARIANCE
+from deep_nrsfm_ros.lifting.numpy_backend import MIN_RELATIVE_DEPTH, RESIDUAL_SCALE, LifterConstants
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.network import filling
 
 
-class Kernel:
+class CompiledBackend:
     """A lifter's constants, laid out for the kernel."""
 
-    def __init__(self, constants: Constants) -> None:
+    def __init__(self, constants: LifterConstants) -> None:
         """Take the constants, of a network that the kernel `supports`."""
         net, p = constants.network, constants.network.p
         options = net.architecture
@@ -55,8 +55,12 @@ class Kernel:
         floats += [rows]
         doubles = [filling(net), constants.test_time_rotations, constants.frame]
         doubles += [CALIBRATED, np.stack(bones[1:], 1), constants.noise, constants.length]
-        doubles += [UNKNOWN * np.trace(covariance) / (3 * p), NEAREST, RESIDUAL_SPREAD]
-        doubles += [LEAST_RESIDUAL]
+        doubles += [
+            UNKNOWN_VARIANCE * np.trace(covariance) / (3 * p),
+            MIN_RELATIVE_DEPTH,
+            RESIDUAL_SCALE,
+        ]
+        doubles += [RESIDUAL_OFFSET]
         self._plan = _kernel.plan(
             np.array(header, np.int32), _joined(floats, np.float32), _joined(doubles, np.float64)
         )

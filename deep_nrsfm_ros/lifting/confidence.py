@@ -1,7 +1,8 @@
 """Confidence: the chance that a lifted point is near its true place.
 
-Near is within `NEAR` of the object's size, twice its RMS radius (1.1 m of an adult), after the best
-scale, in the camera's axes: it covers shape and rotation. The odds of a point that is seen are
+Near is within `CORRECT_DISTANCE` of the object's size, twice its RMS radius (1.1 m of an
+adult), after the best scale, in the camera's axes: it covers shape and rotation. The odds of a
+point that is seen are
 
     odds = exp(constant) spread^a residual^b share^c
 
@@ -20,9 +21,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[Any]
 
-NEAR = 0.1
+CORRECT_DISTANCE = 0.1
 """Distance, in sizes of the object, within which a point is near its true place."""
-LEAST_RESIDUAL = 0.02  # what a residual is never better than
+RESIDUAL_OFFSET = 0.02  # what a residual is never better than
 
 
 class Calibration(NamedTuple):
@@ -39,7 +40,7 @@ CALIBRATED = Calibration(-6.47, -2.29, -1.49, 1.29, -0.27)
 """Fitted to people whom no model saw: `python -m benchmarks.robustness.reliability --data DATA`."""
 
 
-def evidence(visible: NDArray[np.bool_], residual: Floats, spread: Floats) -> Floats:
+def log_odds_terms(visible: NDArray[np.bool_], residual: Floats, spread: Floats) -> Floats:
     """Return what the log odds of a seen point are a sum of, (n, p, 4), by `Calibration`.
 
     visible: (n, p). residual: (n,). spread: (n, p).
@@ -47,20 +48,22 @@ def evidence(visible: NDArray[np.bool_], residual: Floats, spread: Floats) -> Fl
     n, p = visible.shape
     values = np.ones((n, p, 4), np.float32)
     values[..., 1] = np.log(spread)
-    values[..., 2] = np.log(residual + LEAST_RESIDUAL)[:, None]
+    values[..., 2] = np.log(residual + RESIDUAL_OFFSET)[:, None]
     values[..., 3] = np.log(np.maximum(visible.sum(1), 1) / p)[:, None]
     return values
 
 
-def near(
+def keypoint_confidence(
     confidence: Floats, residual: Floats, spread: Floats, by: Calibration = CALIBRATED
 ) -> NDArray[np.float32]:
     """Return the chance (n, p) that each point is near its true place.
 
-    confidence: (n, p) of the detector, 0 = missing. The rest as in `evidence`.
+    confidence: (n, p) of the detector, 0 = missing. The rest as in `log_odds_terms`.
     """
     sure = np.minimum(confidence, np.float32(1))
-    seen = np.exp(-(evidence(confidence > 0, residual, spread) @ np.array(by[:4], np.float32)))
+    seen = np.exp(
+        -(log_odds_terms(confidence > 0, residual, spread) @ np.array(by[:4], np.float32))
+    )
     chance: NDArray[np.float32] = sure / (1 + seen)
     chance += (1 - sure) / (1 + seen * np.float32(np.exp(-by.missing)))
     return chance

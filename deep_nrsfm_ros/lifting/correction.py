@@ -33,7 +33,7 @@ _BLOCK = 64  # frames at a time: more do not fit the cache, and take five times 
 _LEAST_SHARE = 0.3  # of the deviation of a length, that is the object's own in any case
 _LEAST_SPREAD = 0.01  # of a length: no bone is known better
 _SHORTEST = 1e-6  # share of all lengths, where two keypoints are one
-UNKNOWN = 1e4  # variance of what is not known at all, relative to that of the errors
+UNKNOWN_VARIANCE = 1e4  # variance of what is not known at all, relative to that of the errors
 
 
 def correct(
@@ -64,7 +64,7 @@ def correct(
     H: Floats = np.zeros((n, p, 2, p, 3))
     H[:, range(p), :, range(p)] = np.broadcast_to(M, (n, p, 3, 2)).transpose(1, 0, 3, 2)
     H = H.reshape(n, 2 * p, 3 * p)
-    unknown = UNKNOWN * np.trace(covariance) / (3 * p)
+    unknown = UNKNOWN_VARIANCE * np.trace(covariance) / (3 * p)
     least = 1e-12 * unknown  # not quite zero: there is an answer even where M is no camera
     spread = np.where(visible, np.square(noise)[:, None] + least, unknown)  # (n, p)
     R: Floats = np.zeros((n, p, 2, p, 2))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.batched import blocks
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.kernel import supports
-from deep_nrsfm_ros.lifting.compiled_backend import Kernel
-from deep_nrsfm_ros.lifting.numpy_backend import Constants, Fit, Float32
+from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
+from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.model_files.model_file import Model
 
 _BLOCK = 64  # objects lifted together by `lift_all`
@@ -94,7 +94,11 @@ class Lifter:
         self.model = model
         self.options = options or LiftingOptions()
         self.constants = _constants(model, self.options)
-        self.fit = Kernel(self.constants) if supports(model.network) else Fit(self.constants)
+        self.backend = (
+            CompiledBackend(self.constants)
+            if supports(model.network)
+            else NumpyBackend(self.constants)
+        )
 
     def __call__(
         self, points: Float32, confidence: Float32, *, perspective: bool = False
@@ -111,12 +115,12 @@ class Lifter:
                 f"points are {points.shape} and confidence {confidence.shape}; "
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
-        arrays, lost = self.fit(points, confidence, perspective)
+        arrays, lost = self.backend(points, confidence, perspective)
         lifted = Lifted(*arrays)
-        return blank(lifted, lost) if lost.any() else lifted
+        return mark_not_lifted(lifted, lost) if lost.any() else lifted
 
 
-def _constants(model: Model, options: LiftingOptions) -> Constants:
+def _constants(model: Model, options: LiftingOptions) -> LifterConstants:
     p = len(model.layout)
     angles = 2 * np.pi * np.arange(options.test_time_rotations) / options.test_time_rotations
     c, s = np.cos(angles), np.sin(angles)
@@ -127,7 +131,7 @@ def _constants(model: Model, options: LiftingOptions) -> Constants:
     elif options.correction == "back_projection":
         covariance = np.eye(3 * p)
     pair = model.layout.reference
-    return Constants(
+    return LifterConstants(
         model.network,
         model.normaliser,
         model.object_frame,
@@ -161,7 +165,7 @@ def lift_all(
     return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def blank(lifted: Lifted, where: NDArray[np.bool_]) -> Lifted:
+def mark_not_lifted(lifted: Lifted, where: NDArray[np.bool_]) -> Lifted:
     """Return `lifted` with the chosen objects NaN and their confidence 0."""
     for array in lifted:
         array[where] = np.nan

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.lifting.confidence import near
+from deep_nrsfm_ros.lifting.confidence import keypoint_confidence
 from deep_nrsfm_ros.lifting.correction import correct
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.geometry import (
@@ -29,11 +29,13 @@ Float32 = NDArray[np.float32]
 
 # The mirror image of an object, whose y axis points to its left, and of an image.
 _ACROSS = np.array([1, -1, 1], np.float32)
-NEAREST = np.float32(0.1)  # depth of a point, relative to its object's, that is not undercut
-RESIDUAL_SPREAD = 0.02  # squared residual by which a turn loses all but 1/e of its weight
+MIN_RELATIVE_DEPTH = np.float32(
+    0.1
+)  # depth of a point, relative to its object's, that is not undercut
+RESIDUAL_SCALE = 0.02  # squared residual by which a turn loses all but 1/e of its weight
 
 
-class Constants(NamedTuple):
+class LifterConstants(NamedTuple):
     """What a lifter knows before it sees any keypoints."""
 
     network: Network
@@ -51,10 +53,10 @@ class Constants(NamedTuple):
     min_visible: int
 
 
-class Fit:
+class NumpyBackend:
     """Lifts by what it knows."""
 
-    def __init__(self, known: Constants) -> None:
+    def __init__(self, known: LifterConstants) -> None:
         """Take the constants."""
         self.known = known
         self._partners = None if known.partners is None else np.array(known.partners)
@@ -75,21 +77,21 @@ class Fit:
                 S, _, _, unit, origin = fitted
                 seen = unit * S[..., :2] + origin
                 if perspective:
-                    seen /= np.maximum(1 + unit * S[..., 2:], NEAREST)
+                    seen /= np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
                 filled = np.where(visible[..., None], points, seen)
                 fitted = self._fit(filled, whole, visible, perspective)
         S, R, residual, _, _ = fitted
         S = centre(S)
-        sure = self.sure(confidence, residual, S)
+        sure = self.keypoint_confidence(confidence, residual, S)
         S *= self.known.length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
         lost = on_one_line(points, visible)
         lost |= visible.sum(1) < self.known.min_visible
         return (S, R, scale, translation, residual, sure), lost
 
-    def sure(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
+    def keypoint_confidence(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
         """Return the confidence (n, p) of shapes S (n, p, 3) in the network's unit, centred."""
-        return near(confidence, residual, self.spread(S))
+        return keypoint_confidence(confidence, residual, self.spread(S))
 
     def spread(self, S: Float32) -> Float32:
         """Return the standard deviation (n, p) of the model's errors, relative to the RMS radius.
@@ -144,9 +146,13 @@ class Fit:
             M[half:] *= _ACROSS[:, None] * _ACROSS[1:]
         M = M @ turns[:, None]
         S = S @ rotation_from_camera(M).swapaxes(-1, -2)
-        P = S[..., :2] if unit is None else S[..., :2] / np.maximum(1 + unit * S[..., 2:], NEAREST)
+        P = (
+            S[..., :2]
+            if unit is None
+            else S[..., :2] / np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
+        )
         residual = reprojection_error(W, P, visible)
-        trust = np.exp((residual.min(0) ** 2 - residual**2) / RESIDUAL_SPREAD)
+        trust = np.exp((residual.min(0) ** 2 - residual**2) / RESIDUAL_SCALE)
         trust /= trust.sum(0)
         M = (trust[..., None, None] * M).sum(0)
         return (

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 # No image is this large, and sums of squares stay far below the largest float32.
-FARTHEST = 1e9
+MAX_COORDINATE = 1e9
 _CERTAIN, _MISSING = np.float32(1), np.float32(0)
-LEAST = np.nextafter(np.float32(0), np.float32(1))
+MIN_POSITIVE = np.nextafter(np.float32(0), np.float32(1))
 
 Identities = tuple[str | None, ...]
 
@@ -33,7 +33,7 @@ class Observation(NamedTuple):
     identities: Identities = ()
 
 
-def observation(
+def to_observation(
     values: NDArray[np.floating], min_confidence: float = 0.0, identities: Identities = ()
 ) -> Observation:
     """Return values (n, q, 2: x, y or 3: x, y, confidence) with missing keypoints marked.
@@ -45,10 +45,10 @@ def observation(
             values = values.astype(np.float32)
     planes = values.transpose(2, 0, 1)
     # NaN compares false, so the first test drops it together with infinity.
-    seen = np.logical_and.reduce(np.abs(planes) < FARTHEST)
+    seen = np.logical_and.reduce(np.abs(planes) < MAX_COORDINATE)
     seen &= np.logical_or(planes[0], planes[1])
     if len(planes) == 3:
-        seen &= planes[2] >= max(np.float32(min_confidence), LEAST)
+        seen &= planes[2] >= max(np.float32(min_confidence), MIN_POSITIVE)
         confidence = np.where(seen, np.minimum(planes[2], _CERTAIN), _MISSING)
     else:
         confidence = np.where(seen, _CERTAIN, _MISSING)

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, blank
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, mark_not_lifted
 from deep_nrsfm_ros.lifting.numpy_backend import Float32
 from deep_nrsfm_ros.nrsfm.geometry import Floats, weak_perspective
 
 _NEAREST = 0.1  # cosine of the widest angle between a point and its object's ray
 
 
-class Aimed(NamedTuple):
+class VirtualViews(NamedTuple):
     """What virtual cameras see that are turned towards one of n objects each."""
 
     points: Float32  # (n, p, 2) on the plane z = 1 of its camera; 0 where missing
@@ -30,7 +30,7 @@ class Aimed(NamedTuple):
     turns: NDArray[np.float64]  # (n, 3, 3) from the camera to the virtual one: p_v = turn p
 
 
-def aim(intrinsics: Intrinsics, points: Float32, confidence: Float32) -> Aimed:
+def virtual_views(intrinsics: Intrinsics, points: Float32, confidence: Float32) -> VirtualViews:
     """Turn a camera towards the centroid of the visible points of each object.
 
     points: (n, p, 2) pixels. confidence: (n, p), 0 = missing.
@@ -45,11 +45,13 @@ def aim(intrinsics: Intrinsics, points: Float32, confidence: Float32) -> Aimed:
     depth = seen[..., 2:]
     visible &= depth[..., 0] > _NEAREST
     mask = visible[..., None]
-    aimed = np.where(mask, seen[..., :2], 0) / np.where(mask, depth, 1)
-    return Aimed(aimed.astype(np.float32), np.where(visible, confidence, np.float32(0)), turns)
+    views = np.where(mask, seen[..., :2], 0) / np.where(mask, depth, 1)
+    return VirtualViews(
+        views.astype(np.float32), np.where(visible, confidence, np.float32(0)), turns
+    )
 
 
-def lift_at_place(
+def lift_perspective(
     lifter: Lifter, intrinsics: Intrinsics, points: Float32, confidence: Float32
 ) -> Lifted:
     """Lift keypoints (n, p, 2) in pixels as `Lifter` does, with the shapes at their place.
@@ -58,12 +60,12 @@ def lift_at_place(
     W = scale S[..., :2] + translation holds as well as weak perspective can. Objects that come
     out behind the camera are NaN.
     """
-    aimed = aim(intrinsics, points, confidence)
-    lifted = lifter(aimed.points, aimed.confidence, perspective=True)
-    visible = aimed.confidence > 0
-    place = locate(lifted.shapes, aimed.points, visible)
+    views = virtual_views(intrinsics, points, confidence)
+    lifted = lifter(views.points, views.confidence, perspective=True)
+    visible = views.confidence > 0
+    place = solve_translation(lifted.shapes, views.points, visible)
     lost = ~(place[:, 2] > 0)
-    back = aimed.turns.astype(np.float32)
+    back = views.turns.astype(np.float32)
     S = ((lifted.shapes + place[:, None]) @ back).astype(np.float32)
     scale, translation = weak_perspective(points, S[..., :2], visible)
     placed = lifted._replace(
@@ -72,10 +74,10 @@ def lift_at_place(
         scale=scale,
         translation=translation,
     )
-    return blank(placed, lost) if lost.any() else placed
+    return mark_not_lifted(placed, lost) if lost.any() else placed
 
 
-def locate(S: Floats, rays: Floats, visible: NDArray[np.bool_]) -> Floats:
+def solve_translation(S: Floats, rays: Floats, visible: NDArray[np.bool_]) -> Floats:
     """Return the places t (n, 3) from which S + t is seen along the rays best.
 
     Least squares, over the visible points, of x + t_x - u (z + t_z) and the same of y. S: (n, p, 3)

@@ -20,8 +20,8 @@ from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector, rotation_vector
 
 Floats = NDArray[Any]
 
-MEMORY = 1.0
-"""Seconds after which an object that was not lifted begins anew, if `bridge` is not longer."""
+MAX_AGE = 1.0
+"""Seconds after which an object that was not lifted begins anew, if `max_gap` is not longer."""
 _SPEED_CUTOFF = 1.0  # Hz, of the speed; the paper's
 
 
@@ -47,7 +47,7 @@ class SmoothingOptions:
         low=0.0,
         high=1000.0,
     )
-    bridge: float = option(
+    max_gap: float = option(
         0.3,
         "seconds for which an object that cannot be lifted, or is not in the message, is answered "
         "by what it was last, with a confidence that falls to 0",
@@ -121,15 +121,15 @@ def _parts(lifted: Lifted) -> tuple[Floats, Floats, Floats]:
 class Smoother:
     """Filters of all objects that are there, each known by its identity.
 
-    An object that is lifted again after more than `MEMORY` and `bridge` begins anew. What comes
+    An object that is lifted again after more than `MAX_AGE` and `max_gap` begins anew. What comes
     of an object late, or with the stamp of what came before, is answered as it was lifted and
-    changes nothing; a clock that goes back by more than `MEMORY` forgets everything.
+    changes nothing; a clock that goes back by more than `MAX_AGE` forgets everything.
     """
 
     def __init__(self, options: SmoothingOptions) -> None:
         """Know nobody."""
         self._options = options
-        self._memory = max(MEMORY, options.bridge)
+        self._memory = max(MAX_AGE, options.max_gap)
         self._tracks: dict[str, _Track] = {}
         self._now = -np.inf
 
@@ -143,7 +143,7 @@ class Smoother:
         """
         if not self._options.enabled:
             return lifted, identities
-        if time < self._now - MEMORY:
+        if time < self._now - MAX_AGE:
             self._tracks.clear()
             self._now = -np.inf
         self._now = max(time, self._now)
@@ -179,8 +179,8 @@ class Smoother:
         return track.lifted
 
     def _left(self, identity: str, time: float) -> float:
-        """Return the share of `bridge` that is left of an object, 0 of one that is not known."""
-        track, bridge = self._tracks.get(identity), self._options.bridge
-        if track is None or not bridge or time < track.time:
+        """Return the share of `max_gap` that is left of an object, 0 of one that is not known."""
+        track, max_gap = self._tracks.get(identity), self._options.max_gap
+        if track is None or not max_gap or time < track.time:
             return 0.0
-        return max(0.0, 1 - (time - track.time) / bridge)
+        return max(0.0, 1 - (time - track.time) / max_gap)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.lifting.observation import Observation
 
-MEMORY = 1.0
+MAX_AGE = 1.0
 """Seconds after which an object that is not seen is forgotten."""
 
 _FARTHEST = 1.5  # moves from one message to the next, in sizes of the object
@@ -35,7 +35,7 @@ class Tracker:
     RMS).
     """
 
-    def __init__(self, topic: str = "", memory: float = MEMORY) -> None:
+    def __init__(self, topic: str = "", memory: float = MAX_AGE) -> None:
         """Forget objects that were not seen for `memory` seconds.
 
         topic: tells this topic from others: the identity of an object that comes alone and without

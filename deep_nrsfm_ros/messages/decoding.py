@@ -19,11 +19,11 @@ from deep_nrsfm_ros.lifting.observation import (
     MessageError,
     Observation,
     check_keypoints,
-    observation,
+    to_observation,
 )
 from deep_nrsfm_ros.messages.field_mapping import MAPPINGS, FieldMapping, Size
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES, read_mapping
-from deep_nrsfm_ros.messages.point_cloud import make_of
+from deep_nrsfm_ros.messages.point_cloud import point_cloud_format
 
 POINT_CLOUD = "sensor_msgs/PointCloud2"
 MULTI_ARRAY = "std_msgs/Float32MultiArray"
@@ -38,7 +38,7 @@ InputType = str | FieldMapping
 """One of `INPUT_TYPES`, or the mapping of any other."""
 
 
-def find_input(option: str, word: str) -> InputType:
+def resolve_input_type(option: str, word: str) -> InputType:
     """Return the input type that `word`, given by `option`, stands for.
 
     word: one of `INPUT_TYPES`, or the path of a field mapping. Raises ValueError for anything else,
@@ -55,12 +55,12 @@ def find_input(option: str, word: str) -> InputType:
     )
 
 
-def name_of(input_type: InputType) -> str:
+def type_name(input_type: InputType) -> str:
     """Return the type of the messages, "package/Type"."""
     return input_type if isinstance(input_type, str) else input_type.type
 
 
-def read(
+def read_observation(
     message: Any,
     input_type: InputType,
     keypoints: int,
@@ -79,13 +79,13 @@ def read(
     try:
         if mapping:
             values, identities = mapping(message, keypoints, size)
-            return observation(values, min_confidence, identities)
+            return to_observation(values, min_confidence, identities)
         if isinstance(input_type, str) and (reader := _READERS.get(input_type)):
-            return observation(reader(message, keypoints), min_confidence)
+            return to_observation(reader(message, keypoints), min_confidence)
     except MessageError:
         raise
     except (AttributeError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise MessageError(f"expected a message of type {name_of(input_type)}: {error}") from None
+        raise MessageError(f"expected a message of type {type_name(input_type)}: {error}") from None
     raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
 
 
@@ -115,7 +115,7 @@ def count_keypoints(message: Any, input_type: InputType) -> int:
     )
 
 
-def may_leave_out(input_type: InputType) -> bool:
+def may_omit_keypoints(input_type: InputType) -> bool:
     """Tell whether messages leave out keypoints, so that none need tell how many there are."""
     mapping = _mapping(input_type)
     return bool(mapping and mapping.keypoint_id and not mapping.names)
@@ -156,7 +156,7 @@ def read_points(message: Any) -> NDArray[np.float32]:
 
 def _point_cloud(message: Any, keypoints: int) -> NDArray[np.floating]:
     """Return (n, q, 2 or 3) of a PointCloud2: fields x, y and, where there is one, confidence."""
-    return make_of(message, keypoints).values(memoryview(message.data).cast("B"))
+    return point_cloud_format(message, keypoints).values(memoryview(message.data).cast("B"))
 
 
 def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:

@@ -19,13 +19,13 @@ class DroppedMessages:
         self._missed = 0
         self._publishers: frozenset[bytes] = frozenset()
 
-    def came(self, number: int | None) -> None:
+    def received(self, number: int | None) -> None:
         """Note the number of a message that came; None where the middleware tells none."""
         if number is not None and self._last is not None:
             self._missed += max(number - self._last - 1, 0)
         self._last = number
 
-    def missed(self, publishers: Iterable[bytes]) -> int:
+    def take_count(self, publishers: Iterable[bytes]) -> int:
         """Return how many messages have not come since the last call, as far as can be told.
 
         publishers: identities of those that are there now.

@@ -12,11 +12,11 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation
-from deep_nrsfm_ros.lifting.perspective import lift_at_place
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, POINT_CLOUD
 from deep_nrsfm_ros.messages.field_mapping import Size
-from deep_nrsfm_ros.messages.serialised import Header, Reader
+from deep_nrsfm_ros.messages.serialised import Header, MessageReader
 from deep_nrsfm_ros.model_files.folders import default_bags_dir, default_models_dir
 from deep_nrsfm_ros.model_files.model_file import Model
 
@@ -103,8 +103,8 @@ class Pipeline:
         self._steadying = steadying
         self._steady: dict[str, Smoother] = {}
 
-    def observe(
-        self, raw: bytes, reader: Reader, size: Size | None = None
+    def read(
+        self, raw: bytes, reader: MessageReader, size: Size | None = None
     ) -> tuple[Header | None, Observation]:
         """Return the header of a serialised message, None if its type has none, and its objects.
 
@@ -142,7 +142,7 @@ class Pipeline:
         """
         points, confidence = seen.points, seen.confidence
         if intrinsics:
-            lifted = lift_at_place(self._lifter, intrinsics, points, confidence)
+            lifted = lift_perspective(self._lifter, intrinsics, points, confidence)
         else:
             lifted = self._lifter(points, confidence)
         steady = self._steady.get(topic)

@@ -13,7 +13,7 @@ from deep_nrsfm_ros.lifting.observation import MessageError, check_keypoints
 _FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField datatypes FLOAT32 and FLOAT64
 
 
-class CloudMake(NamedTuple):
+class PointCloudFormat(NamedTuple):
     """All of a PointCloud2 that tells how to read its data; most messages of a topic share it.
 
     height, width: objects and keypoints. formats, offsets: of x, y and, where there is one,
@@ -29,7 +29,7 @@ class CloudMake(NamedTuple):
     point_step: int
 
     @property
-    def plain(self) -> bool:
+    def is_float32(self) -> bool:
         """Tell whether all numbers are little-endian float32."""
         return set(self.formats) == {"<f4"}
 
@@ -51,7 +51,7 @@ class CloudMake(NamedTuple):
         return values.reshape(together).transpose(1, 2, 0)
 
 
-def make_of(message: Any, keypoints: int) -> CloudMake:
+def point_cloud_format(message: Any, keypoints: int) -> PointCloudFormat:
     """Return what a PointCloud2 says of its data, once that is found to hold `keypoints` points.
 
     Raises MessageError where it does not.
@@ -63,7 +63,7 @@ def make_of(message: Any, keypoints: int) -> CloudMake:
     order = ">" if message.is_bigendian else "<"
     formats = tuple(order + form for form in formats)
     row_step = int(message.row_step) if height > 1 else width * step
-    make = CloudMake(height, width, formats, offsets, row_step, step)
+    make = PointCloudFormat(height, width, formats, offsets, row_step, step)
     if not height:
         return make
     if row_step < width * step:

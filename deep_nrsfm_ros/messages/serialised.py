@@ -14,10 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from deep_nrsfm_ros import kernel
-from deep_nrsfm_ros.lifting.observation import FARTHEST, LEAST, Observation, observation
-from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, InputType, read
+from deep_nrsfm_ros.lifting.observation import (
+    MAX_COORDINATE,
+    MIN_POSITIVE,
+    Observation,
+    to_observation,
+)
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, InputType, read_observation
 from deep_nrsfm_ros.messages.field_mapping import Size
-from deep_nrsfm_ros.messages.point_cloud import CloudMake, make_of
+from deep_nrsfm_ros.messages.point_cloud import PointCloudFormat, point_cloud_format
 
 _LITTLE_ENDIAN = b"\x00\x01"  # how plain CDR of that order begins
 _STAMP = struct.Struct("<iI")
@@ -44,7 +49,7 @@ class Header(NamedTuple):
         _STAMP.pack_into(raw, _STAMP_AT, self.sec, self.nanosec)
 
 
-class SerialisedMake(NamedTuple):
+class SerialisedFormat(NamedTuple):
     """What serialised PointCloud2 of one make have in common: all but stamp, data and padding.
 
     length: of the message in bytes. start, end: of its data. mask: whose bits are set where a byte
@@ -59,9 +64,9 @@ class SerialisedMake(NamedTuple):
     head: int
     is_dense: int
     frame_id: str
-    cloud: CloudMake
+    cloud: PointCloudFormat
 
-    def fits(self, raw: bytes) -> bool:
+    def matches(self, raw: bytes) -> bool:
         """Tell whether a message is of this make."""
         return (
             len(raw) == self.length
@@ -77,10 +82,10 @@ class SerialisedMake(NamedTuple):
     def observation(self, raws: Sequence[bytes], min_confidence: float) -> Observation:
         """Return the objects of messages of this make, one after the other."""
         data = b"".join(raws)
-        if kernel.AVAILABLE and self.cloud.plain:
+        if kernel.AVAILABLE and self.cloud.is_float32:
             return self._compiled(data, len(raws), min_confidence)
         values = self.cloud.values(data, self.start, len(raws), self.length)
-        return observation(values, min_confidence)
+        return to_observation(values, min_confidence)
 
     def _compiled(self, data: bytes, messages: int, min_confidence: float) -> Observation:
         # Fifteen calls of NumPy cost three times as much, and more yet after a pause.
@@ -93,53 +98,53 @@ class SerialisedMake(NamedTuple):
             (cloud.height, cloud.width),
             (cloud.row_step, cloud.point_step),
             (x, y, *(sure or (-1,))),
-            FARTHEST,
-            max(np.float32(min_confidence), LEAST),
+            MAX_COORDINATE,
+            max(np.float32(min_confidence), MIN_POSITIVE),
             points,
             confidence,
         )
         return Observation(points, confidence)
 
 
-class Reader:
+class MessageReader:
     """Reads the serialised messages of one topic, and remembers the makes that it has met.
 
-    What it returns and raises is what decoding and `messages.read` would, to the last bit.
+    What it returns and raises is what decoding and `read_observation` would, to the last bit.
     """
 
     def __init__(self, input_type: InputType, decode: Callable[[bytes], Any]) -> None:
         """Read messages of `input_type`; `decode` makes them of bytes, or raises."""
         self.input_type, self._decode = input_type, decode
-        self._makes: list[SerialisedMake] = []  # the last that came is the first
+        self._makes: list[SerialisedFormat] = []  # the last that came is the first
 
     def __call__(
         self, raw: bytes, keypoints: int, min_confidence: float = 0.0, size: Size | None = None
     ) -> tuple[Header | None, Observation]:
         """Return the header of a message, None if its type has none, and what it shows.
 
-        The other arguments, and what is raised, are those of `messages.read`; and whatever
+        The other arguments, and what is raised, are those of `read_observation`; and whatever
         `decode` raises.
         """
-        make = self.known(raw, keypoints)
+        make = self.find_format(raw, keypoints)
         if make:
             return make.header(raw), make.observation((raw,), min_confidence)
         message = self._decode(raw)
-        seen = read(message, self.input_type, keypoints, min_confidence, size)
-        header = header_of(message)
+        seen = read_observation(message, self.input_type, keypoints, min_confidence, size)
+        header = read_header(message)
         if self.input_type == POINT_CLOUD and header:
-            self._remember(raw, message, header, make_of(message, keypoints))
+            self._remember(raw, message, header, point_cloud_format(message, keypoints))
         return header, seen
 
-    def known(self, raw: bytes, keypoints: int) -> SerialisedMake | None:
+    def find_format(self, raw: bytes, keypoints: int) -> SerialisedFormat | None:
         """Return the make of a message, None unless it was met and has so many keypoints."""
         for i, make in enumerate(self._makes):
-            if make.fits(raw):
+            if make.matches(raw):
                 if i:
                     self._makes.insert(0, self._makes.pop(i))
                 return make if make.cloud.width == keypoints else None
         return None
 
-    def _remember(self, raw: bytes, message: Any, header: Header, cloud: CloudMake) -> None:
+    def _remember(self, raw: bytes, message: Any, header: Header, cloud: PointCloudFormat) -> None:
         """Remember the make of a message that was read, unless its bytes are not plain."""
         mask, data = _mask(raw), memoryview(message.data).cast("B")
         if mask is None:
@@ -149,12 +154,12 @@ class Reader:
         if end < len(raw) and raw[start:end] == data:
             head = _number(raw[:start]) & bits
             frame_id = header.frame_id
-            make = SerialisedMake(len(raw), start, end, bits, head, raw[end], frame_id, cloud)
+            make = SerialisedFormat(len(raw), start, end, bits, head, raw[end], frame_id, cloud)
             self._makes.insert(0, make)
             del self._makes[_MOST_MAKES:]
 
 
-def header_of(message: Any) -> Header | None:
+def read_header(message: Any) -> Header | None:
     """Return the header of a decoded message, None if it has none."""
     try:
         header = message.header

@@ -44,7 +44,7 @@ class CameraOptions:
     )
 
 
-class CameraListener:
+class CameraInfoSubscription:
     """What is known of the camera from the last CameraInfo.
 
     frame: its frame_id. size: width and height of the image, None if they are unknown.

@@ -46,11 +46,11 @@ from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameters, publishing
-from deep_nrsfm_ros.node.camera import CameraListener, CameraOptions
+from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
 from deep_nrsfm_ros.node.diagnostics import Health
-from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, Listener, Source
+from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.training_service import TrainingService
-from deep_nrsfm_ros.node.transforms import Broadcaster
+from deep_nrsfm_ros.node.transforms import TransformBroadcaster
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.request import (
@@ -94,8 +94,8 @@ class LifterNode(Node):
         )
         self._pipeline = self._proposed = self._prepare(())
 
-        self._camera = CameraListener(self, camera)
-        self._tf = Broadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
+        self._camera = CameraInfoSubscription(self, camera)
+        self._tf = TransformBroadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._health = Health()
         self._points = self._unwatched(PointCloud2, "~/points")
         self._rotation = self._unwatched(QuaternionStamped, "~/camera_rotation")
@@ -116,21 +116,23 @@ class LifterNode(Node):
             f"keypoints in the order of {self._pipeline.source.name!r}"
         )
         health = self._health
-        self._listener = Listener(self, self._inputs, self._lift, health.unheard, health.missed)
+        self._listener = KeypointSubscriptions(
+            self, self._inputs, self._lift, health.unheard, health.missed
+        )
 
     def _unwatched(self, kind: type, topic: str) -> Publisher:
-        return self.create_publisher(kind, topic, 10, event_callbacks=publishing.UNWATCHED)
+        return self.create_publisher(kind, topic, 10, event_callbacks=publishing.NO_EVENT_CALLBACKS)
 
     def close(self) -> None:
         """End a training that runs."""
         self._training.close(_END_OF_TRAINING)
 
-    def _lift(self, source: Source, raw: bytes) -> None:
+    def _lift(self, source: KeypointTopic, raw: bytes) -> None:
         """Lift one serialised message and publish the result: the hot path."""
         started = time.perf_counter()
         try:
             intrinsics = self._camera.known()
-            header, seen = self._pipeline.observe(raw, source.reader, self._camera.size)
+            header, seen = self._pipeline.read(raw, source.reader, self._camera.size)
             told = self._objects.get_subscription_count()
             wanted = told or self._tf or self._pipeline.steadies
             identities = source.tracker(seen, started) if wanted else ("",) * len(seen.confidence)
@@ -147,20 +149,22 @@ class LifterNode(Node):
         if not identities:
             self._health.saw_nothing()
             return
-        placed = self._camera.wanted
+        positioned = self._camera.wanted
         self._points.publish(publishing.point_cloud(header, lifted))
         if not math.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
         if told:
-            self._objects.publish(publishing.objects(header, lifted, identities, placed=placed))
+            self._objects.publish(
+                publishing.objects(header, lifted, identities, positioned=positioned)
+            )
         if self._tf:
             self._tf.send(header, lifted, identities)
         if self._markers.get_subscription_count():
             edges = self._pipeline.edges
-            self._markers.publish(publishing.markers(header, lifted, edges, placed=placed))
+            self._markers.publish(publishing.markers(header, lifted, edges, positioned=positioned))
         self._health.lifted(time.perf_counter() - started, lifted.residual, lifted.confidence)
 
-    def _reject(self, source: Source, problem: Exception) -> None:
+    def _reject(self, source: KeypointTopic, problem: Exception) -> None:
         """Count a message that could not be lifted; say why, but not too often."""
         reason = _words(problem)
         self._health.rejected(reason)

@@ -19,7 +19,7 @@ from deep_nrsfm_ros.data.lifted_bags import Answer
 from deep_nrsfm_ros.data.recording import Recording, lifted_before
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
-from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, read, read_points
+from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, read_observation, read_points
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.node.message_types import message_class
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD
@@ -30,7 +30,7 @@ _LOOK = 0.5  # seconds between looks for the keypoints' topic
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-class Watcher(Node):
+class LifterClient(Node):
     """Gives every frame that a lifter answers to `show`, as a `Recording` of one frame.
 
     The rotation follows the points; a frame without one is shown when the next points come.
@@ -48,7 +48,7 @@ class Watcher(Node):
         context: Context | None = None,
     ) -> None:
         """Listen to the node called `lifter` and to the topic `keypoints`, whatever its type."""
-        super().__init__("lifter_watcher", context=context)
+        super().__init__("lifter_client", context=context)
         self._source, self._target, self._show = source, target, show
         self._min_confidence, self._size = min_confidence, size
         self._seen: OrderedDict[int, Observation] = OrderedDict()  # by stamp; 0: has no header
@@ -76,7 +76,9 @@ class Watcher(Node):
 
         def take(message: Any) -> None:
             try:
-                seen = read(message, kind, len(self._source), self._min_confidence, self._size)
+                seen = read_observation(
+                    message, kind, len(self._source), self._min_confidence, self._size
+                )
             except ValueError as problem:
                 self._complain(str(problem))
                 return

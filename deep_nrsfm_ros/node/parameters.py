@@ -23,7 +23,7 @@ def declare(node: Node, cls: type[Config], prefix: str = "") -> Config:
     """
     for field, _, opt in options(cls):
         descriptor = _descriptor(field.default, opt)
-        node.declare_parameter(name_of(field, prefix), _to_ros(field.default), descriptor)
+        node.declare_parameter(parameter_name(field, prefix), _to_ros(field.default), descriptor)
     return read(node, cls, prefix)
 
 
@@ -37,7 +37,7 @@ def read(
     proposed = {parameter.name: parameter.value for parameter in changes}
     values = {}
     for field, _, opt in options(cls):
-        name = name_of(field, prefix)
+        name = parameter_name(field, prefix)
         # `[]` in a parameter file leaves an array without a value: that is the default too.
         now = node.get_parameter_or(name, Parameter(name, value=_to_ros(field.default)))
         value = proposed.get(name, now.value)
@@ -46,7 +46,7 @@ def read(
     return cls(**values)
 
 
-def name_of(field: Field[Any], prefix: str = "") -> str:
+def parameter_name(field: Field[Any], prefix: str = "") -> str:
     """Return the name of the parameter of an option, e.g. "train.from" of the field `from_`."""
     return prefix + field.name.rstrip("_")
 

@@ -27,7 +27,7 @@ from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.nrsfm.geometry import centre, quaternion
 
-UNWATCHED = PublisherEventCallbacks(use_default_callbacks=False)
+NO_EVENT_CALLBACKS = PublisherEventCallbacks(use_default_callbacks=False)
 """For publishers of the lifter: rclpy looks after two events of any other at every message.
 
 They would tell of a subscriber whose quality of service does not fit. Its own node tells it too.
@@ -98,7 +98,7 @@ def to_header(header: Header) -> std_msgs.Header:
 
 
 def objects(
-    header: Header, lifted: Lifted, identities: Sequence[str], *, placed: bool = False
+    header: Header, lifted: Lifted, identities: Sequence[str], *, positioned: bool = False
 ) -> MultiDOFJointState:
     """Return who is in which row of the point cloud, and how each is turned.
 
@@ -108,17 +108,17 @@ def objects(
 
     identities: n, "" for an object without one. A transform leads from the axes of the object, its
     origin the mean of its keypoints, to those of the cloud: its rotation is that of
-    ~/camera_rotation, its translation the object's place, zero unless the shapes are `placed`. NaN
-    where the object could not be lifted.
+    ~/camera_rotation, its translation the object's place, zero unless the shapes are `positioned`.
+    NaN where the object could not be lifted.
     """
     message = MultiDOFJointState(header=to_header(header), joint_names=list(identities))
-    message.transforms = transforms(lifted, placed=placed)
+    message.transforms = transforms(lifted, positioned=positioned)
     return message
 
 
-def transforms(lifted: Lifted, *, placed: bool) -> list[Transform]:
+def transforms(lifted: Lifted, *, positioned: bool) -> list[Transform]:
     """Return what leads from the axes of each object to those of the camera."""
-    means = lifted.shapes.mean(1) if placed else np.zeros((len(lifted.shapes), 3))
+    means = lifted.shapes.mean(1) if positioned else np.zeros((len(lifted.shapes), 3))
     moves = (Vector3(x=x, y=y, z=z) for x, y, z in means.tolist())
     turns = map(to_quaternion, lifted.rotations)
     return [Transform(translation=t, rotation=q) for t, q in zip(moves, turns, strict=True)]
@@ -131,19 +131,19 @@ def to_quaternion(rotation: NDArray[np.float32]) -> Quaternion:
 
 
 def markers(
-    header: Header, lifted: Lifted, edges: Sequence[tuple[int, int]], *, placed: bool = False
+    header: Header, lifted: Lifted, edges: Sequence[tuple[int, int]], *, positioned: bool = False
 ) -> MarkerArray:
     """Return each object as a list of lines, one an edge, and a list of spheres.
 
-    placed: the shapes are at their place. Where they are not, the first object is at the origin,
-    as in the point cloud; the others stand beside it as they do in the image. Objects that are NaN
-    are left out.
+    positioned: the shapes are at their place. Where they are not, the first object is at the
+    origin, as in the point cloud; the others stand beside it as they do in the image. Objects that
+    are NaN are left out.
     """
     array_of_markers, stamped = MarkerArray(), to_header(header)
     lifted = Lifted(*(part[~np.isnan(lifted.residual)] for part in lifted))
     sizes = np.sqrt((centre(lifted.shapes) ** 2).sum(-1).mean(-1)).tolist()
     apart = (lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]
-    places = (np.zeros_like(apart) if placed else apart).tolist()
+    places = (np.zeros_like(apart) if positioned else apart).tolist()
     for i, (shape, size, (x, y)) in enumerate(
         zip(lifted.shapes.tolist(), sizes, places, strict=True)
     ):

@@ -19,14 +19,14 @@ from std_msgs.msg import Float32MultiArray
 _GRACE = 10.0
 
 
-class LoopbackError(RuntimeError):
+class SelfTestError(RuntimeError):
     """No answer came: says how far it got."""
 
 
-def ask_a_lifter(model: str, keypoints: np.ndarray[Any, Any], seconds: float) -> float:
+def time_to_first_points(model: str, keypoints: np.ndarray[Any, Any], seconds: float) -> float:
     """Start a lifter in a namespace of its own, send keypoints (p, 2), return after how many s.
 
-    Uses the domain and the middleware of the environment. Raises LoopbackError when nothing came
+    Uses the domain and the middleware of the environment. Raises SelfTestError when nothing came
     within `seconds`.
     """
     context = rclpy.Context()
@@ -63,7 +63,7 @@ def ask_a_lifter(model: str, keypoints: np.ndarray[Any, Any], seconds: float) ->
         log.seek(0)
         words = log.read().decode(errors="replace").strip()[-500:] or "nothing"
     found = "did not answer" if met else "was not found"
-    raise LoopbackError(f"the lifter {found} within {took:.0f} s; it said: {words}")
+    raise SelfTestError(f"the lifter {found} within {took:.0f} s; it said: {words}")
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -14,10 +14,10 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from deep_nrsfm_ros.lifting.tracking import Tracker
-from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, InputType, find_input, name_of
+from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, InputType, resolve_input_type, type_name
 from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
 from deep_nrsfm_ros.messages.pipeline import AUTO, InputOptions
-from deep_nrsfm_ros.messages.serialised import Reader
+from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.messages.topics import WILDCARD, match
 from deep_nrsfm_ros.node.message_types import decoder, message_class
 
@@ -29,23 +29,23 @@ LOG_PERIOD = 2.0
 
 
 @dataclass(frozen=True)
-class Source:
+class KeypointTopic:
     """A topic that is heard: how its messages are read, and who is who in them."""
 
     topic: str
-    reader: Reader
+    reader: MessageReader
     tracker: Tracker
-    gaps: DroppedMessages
+    dropped: DroppedMessages
 
 
-class Listener:
+class KeypointSubscriptions:
     """Subscribes to the topics of `InputOptions`, to some as soon as they are there."""
 
     def __init__(
         self,
         node: Node,
         inputs: InputOptions,
-        on_message: Callable[[Source, bytes], None],
+        on_message: Callable[[KeypointTopic, bytes], None],
         on_trouble: Callable[[str], None],
         on_missed: Callable[[int], None],
     ) -> None:
@@ -60,12 +60,12 @@ class Listener:
         self._log = node.get_logger()
         self._type: InputType | None = None
         if inputs.input_type != AUTO:
-            self._type = find_input("input_type", inputs.input_type)
-            message_class(name_of(self._type))
+            self._type = resolve_input_type("input_type", inputs.input_type)
+            message_class(type_name(self._type))
         self._own = f"{node.get_fully_qualified_name()}/"
         wanted = map(self._resolve, inputs.topics or (DEFAULT_TOPIC,))
         self.topics = tuple(dict.fromkeys(wanted))
-        self._heard: dict[str, tuple[Source, Subscription]] = {}
+        self._heard: dict[str, tuple[KeypointTopic, Subscription]] = {}
         for topic in self.topics:
             if self._type and WILDCARD not in topic:
                 self._listen(topic, self._type)
@@ -79,7 +79,8 @@ class Listener:
         """Return the topics that are heard, with their types, in words."""
         sources = (source for source, _ in self._heard.values())
         return (
-            ", ".join(f"{s.topic} ({name_of(s.reader.input_type)})" for s in sources) or "none yet"
+            ", ".join(f"{s.topic} ({type_name(s.reader.input_type)})" for s in sources)
+            or "none yet"
         )
 
     def look(self, *, idle: bool) -> None:
@@ -89,7 +90,7 @@ class Listener:
         """
         for source, _ in self._heard.values():
             there = self._node.get_publishers_info_by_topic(source.topic)
-            self._on_missed(source.gaps.missed(bytes(one.endpoint_gid) for one in there))
+            self._on_missed(source.dropped.take_count(bytes(one.endpoint_gid) for one in there))
         for pattern in self.topics:
             if WILDCARD in pattern:
                 for topic in self._matching(pattern):
@@ -114,7 +115,7 @@ class Listener:
                 self._leave(topic)
         elif len(usable) == 1:
             try:
-                self._listen(topic, self._type or find_input("input_type", usable[0]))
+                self._listen(topic, self._type or resolve_input_type("input_type", usable[0]))
             except ValueError as problem:
                 self._complain(f"cannot listen to {topic}: {problem}")
         elif types and idle:  # what does not hinder others is no trouble
@@ -127,12 +128,12 @@ class Listener:
             expected = "one type" if usable else " or ".join(self._usable)
             self._complain(f"{topic} carries {', '.join(types)}; expected {expected}: {mend}")
 
-    def _check(self, source: Source) -> None:
+    def _check(self, source: KeypointTopic) -> None:
         """Say so if messages of another type are published where the lifter listens.
 
         DDS keeps such publishers apart and reports nothing.
         """
-        types, expected = self._types(source.topic), name_of(source.reader.input_type)
+        types, expected = self._types(source.topic), type_name(source.reader.input_type)
         if not self._type and types and expected not in types:
             self._leave(source.topic)  # another detector: its type is read at the next look
         elif others := [kind for kind in types if kind != expected]:
@@ -146,8 +147,10 @@ class Listener:
         names = [match(pattern, topic) for pattern in self.topics]
         several = len(self.topics) > 1
         name = next(filter(None, names), topic.strip("/") if several else "")
-        kind = name_of(input_type)
-        source = Source(topic, Reader(input_type, decoder(kind)), Tracker(name), DroppedMessages())
+        kind = type_name(input_type)
+        source = KeypointTopic(
+            topic, MessageReader(input_type, decoder(kind)), Tracker(name), DroppedMessages()
+        )
         subscription = self._node.create_subscription(
             message_class(kind),
             topic,
@@ -165,9 +168,9 @@ class Listener:
         self._heard[topic] = source, subscription
         self._log.info(f"listening to {topic} ({kind})")
 
-    def _take(self, source: Source, raw: bytes, info: Mapping[str, Any]) -> None:
+    def _take(self, source: KeypointTopic, raw: bytes, info: Mapping[str, Any]) -> None:
         """Pass a message on, serialised as it came."""
-        source.gaps.came(info["publication_sequence_number"])
+        source.dropped.received(info["publication_sequence_number"])
         self._on_message(source, raw)
 
     def _leave(self, topic: str) -> None:
@@ -179,7 +182,7 @@ class Listener:
     @property
     def _usable(self) -> tuple[str, ...]:
         """Return the types that would be heard."""
-        return (name_of(self._type),) if self._type else INPUT_TYPES
+        return (type_name(self._type),) if self._type else INPUT_TYPES
 
     def _types(self, topic: str) -> list[str]:
         """Return the types that are published on a topic."""

@@ -48,7 +48,10 @@ class TrainingService:
         self._heard: SimpleQueue[Progress] = SimpleQueue()
         self._wake = node.create_guard_condition(self._report)
         self._publisher = node.create_publisher(
-            DiagnosticStatus, "~/training_status", _LATCHED, event_callbacks=publishing.UNWATCHED
+            DiagnosticStatus,
+            "~/training_status",
+            _LATCHED,
+            event_callbacks=publishing.NO_EVENT_CALLBACKS,
         )
         node.create_service(Trigger, "~/train", self._train)
         node.create_service(Trigger, "~/cancel_training", self._cancel)

@@ -13,7 +13,7 @@ from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.node import publishing
 
 
-class Broadcaster:
+class TransformBroadcaster:
     """Sends the frame of each object: its origin the mean of the keypoints, its axes the object's.
 
     tf2_msgs is asked for only here: it comes with ROS, but not from PyPI.
@@ -43,7 +43,7 @@ def frames(header: Header, lifted: Lifted, names: Sequence[str]) -> list[Transfo
 
     names: n, of the frames of the objects.
     """
-    moves, stamped = publishing.transforms(lifted, placed=True), publishing.to_header(header)
+    moves, stamped = publishing.transforms(lifted, positioned=True), publishing.to_header(header)
     return [
         TransformStamped(header=stamped, child_frame_id=name, transform=move)
         for name, move in zip(names, moves, strict=True)

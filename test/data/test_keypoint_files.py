@@ -14,7 +14,7 @@ from deep_nrsfm_ros.data.bags import Frame, write_bag
 from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
 from deep_nrsfm_ros.layouts.presets import COCO17
-from deep_nrsfm_ros.lifting.observation import observation
+from deep_nrsfm_ros.lifting.observation import to_observation
 from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY
 
 Q = len(COCO17)
@@ -29,7 +29,7 @@ def seen() -> Detections:
     values = rng.uniform(1, 1000, (sum(COUNTS), Q, 3))
     values[..., 2] = rng.uniform(0.2, 1, values.shape[:2])
     values[rng.random(values.shape[:2]) < 0.1] = 0
-    people = observation(values)
+    people = to_observation(values)
     parts = np.split(np.arange(len(values)), np.cumsum(COUNTS)[:-1])
     frames = [type(people)(people.points[p], people.confidence[p]) for p in parts]
     return gather(frames, stamps_at(10, len(COUNTS)), Q)

@@ -28,7 +28,7 @@ from deep_nrsfm_ros.data.recording import Recording, lift_recording, lifted_befo
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter
-from deep_nrsfm_ros.lifting.observation import Observation, observation
+from deep_nrsfm_ros.lifting.observation import Observation, to_observation
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_quaternion
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
@@ -44,7 +44,7 @@ def people() -> Detections:
         [rng.uniform(1, 900, (sum(COUNTS), 25, 2)), np.full((sum(COUNTS), 25, 1), 0.75)], -1
     )
     values[-1, 3:] = 0
-    whole = observation(values)
+    whole = to_observation(values)
     parts = np.split(np.arange(len(values)), np.cumsum(COUNTS)[:-1])
     frames = [Observation(whole.points[p], whole.confidence[p]) for p in parts]
     return gather(frames, stamps_at(10, len(COUNTS)) + 10**18, 25, "cam")

@@ -23,7 +23,7 @@ from std_msgs.msg import Header
 
 from deep_nrsfm_ros.data.pose2sim import JOINTS, extract_videos, read_session
 from deep_nrsfm_ros.layouts.presets import BODY25B, MEDIAPIPE33
-from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, MessageError, read
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, MessageError, read_observation
 
 SIZE = (40, 60)  # height and width
 DEADLINE = 60.0
@@ -90,14 +90,14 @@ def test_images_that_cannot_be_read(module: Any, change: dict[str, Any]) -> None
 def test_the_message_is_what_the_lifter_reads(module: Any) -> None:
     found = module.Detector()(coloured(0, 51)[..., ::-1].copy())
     message = module.cloud(found, Header(frame_id="eye"))
-    seen = read(message, POINT_CLOUD, len(MEDIAPIPE33))
+    seen = read_observation(message, POINT_CLOUD, len(MEDIAPIPE33))
     np.testing.assert_allclose(seen.points[0], found.points)
     np.testing.assert_allclose(seen.points[0, 0], [0, 0.2 * SIZE[0]], atol=1e-4)
     np.testing.assert_allclose(seen.confidence, 0.9)
     assert len(MEDIAPIPE33) == module.LANDMARKS
-    assert not len(read(module.cloud(None, Header()), POINT_CLOUD, 33).points)
+    assert not len(read_observation(module.cloud(None, Header()), POINT_CLOUD, 33).points)
     with pytest.raises(MessageError):
-        read(message, POINT_CLOUD, len(BODY25B))
+        read_observation(message, POINT_CLOUD, len(BODY25B))
 
 
 def test_nobody_is_none(module: Any) -> None:
@@ -193,7 +193,7 @@ def test_a_video_from_the_first_image_to_the_last(start: Any, ears: Ears, tmp_pa
     assert before < stamps[0] < time.time_ns()
     assert np.diff(stamps).tolist() == [20_000_000] * 5
     assert {message.header.frame_id for message in ears.heard} == {"eye"}
-    xs = [read(message, POINT_CLOUD, 33).points[0, 0, 0] for message in ears.heard]
+    xs = [read_observation(message, POINT_CLOUD, 33).points[0, 0, 0] for message in ears.heard]
     np.testing.assert_allclose(xs, [10 * i / 255 * SIZE[1] for i in range(6)], atol=1e-3)
 
 

@@ -26,7 +26,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifted, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.decoding import InputType
 from deep_nrsfm_ros.messages.pipeline import InputOptions, Pipeline
-from deep_nrsfm_ros.messages.serialised import Reader
+from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -157,7 +157,7 @@ class Bench:
     def lift(
         pipeline: Pipeline, message: Any, input_type: InputType, intrinsics: Any = None
     ) -> Lifted:
-        _, seen = pipeline.observe(b"", Reader(input_type, lambda _: message))
+        _, seen = pipeline.read(b"", MessageReader(input_type, lambda _: message))
         if not len(seen.confidence):
             raise ValueError("no object, which is no error and no answer either")
         names = ("one",) * len(seen.confidence)

@@ -13,9 +13,15 @@ from rosbags.typesys import Stores, get_typestore
 from deep_nrsfm_ros.data import bags
 from deep_nrsfm_ros.data.bags import frames
 from deep_nrsfm_ros.messages.camera_info import read_camera_info
-from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY, POINT_CLOUD, POLYGON, InputType, read
+from deep_nrsfm_ros.messages.decoding import (
+    MULTI_ARRAY,
+    POINT_CLOUD,
+    POLYGON,
+    InputType,
+    read_observation,
+)
 from deep_nrsfm_ros.messages.field_mapping import SKELETON_2D, YOLO, FieldMapping
-from deep_nrsfm_ros.messages.serialised import Reader
+from deep_nrsfm_ros.messages.serialised import MessageReader
 from test.fuzz.conftest import Bench, Fuzz, Spoiler
 
 KINDS = (POINT_CLOUD, MULTI_ARRAY, POLYGON)
@@ -108,14 +114,14 @@ def test_bytes_on_the_wire_are_read_or_refused_by_the_short_way_as_by_the_long(
     names = {kind: kind.replace("/", "/msg/") for kind in KINDS}
     raws = {k: bytes(store.serialize_cdr(message(k, p), names[k])) for k in KINDS}
     decoders = {k: lambda raw, k=k: store.deserialize_cdr(raw, names[k]) for k in KINDS}
-    readers = {k: Reader(k, decoders[k]) for k in KINDS}
+    readers = {k: MessageReader(k, decoders[k]) for k in KINDS}
 
     def one(spoiler: Spoiler) -> str:
         kind = spoiler.choice(KINDS)
         reader = readers[kind]
         reader(raws[kind], p)  # what comes next may be like it
         raw = spoiler.spoil_bytes(raws[kind])
-        outcome = "read, as known" if reader.known(raw, p) else "read"
+        outcome = "read, as known" if reader.find_format(raw, p) else "read"
         try:
             came = decoders[kind](raw)
         except Exception:  # what bags.py does with it too
@@ -123,7 +129,7 @@ def test_bytes_on_the_wire_are_read_or_refused_by_the_short_way_as_by_the_long(
                 reader(raw, p)
             return "undecodable"
         try:
-            expected = read(came, kind, p)
+            expected = read_observation(came, kind, p)
         except ValueError as refusal:
             with pytest.raises(ValueError, match=f"^{re.escape(str(refusal))}$"):
                 reader(raw, p)

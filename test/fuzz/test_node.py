@@ -21,7 +21,7 @@ from deep_nrsfm_ros.model_files.model_file import save_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameters as ros_parameters
 from deep_nrsfm_ros.node.lifter import LifterNode
-from deep_nrsfm_ros.node.parameters import name_of
+from deep_nrsfm_ros.node.parameters import parameter_name
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.training.job import parse_progress
 from deep_nrsfm_ros.training.limits import Limits
@@ -65,7 +65,9 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
     known = [(c, "") for c in (InputOptions, LiftingOptions)]
     known += [(c, "train.") for c in (TrainingOptions, Recipe, Limits, Curation)]
     known += [(SmoothingOptions, "smoothing.")]
-    defaults = [(name_of(f, prefix), f.default) for c, prefix in known for f, _, _ in options(c)]
+    defaults = [
+        (parameter_name(f, prefix), f.default) for c, prefix in known for f, _, _ in options(c)
+    ]
 
     def value(spoiler: Spoiler, default: Any) -> Any:
         if isinstance(default, bool):

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.kernel import AVAILABLE, _kernel
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
-from deep_nrsfm_ros.lifting.compiled_backend import Kernel
+from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
-from deep_nrsfm_ros.lifting.numpy_backend import Fit
+from deep_nrsfm_ros.lifting.numpy_backend import NumpyBackend
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -102,9 +102,9 @@ def test_lifts_as_numpy_does(
     lifter = Lifter(model(seed, layout, widths, whitening, scale), options)
     rng, p = np.random.default_rng(seed), len(layout)
     points, confidence = objects(rng, MORE_THAN_A_BLOCK, p, missing, perspective)
-    assert isinstance(lifter.fit, Kernel)
-    arrays, lost = lifter.fit(points, confidence, perspective)
-    by_numpy = Fit(lifter.constants)
+    assert isinstance(lifter.backend, CompiledBackend)
+    arrays, lost = lifter.backend(points, confidence, perspective)
+    by_numpy = NumpyBackend(lifter.constants)
     expected, lost_too = by_numpy(points, confidence, perspective)
     # Where the last digits of the input matter, no more can be asked of the last of the output.
     moved = (points + 1e-6 * rng.standard_normal(points.shape).astype(np.float32) for _ in range(3))
@@ -173,7 +173,7 @@ def test_what_cannot_be_lifted_is_nan(shown: int) -> None:
 def test_other_options_of_the_network_are_left_to_numpy(options: tuple[str, ...]) -> None:
     network = initialise(Architecture((12, 6), *options), 17, np.random.default_rng(0))
     random = dataclasses.replace(model(0, HUMAN17, (12, 6), 0.0, "rms"), network=network)
-    assert isinstance(Lifter(random).fit, Fit)
+    assert isinstance(Lifter(random).backend, NumpyBackend)
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
@@ -181,6 +181,6 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         _kernel.plan(np.zeros(40, np.int32), np.zeros(9, np.float32), np.zeros(9))
     with pytest.raises(ValueError, match="not those of a plan"):
         _kernel.plan(b"", b"", b"")
-    kernel = Kernel(Lifter(model(0, HUMAN17, (12, 6), 1.0, "rms")).constants)
+    kernel = CompiledBackend(Lifter(model(0, HUMAN17, (12, 6), 1.0, "rms")).constants)
     with pytest.raises(ValueError, match="do not fit"):
         kernel(np.zeros((2, 16, 2), np.float32), np.ones((2, 17), np.float32), False)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import EQUIDISTANT, Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
-from deep_nrsfm_ros.lifting.perspective import aim, lift_at_place
+from deep_nrsfm_ros.lifting.perspective import lift_perspective, virtual_views
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -59,7 +59,7 @@ def test_an_object_comes_out_at_its_place_and_turned_with_its_ray(
     place = far * np.array([x, y, 1])
     Q = turn_to(place)
     shape = centred.shapes @ Q.T + place
-    lifted = lift_at_place(lifter, LENS, seen(shape), CERTAIN)
+    lifted = lift_perspective(lifter, LENS, seen(shape), CERTAIN)
     assert np.linalg.norm(lifted.shapes.mean(1) - place) < 0.02 * np.linalg.norm(place)
     size = np.abs(centred.shapes).max()
     form = lifted.shapes - lifted.shapes.mean(1, keepdims=True)
@@ -74,7 +74,7 @@ def test_what_comes_out_is_seen_where_the_keypoints_are(lifter: Lifter) -> None:
     rng = np.random.default_rng(3)
     pixels = (rng.uniform(0, 150, (20, P, 2)) + rng.uniform(0, 400, (20, 1, 2))).astype(np.float32)
     confidence = (rng.random((20, P)) > 0.2).astype(np.float32)
-    lifted = lift_at_place(lifter, LENS, pixels, confidence)
+    lifted = lift_perspective(lifter, LENS, pixels, confidence)
     ahead = (lifted.shapes[..., 2] > 0).all(1)  # a random model may put points anywhere
     assert ahead.sum() > 10
     known = (confidence > 0) & ahead[:, None]
@@ -86,8 +86,8 @@ def test_the_reference_length_sets_size_and_distance_alike(
 ) -> None:
     confidence = np.ones(pixels.shape[:2], np.float32)
     twice = Lifter(lifter.model, LiftingOptions(reference_length=1.0, noise=0))
-    one = lift_at_place(lifter, LENS, pixels, confidence)
-    two = lift_at_place(twice, LENS, pixels, confidence)
+    one = lift_perspective(lifter, LENS, pixels, confidence)
+    two = lift_perspective(twice, LENS, pixels, confidence)
     np.testing.assert_allclose(two.shapes, 2 * one.shapes, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(two.rotations, one.rotations, atol=1e-5)
     neck, hip = HUMAN17.index("neck"), HUMAN17.index("mid_hip")
@@ -99,25 +99,25 @@ def test_a_camera_turned_towards_the_object_sees_it_in_the_middle() -> None:
     shape = np.random.default_rng(0).normal(0, 0.1, (3, 8, 3)) + [[[1, -0.5, 3]]]
     points, confidence = seen(shape), np.ones((3, 8), np.float32)
     confidence[1, :2] = 0
-    aimed = aim(LENS, points, confidence)
-    orthonormal = aimed.turns @ aimed.turns.swapaxes(1, 2)
+    views = virtual_views(LENS, points, confidence)
+    orthonormal = views.turns @ views.turns.swapaxes(1, 2)
     np.testing.assert_allclose(orthonormal, np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
-    inside = shape @ aimed.turns.swapaxes(1, 2)
+    inside = shape @ views.turns.swapaxes(1, 2)
     flat = inside[..., :2] / inside[..., 2:]
     known = confidence > 0
-    np.testing.assert_allclose(aimed.points[known], flat[known], atol=1e-5)
-    assert not aimed.points[~known].any()
-    assert np.abs((aimed.points * known[..., None]).sum(1) / known.sum(1)[:, None]).max() < 0.01
+    np.testing.assert_allclose(views.points[known], flat[known], atol=1e-5)
+    assert not views.points[~known].any()
+    assert np.abs((views.points * known[..., None]).sum(1) / known.sum(1)[:, None]).max() < 0.01
 
 
 def test_pixels_without_a_ray_are_missing() -> None:
     fisheye = Intrinsics((300.0, 300.0), (500.0, 500.0), (), EQUIDISTANT)
     # At 0, 20, 115 and 57 degrees from the axis.
     points = np.array([[[500, 500], [605, 500], [500, 1100], [200, 500]]], np.float32)
-    aimed = aim(fisheye, points, np.ones((1, 4), np.float32))
-    np.testing.assert_array_equal(aimed.confidence, [[1, 1, 0, 1]])
-    assert np.isfinite(aimed.points).all()
-    nothing = aim(fisheye, points[:, 2:3], np.ones((1, 1), np.float32))
+    views = virtual_views(fisheye, points, np.ones((1, 4), np.float32))
+    np.testing.assert_array_equal(views.confidence, [[1, 1, 0, 1]])
+    assert np.isfinite(views.points).all()
+    nothing = virtual_views(fisheye, points[:, 2:3], np.ones((1, 1), np.float32))
     np.testing.assert_array_equal(nothing.turns, np.eye(3)[None])
 
 
@@ -125,9 +125,9 @@ def test_what_cannot_be_lifted_is_nan_and_touches_nothing(
     lifter: Lifter, pixels: np.ndarray
 ) -> None:
     confidence = np.ones((3, P), np.float32)
-    alone = lift_at_place(lifter, LENS, pixels[[0, 2]], confidence[[0, 2]])
+    alone = lift_perspective(lifter, LENS, pixels[[0, 2]], confidence[[0, 2]])
     confidence[1, 2:] = 0
-    lifted = lift_at_place(lifter, LENS, pixels, confidence)
+    lifted = lift_perspective(lifter, LENS, pixels, confidence)
     assert np.isnan(lifted.shapes[1]).all() and not lifted.confidence[1].any()
     assert np.isnan(lifted.residual[1])
     np.testing.assert_allclose(lifted.shapes[[0, 2]], alone.shapes, rtol=1e-4, atol=1e-4)

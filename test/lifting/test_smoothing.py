@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.lifting.lifter import Lifted
-from deep_nrsfm_ros.lifting.smoothing import MEMORY, Smoother, SmoothingOptions
+from deep_nrsfm_ros.lifting.smoothing import MAX_AGE, Smoother, SmoothingOptions
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector
 
 P = 8
@@ -127,7 +127,7 @@ def test_each_object_has_a_filter_of_its_own_wherever_it_stands_in_the_message()
 
 @pytest.mark.parametrize("listed", [True, False], ids=["not lifted", "not in the message"])
 def test_a_gap_is_bridged_for_its_time_and_less_sure(listed: bool) -> None:
-    steady = Smoother(dataclasses.replace(ON, bridge=0.4))
+    steady = Smoother(dataclasses.replace(ON, max_gap=0.4))
     empty = Lifted(*(part[:0] for part in one()))
     gone, identities = (nothing(), ("a",)) if listed else (empty, ())
     steady(one(), ("a",), 10.0)
@@ -142,7 +142,7 @@ def test_a_gap_is_bridged_for_its_time_and_less_sure(listed: bool) -> None:
 
 
 def test_no_bridge_if_none_is_asked_for_and_none_for_strangers() -> None:
-    steady = Smoother(dataclasses.replace(ON, bridge=0.0))
+    steady = Smoother(dataclasses.replace(ON, max_gap=0.0))
     steady(one(), ("a",), 0.0)
     assert np.isnan(steady(nothing(), ("a",), 0.01)[0].residual).all()
     assert np.isnan(Smoother(ON)(nothing(), ("b",), 0.0)[0].residual).all()
@@ -150,7 +150,7 @@ def test_no_bridge_if_none_is_asked_for_and_none_for_strangers() -> None:
 
 def test_an_object_that_was_away_for_long_begins_anew() -> None:
     far = one(SHAPE + np.eye(P, 3))
-    for wait, anew in ((0.5 * MEMORY, False), (1.5 * MEMORY, True)):
+    for wait, anew in ((0.5 * MAX_AGE, False), (1.5 * MAX_AGE, True)):
         steady = Smoother(dataclasses.replace(ON, min_cutoff=0.1, beta=0.0))
         steady(one(), ("a",), 0.0)
         back, _ = steady(far, ("a",), wait)

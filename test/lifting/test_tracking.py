@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.lifting.observation import Identities, Observation
-from deep_nrsfm_ros.lifting.tracking import MEMORY, Tracker
+from deep_nrsfm_ros.lifting.tracking import MAX_AGE, Tracker
 
 BODY = np.random.default_rng(0).uniform(-50, 50, (8, 2)).astype(np.float32)
 
@@ -37,8 +37,8 @@ def test_a_jump_is_another_object_and_so_is_one_that_was_long_away() -> None:
     (a,) = tracker(seen((100, 100)), 0.0)
     (b,) = tracker(seen((400, 100)), 0.1)
     assert a != b
-    assert tracker(seen((100, 100)), MEMORY) == (a,)
-    assert tracker(seen((100, 100)), 3 * MEMORY)[0] not in (a, b)
+    assert tracker(seen((100, 100)), MAX_AGE) == (a,)
+    assert tracker(seen((100, 100)), 3 * MAX_AGE)[0] not in (a, b)
 
 
 def test_another_number_of_keypoints_is_another_object() -> None:

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray, MultiArrayDimension
 
-from deep_nrsfm_ros.lifting.observation import MessageError, observation
+from deep_nrsfm_ros.lifting.observation import MessageError, to_observation
 from deep_nrsfm_ros.messages.decoding import (
     INPUT_TYPES,
     MULTI_ARRAY,
@@ -23,9 +23,9 @@ from deep_nrsfm_ros.messages.decoding import (
     POINT_STEP,
     POLYGON,
     count_keypoints,
-    find_input,
     pack_points,
-    read,
+    read_observation,
+    resolve_input_type,
 )
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -109,7 +109,7 @@ def polygon(values: np.ndarray) -> PolygonStamped:
 def test_point_cloud_of_any_make(origin: str, n: int, q: int, names: Any, **make: Any) -> None:
     values = keypoints(n, q)
     message = received(cloud(values, names=tuple(names), **make), POINT_CLOUD, origin)
-    points, confidence, _ = read(message, POINT_CLOUD, q)
+    points, confidence, _ = read_observation(message, POINT_CLOUD, q)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2])
     assert points.dtype == confidence.dtype == np.float32
@@ -118,7 +118,9 @@ def test_point_cloud_of_any_make(origin: str, n: int, q: int, names: Any, **make
 @BOTH
 def test_point_cloud_without_confidence_is_certain(origin: str) -> None:
     message = cloud(keypoints(2, 5), names=("y", "x"))
-    assert (read(received(message, POINT_CLOUD, origin), POINT_CLOUD, 5).confidence == 1).all()
+    assert (
+        read_observation(received(message, POINT_CLOUD, origin), POINT_CLOUD, 5).confidence == 1
+    ).all()
 
 
 def test_packed_points_read_back() -> None:
@@ -126,7 +128,7 @@ def test_packed_points_read_back() -> None:
     message = PointCloud2(height=2, width=6, point_step=POINT_STEP, row_step=6 * POINT_STEP)
     message.fields = [PointField(name=n, offset=o, datatype=7, count=1) for n, o in POINT_FIELDS]
     message.data = array("B", pack_points(values[..., :2], values[..., 2]))
-    points, confidence, _ = read(message, POINT_CLOUD, 6)
+    points, confidence, _ = read_observation(message, POINT_CLOUD, 6)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2])
 
@@ -139,7 +141,7 @@ def test_multi_array_by_its_layout(origin: str, shape: str, size: int) -> None:
     values = keypoints(n, q)
     sizes = {"p": (q, size), "n p": (n, q, size), "flat": (q * size,), "none": ()}[shape]
     message = multi_array(values[..., :size], sizes, offset=2)
-    points, confidence, _ = read(received(message, MULTI_ARRAY, origin), MULTI_ARRAY, q)
+    points, confidence, _ = read_observation(received(message, MULTI_ARRAY, origin), MULTI_ARRAY, q)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2] if size == 3 else np.ones((n, q)))
 
@@ -147,11 +149,13 @@ def test_multi_array_by_its_layout(origin: str, shape: str, size: int) -> None:
 @BOTH
 def test_polygon_takes_z_for_confidence(origin: str) -> None:
     values = keypoints(1, 7)
-    points, confidence, _ = read(received(polygon(values[0]), POLYGON, origin), POLYGON, 7)
+    points, confidence, _ = read_observation(
+        received(polygon(values[0]), POLYGON, origin), POLYGON, 7
+    )
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2])
     values[..., 2] = 0
-    flat = read(received(polygon(values[0]), POLYGON, origin), POLYGON, 7)
+    flat = read_observation(received(polygon(values[0]), POLYGON, origin), POLYGON, 7)
     np.testing.assert_array_equal(flat.points, values[..., :2])
     assert (flat.confidence == 1).all()
 
@@ -178,19 +182,19 @@ def test_missing_keypoints(missing: tuple[float, float, float]) -> None:
     values[0, 3] = missing
     with np.errstate(all="raise", over="ignore"):
         message = cloud(values, datatypes=(PointField.FLOAT64,) * 3)
-        points, confidence, _ = read(message, POINT_CLOUD, 5, min_confidence=0.3)
+        points, confidence, _ = read_observation(message, POINT_CLOUD, 5, min_confidence=0.3)
     np.testing.assert_array_equal(confidence, [[0.5, 0.5, 0.5, 0, 0.5]])
     np.testing.assert_array_equal(points[0, 3], [0, 0])
     np.testing.assert_array_equal(points[0, :3], values[0, :3, :2].astype(np.float32))
 
 
 def test_a_keypoint_on_an_image_border_is_there() -> None:
-    seen = observation(np.array([[[0, 5, 1], [5, 0, 1], [-3, -4, 1], [0, 0, 1]]]))
+    seen = to_observation(np.array([[[0, 5, 1], [5, 0, 1], [-3, -4, 1], [0, 0, 1]]]))
     np.testing.assert_array_equal(seen.confidence, [[1, 1, 1, 0]])
 
 
 def test_confidence_is_at_most_one() -> None:
-    seen = observation(np.array([[[5, 5, 1.3], [5, 5, 100]]]))
+    seen = to_observation(np.array([[[5, 5, 1.3], [5, 5, 100]]]))
     np.testing.assert_array_equal(seen.confidence, [[1, 1]])
 
 
@@ -205,12 +209,12 @@ def test_confidence_is_at_most_one() -> None:
 )
 def test_wrong_number_of_keypoints_names_both(input_type: str, message: Any) -> None:
     with pytest.raises(MessageError, match="17 keypoints.*has 25"):
-        read(message, input_type, 25)
+        read_observation(message, input_type, 25)
 
 
 def test_flat_array_of_wrong_length_says_what_it_takes() -> None:
     with pytest.raises(MessageError, match=r"50 numbers.*34.*51"):
-        read(multi_array(np.zeros(50), ()), MULTI_ARRAY, 17)
+        read_observation(multi_array(np.zeros(50), ()), MULTI_ARRAY, 17)
 
 
 @pytest.mark.parametrize(
@@ -242,7 +246,7 @@ def test_malformed_point_cloud(mend: dict[str, Any], expected: str) -> None:
     for name, value in mend.items():
         setattr(message, name, value)
     with pytest.raises(MessageError, match=expected):
-        read(message, POINT_CLOUD, 5)
+        read_observation(message, POINT_CLOUD, 5)
 
 
 @pytest.mark.parametrize(
@@ -258,7 +262,7 @@ def test_malformed_point_cloud(mend: dict[str, Any], expected: str) -> None:
 )
 def test_malformed_multi_array(sizes: tuple[int, ...], expected: str) -> None:
     with pytest.raises(MessageError, match=expected):
-        read(multi_array(np.ones(20), sizes), MULTI_ARRAY, 5)
+        read_observation(multi_array(np.ones(20), sizes), MULTI_ARRAY, 5)
 
 
 @settings(deadline=None, max_examples=300)
@@ -281,7 +285,7 @@ def test_malformed_multi_array(sizes: tuple[int, ...], expected: str) -> None:
 )
 def test_arbitrary_point_cloud_is_read_or_refused(**message: Any) -> None:
     try:
-        points, confidence, _ = read(SimpleNamespace(**message), POINT_CLOUD, 5)
+        points, confidence, _ = read_observation(SimpleNamespace(**message), POINT_CLOUD, 5)
     except MessageError:
         return
     assert points.shape == (message["height"], 5, 2)
@@ -298,7 +302,9 @@ def test_arbitrary_multi_array_is_read_or_refused(
 ) -> None:
     layout = SimpleNamespace(data_offset=offset, dim=[SimpleNamespace(size=s) for s in sizes])
     try:
-        points, confidence, _ = read(SimpleNamespace(layout=layout, data=data), MULTI_ARRAY, 5)
+        points, confidence, _ = read_observation(
+            SimpleNamespace(layout=layout, data=data), MULTI_ARRAY, 5
+        )
     except MessageError:
         return
     assert points.shape[1:] == (5, 2) and len(points) * 10 <= len(data)
@@ -308,20 +314,20 @@ def test_arbitrary_multi_array_is_read_or_refused(
 @pytest.mark.parametrize("input_type", INPUT_TYPES)
 def test_message_of_another_type_is_refused(input_type: str) -> None:
     with pytest.raises(MessageError, match=f"expected a message of type {input_type}"):
-        read(SimpleNamespace(header=None), input_type, 5)
+        read_observation(SimpleNamespace(header=None), input_type, 5)
 
 
 def test_unknown_input_type_lists_the_known() -> None:
     with pytest.raises(ValueError, match="no input type 'a/B'; choose one of sensor_msgs/Point"):
-        read(None, "a/B", 5)
+        read_observation(None, "a/B", 5)
 
 
 def test_a_type_is_found_by_name_and_else_the_choice_is_told() -> None:
-    assert find_input("input_type", "sensor_msgs/msg/PointCloud2") == POINT_CLOUD
+    assert resolve_input_type("input_type", "sensor_msgs/msg/PointCloud2") == POINT_CLOUD
     with pytest.raises(ValueError, match=r"input_type is 'a/B'; name one of .*field mapping"):
-        find_input("input_type", "a/B")
+        resolve_input_type("input_type", "a/B")
     with pytest.raises(ValueError, match="field mapping nowhere.yaml: cannot be read"):
-        find_input("input_type", "nowhere.yaml")
+        resolve_input_type("input_type", "nowhere.yaml")
 
 
 @pytest.mark.parametrize(

@@ -10,53 +10,53 @@ A, B = b"a", b"b"
 def gaps_after(*numbers: int | None) -> DroppedMessages:
     gaps = DroppedMessages()
     for number in numbers:
-        gaps.came(number)
+        gaps.received(number)
     return gaps
 
 
 def test_gaps_are_counted_once() -> None:
     gaps = gaps_after(1, 2, 5, 6, 10)
-    assert gaps.missed([A]) == 2 + 3
-    assert gaps.missed([A]) == 0
-    gaps.came(12)
-    assert gaps.missed([A]) == 1
+    assert gaps.take_count([A]) == 2 + 3
+    assert gaps.take_count([A]) == 0
+    gaps.received(12)
+    assert gaps.take_count([A]) == 1
 
 
 def test_what_came_before_the_first_message_is_not_missed() -> None:
-    assert gaps_after(1000, 1001).missed([A]) == 0
+    assert gaps_after(1000, 1001).take_count([A]) == 0
 
 
 def test_the_last_gap_of_a_publisher_that_has_gone_counts() -> None:
     gaps = gaps_after(1, 2)
-    assert gaps.missed([A]) == 0
-    gaps.came(4)
-    assert gaps.missed([]) == 1
+    assert gaps.take_count([A]) == 0
+    gaps.received(4)
+    assert gaps.take_count([]) == 1
 
 
 def test_numbers_of_two_publishers_tell_nothing() -> None:
-    assert gaps_after(1000, 5, 1001, 6).missed([A, B]) == 0
+    assert gaps_after(1000, 5, 1001, 6).take_count([A, B]) == 0
 
 
 def test_a_publisher_in_the_place_of_another_is_not_taken_for_it() -> None:
     gaps = gaps_after(1, 2)
-    gaps.missed([A])
-    gaps.came(500)
-    assert gaps.missed([B]) == 0
-    gaps.came(502)
-    assert gaps.missed([B]) == 1
+    gaps.take_count([A])
+    gaps.received(500)
+    assert gaps.take_count([B]) == 0
+    gaps.received(502)
+    assert gaps.take_count([B]) == 1
 
 
 def test_a_publisher_that_comes_later_counts_anew() -> None:
     gaps = gaps_after(1, 2)
-    gaps.missed([A])
-    gaps.missed([])
-    gaps.came(7)
-    assert gaps.missed([B]) == 0
+    gaps.take_count([A])
+    gaps.take_count([])
+    gaps.received(7)
+    assert gaps.take_count([B]) == 0
 
 
 def test_a_publisher_that_starts_again_is_behind_not_ahead() -> None:
-    assert gaps_after(7, 8, 1, 2).missed([A]) == 0
+    assert gaps_after(7, 8, 1, 2).take_count([A]) == 0
 
 
 def test_a_middleware_without_numbers_tells_nothing() -> None:
-    assert gaps_after(None, None, 5, None, 9).missed([A]) == 0
+    assert gaps_after(None, None, 5, None, 9).take_count([A]) == 0

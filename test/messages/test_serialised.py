@@ -16,8 +16,8 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray
 
 from deep_nrsfm_ros import kernel
-from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY, POINT_CLOUD, read
-from deep_nrsfm_ros.messages.serialised import Header, Reader, header_of
+from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY, POINT_CLOUD, read_observation
+from deep_nrsfm_ros.messages.serialised import Header, MessageReader, read_header
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 Q = 5
@@ -77,7 +77,7 @@ def outcome(call: Callable[[], tuple[Header | None, Any]]) -> Any:
 
 def long_way(raw: bytes, origin: str, *how: Any) -> Any:
     message = DECODERS[origin](raw)
-    return header_of(message), read(message, POINT_CLOUD, *how)
+    return read_header(message), read_observation(message, POINT_CLOUD, *how)
 
 
 @BOTH
@@ -87,7 +87,7 @@ def long_way(raw: bytes, origin: str, *how: Any) -> Any:
 def test_short_and_long_way_end_alike(
     origin: str, message: PointCloud2, spoilt: st.DataObject, min_confidence: float
 ) -> None:
-    reader = Reader(POINT_CLOUD, DECODERS[origin])
+    reader = MessageReader(POINT_CLOUD, DECODERS[origin])
     raws = [serialize_message(renewed(message, seed)) for seed in (1, 2, 3)]
     for _ in range(6):
         raw = bytearray(spoilt.draw(st.sampled_from(raws[:3])))
@@ -108,7 +108,7 @@ def test_short_and_long_way_end_alike(
 def test_the_second_message_of_a_make_is_not_decoded(
     origin: str, message: PointCloud2, seeds: list[int]
 ) -> None:
-    reader = Reader(POINT_CLOUD, DECODERS[origin])
+    reader = MessageReader(POINT_CLOUD, DECODERS[origin])
     reader(serialize_message(message), Q)
     reader._decode = forbidden
     raws = [serialize_message(renewed(message, seed)) for seed in seeds]
@@ -116,7 +116,7 @@ def test_the_second_message_of_a_make_is_not_decoded(
     assert [outcome(lambda raw=raw: reader(raw, Q)) for raw in raws] == [
         outcome(lambda raw=raw: long_way(raw, origin, Q)) for raw in raws
     ]
-    make = reader.known(raws[0], Q)
+    make = reader.find_format(raws[0], Q)
     assert make
     together = make.observation(raws, 0.0)
     for i in range(2):
@@ -134,7 +134,7 @@ def plain(n: int = 1, frame_id: str = "camera") -> bytes:
 @BOTH
 def test_no_byte_is_overlooked(origin: str) -> None:
     raw = plain(2)
-    reader = Reader(POINT_CLOUD, DECODERS[origin])
+    reader = MessageReader(POINT_CLOUD, DECODERS[origin])
     for at in range(len(raw)):
         for bit in (1, 2, 128):
             reader(raw, Q)
@@ -146,7 +146,7 @@ def test_no_byte_is_overlooked(origin: str) -> None:
 
 def test_bytes_between_numbers_do_not_matter() -> None:
     raw = bytearray(plain(frame_id="a"))  # after it two bytes that senders leave to chance
-    reader = Reader(POINT_CLOUD, DECODERS["live"])
+    reader = MessageReader(POINT_CLOUD, DECODERS["live"])
     reader(bytes(raw), Q)
     reader._decode = forbidden
     raw[18:20] = b"\xab\xcd"
@@ -182,7 +182,7 @@ def test_nothing_is_read_beyond_the_data(
 
 
 def test_makes_that_take_turns_are_all_remembered_but_not_without_end() -> None:
-    reader = Reader(POINT_CLOUD, DECODERS["live"])
+    reader = MessageReader(POINT_CLOUD, DECODERS["live"])
     raws = [plain(n, frame_id) for n in range(4) for frame_id in ("", "left", "right")]
     for raw in raws:
         reader(raw, Q)
@@ -194,12 +194,12 @@ def test_makes_that_take_turns_are_all_remembered_but_not_without_end() -> None:
         reader(plain(1, f"camera {i}"), Q)
     assert len(reader._makes) == 64
     reader(plain(1, "a" * 5000), Q)  # long: not remembered
-    assert not reader.known(plain(1, "a" * 5000), Q)
+    assert not reader.find_format(plain(1, "a" * 5000), Q)
 
 
 def test_another_type_is_read_by_its_decoder() -> None:
     raw = serialize_message(Float32MultiArray(data=array("f", range(1, 2 * Q + 1))))
-    reader = Reader(MULTI_ARRAY, lambda raw: deserialize_message(raw, Float32MultiArray))
+    reader = MessageReader(MULTI_ARRAY, lambda raw: deserialize_message(raw, Float32MultiArray))
     for _ in range(2):
         header, seen = reader(raw, Q)
         assert header is None and seen.points.ravel().tolist() == list(range(1, 2 * Q + 1))

@@ -157,7 +157,7 @@ def test_frames_lead_from_the_objects_to_the_camera() -> None:
 
 def test_markers_stand_where_the_points_are() -> None:
     lifted = placed()
-    markers = publishing.markers(serialised.Header(), lifted, [(0, 1)], placed=True).markers
+    markers = publishing.markers(serialised.Header(), lifted, [(0, 1)], positioned=True).markers
     for marker in markers:
         position = marker.pose.position
         assert (position.x, position.y, position.z) == (0, 0, 0)

@@ -220,7 +220,7 @@ def test_markers_come_when_someone_listens(start_lifter: StartLifter, connect: C
 def test_steadied_it_follows_slower_and_bridges_a_gap(
     start_lifter: StartLifter, connect: Connect
 ) -> None:
-    start_lifter(**{"smoothing.enabled": True, "smoothing.bridge": 5.0})
+    start_lifter(**{"smoothing.enabled": True, "smoothing.max_gap": 5.0})
     client = connect()
     publisher = client.publisher(PointCloud2)
     here, there = (cloud(pixels(1, seed=seed)) for seed in (0, 1))

@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from deep_nrsfm_ros.data.recording import Recording
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
-from deep_nrsfm_ros.node.lifter_client import Watcher
+from deep_nrsfm_ros.node.lifter_client import LifterClient
 
 KEYPOINTS = 17
 
@@ -42,7 +42,7 @@ def test_keypoints_and_answers_are_joined(
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     executor = SingleThreadedExecutor(context=context)
-    watcher = Watcher(
+    watcher = LifterClient(
         "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
     )
     executor.add_node(watcher)
@@ -80,7 +80,7 @@ def test_odd_points_are_complained_of(domain: int, wrong: str) -> None:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     shown: list[Recording] = []
-    watcher = Watcher(
+    watcher = LifterClient(
         "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
     )
     complaints: list[str] = []

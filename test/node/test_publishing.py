@@ -19,13 +19,13 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.tracking import Tracker
-from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read_observation
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS as FIELDS
 from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
-from deep_nrsfm_ros.messages.serialised import Header, Reader
+from deep_nrsfm_ros.messages.serialised import Header, MessageReader
 from deep_nrsfm_ros.node import lifter, publishing
 from deep_nrsfm_ros.node.message_types import decoder
-from deep_nrsfm_ros.node.subscriptions import Source
+from deep_nrsfm_ros.node.subscriptions import KeypointTopic
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 
 
@@ -50,7 +50,7 @@ def test_clouds_of_any_size_follow_each_other() -> None:
         values = np.frombuffer(message.data, "<f4").reshape(n, p, 4)
         np.testing.assert_array_equal(values[..., :3], wanted.shapes)
         np.testing.assert_array_equal(values[..., 3], wanted.confidence)
-        points, confidence, _ = read(message, POINT_CLOUD, p)
+        points, confidence, _ = read_observation(message, POINT_CLOUD, p)
         np.testing.assert_array_equal(points, wanted.shapes[..., :2])
         np.testing.assert_array_equal(confidence, wanted.confidence)
 
@@ -143,9 +143,9 @@ def test_markers_are_not_made_when_nobody_listens(
         heard: list[bytes] = []
         monkeypatch.setattr(node._points, "publish", heard.append)
         node._lift(
-            Source(
+            KeypointTopic(
                 "/keypoints",
-                Reader(POINT_CLOUD, decoder(POINT_CLOUD)),
+                MessageReader(POINT_CLOUD, decoder(POINT_CLOUD)),
                 Tracker(),
                 DroppedMessages(),
             ),

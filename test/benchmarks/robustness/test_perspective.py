@@ -42,7 +42,7 @@ def test_the_truth_has_no_error(scene: perspective.Scene, monkeypatch: pytest.Mo
     def lift(lifter: Any, intrinsics: Any, points: Any, confidence: Any) -> Any:
         return SimpleNamespace(shapes=np.stack([truth[p.tobytes()] for p in points]))
 
-    monkeypatch.setattr(perspective, "lift_at_place", lift)
+    monkeypatch.setattr(perspective, "lift_perspective", lift)
     monkeypatch.setattr(perspective, "Lifter", lambda *_: None)
     found = perspective.found(None, scene, perspective.CAMERA)  # type: ignore[arg-type]
     assert tuple(found) == tuple(perspective.FIGURES)

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.robustness import reliability
 from benchmarks.robustness.reliability import ALL, Rated
-from deep_nrsfm_ros.lifting.confidence import NEAR, Calibration
+from deep_nrsfm_ros.lifting.confidence import CORRECT_DISTANCE, Calibration
 
 
 def test_from_end_to_end(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -32,7 +32,7 @@ def test_the_fit_finds_what_the_chances_were_made_of() -> None:
     evidence = rng.standard_normal((4000, 10, 5))
     evidence[..., 0], evidence[..., 4] = 1, rng.random((4000, 10)) < 0.3
     hit = rng.random((4000, 10)) < 1 / (1 + np.exp(-evidence @ truth))
-    error = np.where(hit, NEAR / 2, 2 * NEAR)
+    error = np.where(hit, CORRECT_DISTANCE / 2, 2 * CORRECT_DISTANCE)
     parts = [Rated(error, error[i::2], evidence[i::2]) for i in range(2)]
     np.testing.assert_allclose(reliability.fit(parts), truth, atol=0.1)
 
@@ -40,7 +40,7 @@ def test_the_fit_finds_what_the_chances_were_made_of() -> None:
 def test_reliable_confidence_is_told_from_boasting() -> None:
     rng = np.random.default_rng(0)
     chance = rng.random((3000, 10))
-    error = np.where(rng.random(chance.shape) < chance, NEAR / 2, 2 * NEAR)
+    error = np.where(rng.random(chance.shape) < chance, CORRECT_DISTANCE / 2, 2 * CORRECT_DISTANCE)
     fair, boast = (
         dict(reliability.reliability(said, error))[ALL] for said in (chance, chance**0.5)
     )
