@@ -31,12 +31,14 @@ AVAILABLE = _kernel is not None
 def supports(network: Network) -> bool:
     """Return whether the kernel is available and computes a network of this architecture.
 
-    It computes the default variant (`Architecture.is_default_variant`) of up to MOST_LAYERS
-    dictionaries; other variants are left to NumPy and torch.
+    It computes the default variant (`Architecture.is_default_variant`) within its limits of
+    dictionaries, atoms and keypoints; other networks are left to NumPy and torch.
     """
     architecture = network.architecture
     return (
         AVAILABLE
         and architecture.is_default_variant
         and len(architecture.widths) <= _kernel.MOST_LAYERS
+        and max(architecture.widths) <= _kernel.MAX_WIDTH
+        and network.p <= _kernel.MAX_KEYPOINTS
     )

@@ -4,7 +4,10 @@
 
 #include <stddef.h>
 
-#define MOST_LAYERS 64 /* of a network */
+/* Limits of a network: products of these numbers that are computed as `int` cannot overflow. */
+#define MOST_LAYERS 64
+#define MAX_KEYPOINTS 4096
+#define MAX_WIDTH 65536 /* atoms of a dictionary */
 
 /* Columns of matrices are filled up with zeros to a multiple of these. */
 #define FLOATS 16

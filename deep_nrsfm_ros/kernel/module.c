@@ -1,6 +1,9 @@
-/* The module `_kernel`: Python's arrays to C and back. */
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
+/* The module `_kernel`: its entry points of lifting and decoding, which hand Python's arrays to C.
+
+   No argument is trusted: types, lengths, sizes and indices are checked here and in plan_layout.c, and whatever
+   is wrong raises TypeError, ValueError or RuntimeError. Functions of the other files assume what is checked. */
+#include "arguments.h"
+
 #include <stdint.h>
 #include <string.h>
 
@@ -8,106 +11,160 @@
 #include "plan.h"
 #include "training_module.h"
 
-#define LINE 64 /* bytes of the cache, at whose borders all parts begin */
+static const char PLAN[] = "deep_nrsfm_ros.kernel._kernel.plan";
 
-static const char NAME[] = "deep_nrsfm_ros.kernel._kernel.plan";
-
-static void forget(PyObject *capsule) {
-    Plan *k = PyCapsule_GetPointer(capsule, NAME);
-    if (k) PyMem_Free(k->memory), PyMem_Free(k);
+static void plan_free(Plan *k) {
+    if (k) PyMem_Free(k->constants), PyMem_Free(k->scratch);
+    PyMem_Free(k);
 }
 
-/* plan(header int32, floats float32, doubles float64) -> capsule; `compiled.plan` says what is in them. */
+static void plan_destructor(PyObject *capsule) { plan_free(PyCapsule_GetPointer(capsule, PLAN)); }
+
+/* Copy the arrays of a plan into its own memory, and lay it out; return what is wrong with them, NULL if nothing. */
+static const char *plan_fill(Plan *k, const Py_buffer *arrays) {
+    size_t begin[4] = {0}, needed;
+    for (int i = 0; i < 3; i++)
+        if (__builtin_add_overflow(begin[i], TO_CACHE_LINE((size_t)arrays[i].len), &begin[i + 1]))
+            return "the arrays are too large";
+    k->constants = PyMem_Calloc(begin[3] + CACHE_LINE, 1);
+    if (!k->constants) return "there is no memory for the plan";
+    char *memory = (char *)TO_CACHE_LINE((uintptr_t)k->constants);
+    for (int i = 0; i < 3; i++)
+        if (arrays[i].len) memcpy(memory + begin[i], arrays[i].buf, arrays[i].len);
+    const int *header = (const int *)memory;
+    const char *problem = check_header(header, count_items(arrays));
+    if (problem) return problem;
+    problem = lay_out(k, header, (float *)(memory + begin[1]), (double *)(memory + begin[2]),
+                      count_items(arrays + 1), count_items(arrays + 2));
+    if (problem) return problem;
+    if (!lay_out_scratch(k, NULL, &needed) || __builtin_add_overflow(needed, CACHE_LINE, &needed))
+        return "the plan is too large";
+    k->scratch = PyMem_Calloc(needed, 1);
+    if (!k->scratch) return "there is no memory for the plan";
+    lay_out_scratch(k, (char *)TO_CACHE_LINE((uintptr_t)k->scratch), &needed);
+    return NULL;
+}
+
+/* plan(header int32, floats float32, doubles float64) -> capsule; CompiledBackend says what is in them. */
 static PyObject *plan(PyObject *Py_UNUSED(module), PyObject *args) {
-    Py_buffer parts[3];
-    if (!PyArg_ParseTuple(args, "y*y*y*", &parts[0], &parts[1], &parts[2])) return NULL;
-    size_t aligned[4] = {0};
-    for (int i = 0; i < 3; i++) aligned[i + 1] = aligned[i] + (parts[i].len + LINE - 1) / LINE * LINE;
-    const int *header = parts[0].buf;
-    Py_ssize_t lengths[3] = {parts[0].len / 4, parts[1].len / 4, parts[2].len / 8};
-    int sound = lengths[0] > 13 && header[0] > 0 && header[1] > 0 && header[1] <= MOST_LAYERS;
-    sound = sound && header[11] >= 0 && lengths[0] == 12 + header[0] + header[1] + 2 * header[11];
-    Plan *k = sound ? PyMem_Calloc(1, sizeof(Plan)) : NULL;
-    char *memory = NULL;
-    if (k && lay_out(k, header, parts[1].buf, parts[2].buf, lengths)) {
-        size_t needed = scratch(k, NULL);
-        memory = k->memory = PyMem_Calloc(1, aligned[3] + needed + LINE);
-        if (memory) memory += LINE - (uintptr_t)memory % LINE;
-        for (int i = 0; memory && i < 3; i++) memcpy(memory + aligned[i], parts[i].buf, parts[i].len);
-        if (memory) {
-            lay_out(k, (int *)memory, (float *)(memory + aligned[1]), (double *)(memory + aligned[2]),
-                    lengths);
-            scratch(k, memory + aligned[3]);
-        }
-    }
-    for (int i = 0; i < 3; i++) PyBuffer_Release(&parts[i]);
-    if (!memory) {
-        PyMem_Free(k);
-        PyErr_SetString(PyExc_ValueError, "the arrays are not those of a plan, or too large");
-        return NULL;
-    }
-    return PyCapsule_New(k, NAME, forget);
+    static const ArrayArgument expected[3] = {{"header", INT32, 0}, {"floats", FLOAT32, 0}, {"doubles", FLOAT64, 0}};
+    PyObject *objects[3];
+    Py_buffer arrays[3];
+    if (!parse_arguments(args, "OOO:plan", &objects[0], &objects[1], &objects[2])) return NULL;
+    if (!get_arrays(3, expected, objects, arrays)) return NULL;
+    Plan *k = PyMem_Calloc(1, sizeof(Plan));
+    const char *problem = k ? plan_fill(k, arrays) : "there is no memory for the plan";
+    release_arrays(3, arrays);
+    PyObject *capsule = NULL;
+    if (problem)
+        PyErr_Format(PyExc_ValueError, "the arrays are not those of a plan: %s", problem);
+    else
+        capsule = PyCapsule_New(k, PLAN, plan_destructor);
+    if (!capsule) plan_free(k);
+    return capsule;
 }
 
-/* lift(plan, points, confidence, perspective, shapes, rotations, scale, translation, residual, sure, lost):
-   fill the last seven, arrays as in `lifting.Lifted`, and lost (n,) of bytes. */
+/* Return whether each array has n x sizes[i] items. */
+static int lengths_match(int count, const Py_buffer *arrays, const Py_ssize_t *sizes, Py_ssize_t n) {
+    for (int i = 0; i < count; i++) {
+        Py_ssize_t items;
+        if (__builtin_mul_overflow(n, sizes[i], &items) || count_items(arrays + i) != items) return 0;
+    }
+    return 1;
+}
+
+/* lift(plan, points, confidence, perspective, shapes, rotations, scale, translation, residual, confidence,
+   not_lifted): fill the last seven: the arrays of `lifting.Lifted`, float32, and not_lifted (n,) of bool.
+
+   The GIL is held: a lift takes less than waiting for the GIL does, and the scratch memory of a plan serves one
+   lift at a time. The flag makes sure of that also where an object's buffer method lifts with the same plan. */
 static PyObject *lift_objects(PyObject *Py_UNUSED(module), PyObject *args) {
-    PyObject *capsule;
-    Py_buffer b[9];
-    int perspective;
-    if (!PyArg_ParseTuple(args, "Oy*y*pw*w*w*w*w*w*w*", &capsule, &b[0], &b[1], &perspective, &b[2],
-                          &b[3], &b[4], &b[5], &b[6], &b[7], &b[8]))
+    static const ArrayArgument expected[9] = {
+        {"points", FLOAT32, 0},    {"confidence", FLOAT32, 0}, {"shapes", FLOAT32, 1},
+        {"rotations", FLOAT32, 1}, {"scale", FLOAT32, 1},      {"translation", FLOAT32, 1},
+        {"residual", FLOAT32, 1},  {"confidence", FLOAT32, 1}, {"not_lifted", BOOL, 1}};
+    PyObject *capsule, *o[9];
+    Py_buffer arrays[9];
+    int perspective, lifted = 0;
+    if (!parse_arguments(args, "OOOpOOOOOOO:lift", &capsule, &o[0], &o[1], &perspective, &o[2], &o[3], &o[4], &o[5],
+                         &o[6], &o[7], &o[8]))
         return NULL;
-    Plan *k = PyCapsule_GetPointer(capsule, NAME);
-    int sound = k != NULL;
-    if (k) {
-        Py_ssize_t n = b[8].len, p = k->p;
-        const Py_ssize_t each[8] = {2 * p, p, 3 * p, 9, 1, 2, 1, p};
-        float *lifted[6];
-        for (int i = 0; i < 8; i++) sound = sound && b[i].len == 4 * n * each[i];
-        for (int i = 0; i < 6; i++) lifted[i] = b[2 + i].buf;
-        if (sound)
-            lift(k, n, b[0].buf, b[1].buf, perspective, lifted, b[8].buf);
+    Plan *k = PyCapsule_GetPointer(capsule, PLAN);
+    if (!k) return NULL;
+    if (__atomic_exchange_n(&k->busy, 1, __ATOMIC_ACQUIRE))
+        return PyErr_Format(PyExc_RuntimeError, "the plan is in use by another lift");
+    if (get_arrays(9, expected, o, arrays)) {
+        Py_ssize_t n = count_items(arrays + 8), p = k->p;
+        const Py_ssize_t sizes[9] = {2 * p, p, 3 * p, 9, 1, 2, 1, p, 1};
+        float *outputs[6];
+        for (int i = 0; i < 6; i++) outputs[i] = arrays[2 + i].buf;
+        lifted = lengths_match(9, arrays, sizes, n);
+        if (lifted)
+            lift(k, n, arrays[0].buf, arrays[1].buf, perspective, outputs, arrays[8].buf);
         else
             PyErr_SetString(PyExc_ValueError, "the arrays do not fit the plan and each other");
+        release_arrays(9, arrays);
     }
-    for (int i = 0; i < 9; i++) PyBuffer_Release(&b[i]);
-    if (!sound) return NULL;
+    __atomic_store_n(&k->busy, 0, __ATOMIC_RELEASE);
+    if (!lifted) return NULL;
     Py_RETURN_NONE;
 }
 
-/* observe(data, (messages, apart), (height, width), (row_step, point_step), (x, y, confidence), farthest, least,
-   points, confidence): fill the last two; what begins at x, y and confidence in the first message does so `apart` bytes
-   later in the next. */
+/* Set `sum` to the first byte beyond all that is read of n items, each `step` bytes after the one before; n >= 1. */
+static int add_steps(Py_ssize_t n, Py_ssize_t step, Py_ssize_t *sum) {
+    Py_ssize_t bytes;
+    return step >= 0 && !__builtin_mul_overflow(n - 1, step, &bytes) && !__builtin_add_overflow(*sum, bytes, sum);
+}
+
+/* observe(data, (messages, message_step), (objects, keypoints), (object_step, point_step), (x, y, confidence),
+   farthest, least, points, confidence): fill the last two, (messages objects, keypoints, 2) and without the 2.
+
+   Steps and offsets are in bytes; an offset of confidence below 0: there is none. */
 static PyObject *observe_raw(PyObject *Py_UNUSED(module), PyObject *args) {
-    Py_buffer data, points, confidence;
-    Py_ssize_t messages, apart, height, width, row_step, point_step, offset[3], most = -1;
+    static const ArrayArgument expected[3] = {{"data", BYTES, 0}, {"points", FLOAT32, 1}, {"confidence", FLOAT32, 1}};
+    PyObject *objects[3];
+    Py_buffer arrays[3];
+    Py_ssize_t messages, message_step, n, q, object_step, point_step, offset[3], count, end = 0;
     float farthest, least;
-    if (!PyArg_ParseTuple(args, "y*(nn)(nn)(nn)(nnn)ffw*w*", &data, &messages, &apart, &height, &width, &row_step,
-                          &point_step, &offset[0], &offset[1], &offset[2], &farthest, &least, &points, &confidence))
+    if (!parse_arguments(args, "O(nn)(nn)(nn)(nnn)ffOO:observe", &objects[0], &messages, &message_step, &n, &q,
+                         &object_step, &point_step, &offset[0], &offset[1], &offset[2], &farthest, &least,
+                         &objects[1], &objects[2]))
         return NULL;
-    for (int i = 0; i < 3; i++) most = offset[i] > most ? offset[i] : most;
-    Py_ssize_t n = messages * height * width;
-    int sound = apart >= 0 && row_step >= 0 && point_step >= 0 && offset[0] >= 0 && offset[1] >= 0;
-    sound = sound && points.len == 8 * n && confidence.len == 4 * n;
-    sound = sound && (n == 0 || (messages - 1) * apart + (height - 1) * row_step + (width - 1) * point_step + most + 4 <=
-                                    data.len);
-    for (Py_ssize_t m = 0; sound && m < messages; m++) {
-        Places at = {height, width, {offset[0], offset[1], offset[2]}, point_step, row_step};
-        observe_keypoints((const char *)data.buf + m * apart, &at, farthest, least,
-                          (float *)points.buf + 2 * m * height * width,
-                          (float *)confidence.buf + m * height * width);
+    if (!get_arrays(3, expected, objects, arrays)) return NULL;
+    for (int i = 0; i < 3; i++) end = offset[i] > end ? offset[i] : end;
+    int sound = messages >= 0 && n >= 0 && q >= 0 && offset[0] >= 0 && offset[1] >= 0;
+    sound = sound && !__builtin_mul_overflow(messages, n, &count) && !__builtin_mul_overflow(count, q, &count);
+    const Py_ssize_t sizes[2] = {2, 1};
+    sound = sound && lengths_match(2, arrays + 1, sizes, count);
+    if (sound && count) {
+        sound = add_steps(messages, message_step, &end) && add_steps(n, object_step, &end) &&
+                add_steps(q, point_step, &end) && !__builtin_add_overflow(end, (Py_ssize_t)sizeof(float), &end) &&
+                end <= arrays[0].len;
+        Places places = {n, q, {offset[0], offset[1], offset[2]}, point_step, object_step};
+        for (Py_ssize_t m = 0; sound && m < messages; m++)
+            observe_keypoints((const char *)arrays[0].buf + m * message_step, &places, farthest, least,
+                              (float *)arrays[1].buf + 2 * m * n * q, (float *)arrays[2].buf + m * n * q);
     }
-    PyBuffer_Release(&data), PyBuffer_Release(&points), PyBuffer_Release(&confidence);
+    release_arrays(3, arrays);
     if (!sound) return PyErr_Format(PyExc_ValueError, "the arrays do not fit the data");
     Py_RETURN_NONE;
 }
 
 /* choose_vectors(bytes) -> bytes: for tests, which try them all. */
 static PyObject *choose(PyObject *Py_UNUSED(module), PyObject *bytes) {
-    long asked = PyLong_AsLong(bytes);
-    if (asked == -1 && PyErr_Occurred()) return NULL;
-    return PyLong_FromLong(choose_vectors(asked < 64 ? (int)asked : 64));
+    long requested = PyLong_AsLong(bytes);
+    if (requested == -1 && PyErr_Occurred()) return overflow_to_value_error();
+    return PyLong_FromLong(choose_vectors(requested < 16 ? 16 : requested < 64 ? (int)requested : 64));
+}
+
+/* The module has no state of its own. `vector_bytes` belongs to the process: it says what the processor can do. */
+static int module_exec(PyObject *module) {
+    choose_vectors(64);
+    return PyModule_AddIntMacro(module, FLOATS) || PyModule_AddIntMacro(module, DOUBLES) ||
+                   PyModule_AddIntMacro(module, MOST_LAYERS) || PyModule_AddIntMacro(module, MAX_KEYPOINTS) ||
+                   PyModule_AddIntMacro(module, MAX_WIDTH)
+               ? -1
+               : 0;
 }
 
 static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
@@ -116,13 +173,7 @@ static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
                                 {"observe", observe_raw, METH_VARARGS, NULL},
                                 {"choose_vectors", choose, METH_O, NULL},
                                 {NULL, NULL, 0, NULL}};
-static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_kernel", NULL, -1, methods, NULL, NULL, NULL, NULL};
+static PyModuleDef_Slot slots[] = {{Py_mod_exec, (void *)module_exec}, {0, NULL}};
+static PyModuleDef definition = {PyModuleDef_HEAD_INIT, "_kernel", NULL, 0, methods, slots, NULL, NULL, NULL};
 
-PyMODINIT_FUNC PyInit__kernel(void) {
-    PyObject *made = PyModule_Create(&module);
-    choose_vectors(64);
-    if (made && (PyModule_AddIntMacro(made, FLOATS) || PyModule_AddIntMacro(made, DOUBLES) ||
-                 PyModule_AddIntMacro(made, MOST_LAYERS)))
-        Py_CLEAR(made);
-    return made;
-}
+PyMODINIT_FUNC PyInit__kernel(void) { return PyModuleDef_Init(&definition); }

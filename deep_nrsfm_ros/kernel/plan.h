@@ -29,7 +29,8 @@ typedef struct {
     const float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head, *spread, *covariance;
     const double *filling, *turn, *frame, *calibration, *lengths;
     double noise, length, unknown, nearest, residual_spread, least_residual;
-    void *memory;
+    void *constants, *scratch; /* the memory of all above, and of all below */
+    int busy;                  /* whether a lift computes in the scratch memory */
     /* Scratch, for `block` objects at a time. */
     int block, *missing;
     Object *objects, **some;
@@ -37,12 +38,21 @@ typedef struct {
     double *M, *cameras, *seen, *E, *A, *left, *edges, *along, *residual;
 } Plan;
 
-/* compiled.py: point `k` at its parts of three arrays; return whether they have a plan's `lengths`. */
-int lay_out(Plan *k, const int *header, const float *floats, const double *doubles,
-            const ptrdiff_t lengths[3]);
+/* Limits of a plan, as those of a network in algebra.h. */
+#define MAX_ROTATIONS 1024
+#define MAX_BONES 65536
 
-/* Point `k` at its scratch memory, which begins at `at`; return how many bytes it takes. */
-size_t scratch(Plan *k, char *at);
+/* Check the numbers of a plan's header (length): counts, flags, widths and indices of keypoints. Returns what is
+   wrong, NULL if nothing. */
+const char *check_header(const int *header, ptrdiff_t length);
+
+/* Point `k` at its parts of three arrays, of which the header is checked. Returns what is wrong with the lengths
+   of the others or with numbers that the lift divides by, NULL if nothing. */
+const char *lay_out(Plan *k, const int *header, const float *floats, const double *doubles, size_t n_floats,
+                    size_t n_doubles);
+
+/* Point `k` at its scratch memory, NULL to compute only its size in bytes. Returns 0 if that overflows. */
+int lay_out_scratch(Plan *k, char *memory, size_t *size);
 
 /* network.py: set `filled` to the points, the missing filled in. */
 void complete(Plan *k, const Object *o, float *filled);

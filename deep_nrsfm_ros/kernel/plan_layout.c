@@ -1,0 +1,164 @@
+/* Where each part of a plan lies in its arrays, and how much memory it computes with. */
+#include "plan.h"
+
+#include <math.h>
+
+/* Rows of a product, at most: the codes of more do not stay in the cache. */
+#define MAX_ROWS 144
+
+#define HEADER_LENGTH 12
+
+static int in_range(int value, int first, int last) { return first <= value && value <= last; }
+
+/* Check n indices of keypoints. */
+static int all_keypoints(const int *indices, ptrdiff_t n, int p) {
+    int sound = 1;
+    for (ptrdiff_t i = 0; i < n; i++) sound &= in_range(indices[i], 0, p - 1);
+    return sound;
+}
+
+const char *check_header(const int *h, ptrdiff_t length) {
+    if (length < HEADER_LENGTH) return "the header is too short";
+    int p = h[0], layers = h[1], bones = h[11];
+    if (!in_range(p, 1, MAX_KEYPOINTS)) return "the number of keypoints is out of range";
+    if (!in_range(layers, 1, MOST_LAYERS)) return "the number of dictionaries is out of range";
+    if (!in_range(h[2], 1, MAX_ROTATIONS)) return "the number of rotations is out of range";
+    for (int i = 3; i < 7; i++)
+        if (!in_range(h[i], 0, 1)) return "a flag is neither 0 nor 1";
+    if (h[7] < 0) return "the rounds of refilling are negative";
+    if (!(h[8] == -1 && h[9] == -1) && !all_keypoints(h + 8, 2, p)) return "the reference is no pair of keypoints";
+    if (h[10] < 0) return "min_visible is negative";
+    if (!in_range(bones, 0, MAX_BONES)) return "the number of bones is out of range";
+    /* All four are bounded: the sum cannot overflow. */
+    if (length != HEADER_LENGTH + (ptrdiff_t)layers + p + 2 * bones) return "the header has another length";
+    h += HEADER_LENGTH;
+    for (int i = 0; i < layers; i++, h++)
+        if (!in_range(*h, 1, MAX_WIDTH)) return "the width of a dictionary is out of range";
+    if (!all_keypoints(h, p, p)) return "a partner is no keypoint";
+    if (!all_keypoints(h + p, 2 * (ptrdiff_t)bones, p)) return "the end of a bone is no keypoint";
+    return NULL;
+}
+
+/* Items of an array that are not taken; `short_of`: more were requested than there are. */
+typedef struct {
+    size_t left;
+    int short_of;
+} Items;
+
+/* Take rows x columns items; return how many, 0 if there are fewer. */
+static size_t take(Items *items, size_t rows, size_t columns) {
+    size_t count;
+    if (__builtin_mul_overflow(rows, columns, &count) || count > items->left) {
+        items->short_of = 1;
+        return 0;
+    }
+    items->left -= count;
+    return count;
+}
+
+static const float *matrix(Matrix *A, int k, int n, const float *at, Items *items) {
+    A->k = k, A->n = FLOATS_OF(n), A->panels = at;
+    return at + take(items, k, A->n);
+}
+
+const char *lay_out(Plan *k, const int *header, const float *floats, const double *doubles, size_t n_floats,
+                    size_t n_doubles) {
+    const int *h = header;
+    const float *f = floats;
+    const double *d = doubles;
+    Items f_items = {n_floats, 0}, d_items = {n_doubles, 0};
+    k->p = *h++, k->layers = *h++, k->turns = *h++, k->mirrored = *h++, k->whitened = *h++;
+    k->rms = *h++, k->corrected = *h++, k->refill = *h++, k->reference[0] = *h++;
+    k->reference[1] = *h++, k->min_visible = *h++, k->bones = *h++;
+    int p = k->p, wide = k->wide = FLOATS_OF(p), last;
+    k->widths = h, h += k->layers;
+    k->partners = h, h += p;
+    k->ends = h;
+    f = matrix(&k->L, p, p, f, &f_items);
+    f = matrix(&k->L_inverse, p, p, f, &f_items);
+    for (int i = 0; i < k->layers; i++) {
+        int to = k->widths[i], from = i ? k->widths[i - 1] : 0;
+        f = matrix(&k->encoder[i], i ? from : p, i ? to : 3 * FLOATS_OF(to), f, &f_items);
+        k->b[i] = f, f += take(&f_items, FLOATS_OF(to), 1);
+        f = matrix(&k->decoder[i], to, i ? from : 3 * wide, f, &f_items);
+        k->b_[i] = f, f += take(&f_items, k->decoder[i].n, 1);
+    }
+    last = k->widths[k->layers - 1];
+    f = matrix(&k->code_head, 6 * FLOATS_OF(last), last, f, &f_items);
+    k->camera_head = f, f += take(&f_items, last, 1);
+    k->spread = f, f += take(&f_items, p, 1);
+    k->covariance = f, take(&f_items, 9 * DOUBLES_OF(p), DOUBLES_OF(p));
+    k->filling = d, d += take(&d_items, p, p);
+    k->turn = d, d += take(&d_items, k->turns, 4);
+    k->frame = d, d += take(&d_items, 9, 1);
+    k->calibration = d, d += take(&d_items, 5, 1);
+    k->lengths = d, d += take(&d_items, k->bones, 2);
+    take(&d_items, 6, 1);
+    if (f_items.short_of || f_items.left) return "the array of float32 has another length";
+    if (d_items.short_of || d_items.left) return "the array of float64 has another length";
+    k->noise = *d++, k->length = *d++, k->unknown = *d++, k->nearest = *d++;
+    k->residual_spread = *d++, k->least_residual = *d++;
+    const double *scalars = &d[-6];
+    for (int i = 0; i < 6; i++)
+        if (!(scalars[i] >= 0 && scalars[i] < INFINITY)) return "a variance or length is negative or not finite";
+    if (!k->nearest || !k->residual_spread || !k->least_residual) return "a divisor is zero";
+    for (int i = 0; i < 2 * k->bones; i++)
+        if (!(k->lengths[i] > 0 && k->lengths[i] < INFINITY)) return "the length of a bone is not positive and finite";
+    return NULL;
+}
+
+/* Memory that is laid out part by part. */
+typedef struct {
+    char *memory; /* NULL: only the size is computed */
+    size_t size;
+    int overflow;
+} Arena;
+
+/* Return the place of rows x columns items of `item` bytes, at the border of a cache line. */
+static void *room(Arena *arena, size_t item, size_t rows, size_t columns) {
+    void *place = arena->memory ? arena->memory + arena->size : NULL;
+    size_t bytes;
+    arena->overflow |= __builtin_mul_overflow(rows, columns, &bytes) ||
+                       __builtin_mul_overflow(bytes, item, &bytes) || __builtin_add_overflow(bytes, 63, &bytes) ||
+                       __builtin_add_overflow(arena->size, bytes / 64 * 64, &arena->size);
+    return place;
+}
+
+int lay_out_scratch(Plan *k, char *memory, size_t *size) {
+    int n = k->block = 6 * k->turns < MAX_ROWS ? MAX_ROWS / (6 * k->turns) : 1;
+    size_t p = k->p, wide = k->wide, turned = (size_t)n * k->turns, all = k->turns * (1 + k->mirrored);
+    size_t even = DOUBLES_OF(k->p), bones = DOUBLES_OF(k->bones), system = 2 * even + bones;
+    size_t widest = 3 * wide;
+    for (int i = 0; i < k->layers; i++)
+        if ((size_t)FLOATS_OF(k->widths[i]) > widest) widest = FLOATS_OF(k->widths[i]);
+    Arena arena = {memory, 0, 0}, *a = &arena;
+    k->x = room(a, sizeof(float), 4 * n, wide);
+    k->V = room(a, sizeof(float), 6 * n, widest);
+    k->Psi[0] = room(a, sizeof(float), 6 * turned, widest);
+    k->Psi[1] = room(a, sizeof(float), 6 * turned, widest);
+    k->psi[0] = room(a, sizeof(float), turned, widest);
+    k->psi[1] = room(a, sizeof(float), turned, widest);
+    k->shapes = room(a, sizeof(float), 3 * n * all, wide);
+    k->M = room(a, sizeof(double), n * all, 6);
+    k->residual = room(a, sizeof(double), all, 1);
+    k->cameras = room(a, sizeof(double), 6, even);
+    k->seen = room(a, sizeof(double), 2 * DOUBLES, even);
+    k->E = room(a, sizeof(double), 3, even);
+    k->A = room(a, sizeof(double), system, system + DOUBLES);
+    k->left = room(a, sizeof(double), 2, even);
+    k->edges = room(a, sizeof(double), bones, 4);
+    k->along = room(a, sizeof(double), 3 * even, bones);
+    k->missing = room(a, sizeof(int), p, 1);
+    k->some = room(a, sizeof(Object *), n, 1);
+    k->objects = room(a, sizeof(Object), n, 1);
+    Object unused, *o = memory ? k->objects : &unused;
+    for (int i = 0; i < n; i++, o += memory != NULL) {
+        o->points = room(a, sizeof(float), p, 2);
+        o->mask = room(a, sizeof(float), p, 1);
+        o->visible = room(a, sizeof(float), p, 1);
+        o->W = room(a, sizeof(float), p, 2);
+        o->S = room(a, sizeof(float), 3, wide);
+    }
+    *size = arena.size;
+    return !arena.overflow;
+}
