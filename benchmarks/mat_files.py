@@ -54,7 +54,7 @@ def read_category(path: Path) -> NDArray[np.float64]:
 
 
 def observed(W: NDArray[Any], S: NDArray[Any], source: str) -> Dataset:
-    """Return images W (f, p, 2) with their truth S (f, p, 3) as an dataset of nameless points."""
+    """Return images W (f, p, 2) with their truth S (f, p, 3) as a dataset of nameless points."""
     layout = KeypointLayout.numbered(W.shape[1])
     points, shapes = (centre(X).astype(np.float32) for X in (W, S))
     return Dataset(points, np.ones(W.shape[:2], bool), layout, source, shapes)

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 
-def blocks(n: int, size: int = 4096) -> list[slice]:
+def slices(n: int, size: int = 4096) -> list[slice]:
     """Return slices of at most `size` that together are n."""
     return [slice(start, min(start + size, n)) for start in range(0, n, size)]

@@ -39,7 +39,7 @@ class Solved(NamedTuple):
 
 
 def solve(session: Session, name: str, dataset: Dataset) -> Solved:
-    """Return a baseline's errors on an dataset with ground truth, kept in the output folder."""
+    """Return a baseline's errors on a dataset with ground truth, kept in the output folder."""
     digest = hashlib.sha256(name.encode() + dataset.points.tobytes()).hexdigest()[:10]
     path = session.output / "baselines" / f"{digest}.json"
     if not path.exists():

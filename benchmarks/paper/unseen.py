@@ -77,7 +77,7 @@ def _compare(
 
 
 def errors(model: Model, test: Dataset, options: LiftingOptions) -> dict[str, float]:
-    """Return the figures of a model on an dataset with ground truth, the paper's metric too."""
+    """Return the figures of a model on a dataset with ground truth, the paper's metric too."""
     if test.shapes is None:
         raise ValueError(f"{test.source} has no ground truth to compare with")
     S = reconstruct(Lifter(model, options), test)

@@ -30,7 +30,7 @@ from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre
-from deep_nrsfm_ros.nrsfm.metrics import camera_errors, degrees
+from deep_nrsfm_ros.nrsfm.metrics import camera_errors, rotation_angles
 
 Floats = NDArray[Any]
 
@@ -167,7 +167,7 @@ def lift(
 def jitter(shapes: Floats) -> float:
     """Return the median angle, in degrees, from each shape of (f, p, 3) to the next."""
     S = centre(shapes[np.isfinite(shapes).all((1, 2))].astype(float))
-    return float(np.median(degrees(align(S[:-1], S[1:]).rotation)))
+    return float(np.median(rotation_angles(align(S[:-1], S[1:]).rotation)))
 
 
 def mean_shape(shapes: Floats) -> Floats:

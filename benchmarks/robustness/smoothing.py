@@ -23,7 +23,7 @@ from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.geometry import centre
-from deep_nrsfm_ros.nrsfm.metrics import degrees, procrustes_distances
+from deep_nrsfm_ros.nrsfm.metrics import procrustes_distances, rotation_angles
 
 Floats = NDArray[Any]
 
@@ -151,7 +151,7 @@ def figures(lifted: Lifted, steady: Lifted, clip: Clip) -> dict[str, float]:
     """Return the `FIGURES` of the answers `steady` of a filter to what was lifted."""
     S, R = steady.shapes.astype(float), steady.rotations
     S = S / np.sqrt((S * S).sum(2).mean(1))[:, None, None]
-    turns = degrees(R[1:] @ R[:-1].swapaxes(1, 2))
+    turns = rotation_angles(R[1:] @ R[:-1].swapaxes(1, 2))
     shown: dict[str, float] = {
         "rotation deg": float(np.nanmedian(turns)),
         "points %": 100 * _middle(np.diff(S, axis=0)),

@@ -1,4 +1,4 @@
-"""How fast bags become an dataset, against rosbags that only decodes their messages."""
+"""How fast bags become a dataset, against rosbags that only decodes their messages."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def benchmark(given: Namespace) -> Iterator[Table]:
         ("messages/s", "share"),
         {
             BARE: "Reader.messages and deserialize_cdr, nothing kept",
-            OURS: "into an dataset: decoded, checked, mapped to a layout",
+            OURS: "into a dataset: decoded, checked, mapped to a layout",
             "share": f"of the messages/s of {BARE}",
         },
         bars("messages/s"),

@@ -102,7 +102,7 @@ def reconstruct(lifter: Lifter, dataset: Dataset) -> NDArray[np.float32]:
 
 
 def evaluate(model: Model, dataset: Dataset, options: LiftingOptions) -> ShapeErrors:
-    """Lift every frame of an dataset with ground truth and compare."""
+    """Lift every frame of a dataset with ground truth and compare."""
     if dataset.shapes is None:
         raise ValueError(f"{dataset.source} has no ground truth to compare with")
     return shape_errors(reconstruct(Lifter(model, options), dataset), dataset.shapes)

@@ -151,8 +151,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)
-    lifted, total = recording.sound.sum(), len(recording.seen)
-    frames = len(recording.seen.stamps)
+    lifted, total = recording.is_lifted.sum(), len(recording.detections)
+    frames = len(recording.detections.stamps)
     print(f"{given.output}: {lifted} of {total} objects in {frames} frames lifted")
     if lifted < total:
         warn(f"{total - lifted} objects have too few visible keypoints, or all on one line")

@@ -21,8 +21,8 @@ from deep_nrsfm_ros.commands.program import program
 from deep_nrsfm_ros.configuration import override
 from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.keypoint_files import KINDS, is_bag
-from deep_nrsfm_ros.data.lifted_bags import has_answers, read_answers
-from deep_nrsfm_ros.data.recording import Recording, lifted_before
+from deep_nrsfm_ros.data.lifted_bags import has_lifted_messages, read_lifted_messages
+from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -75,17 +75,17 @@ def read_recording(
     """Return the recording, and in words where its shapes come from; raise ValueError if none."""
     if not given.input.exists():
         raise ValueError(f"{given.input} does not exist")
-    if given.lift_again or not is_bag(given.input) or not has_answers(given.input):
+    if given.lift_again or not is_bag(given.input) or not has_lifted_messages(given.input):
         seen = read_objects(given, source)
         return lift_objects(given, model, source, seen), f"lifted with model {model.name}"
     with progress("reading answers") as on_progress:
-        answers = read_answers(given.input, on_progress, warn)
+        answers = read_lifted_messages(given.input, on_progress, warn)
     try:
         seen_then = read_objects(given, source)
     except BagError as error:
         warn(f"showing the answers without keypoints: {error}")
         seen_then = None
-    recording = lifted_before(answers, seen_then, source, model.layout)
+    recording = join_lifted_messages(answers, seen_then, source, model.layout)
     return recording, f"as recorded; drawn as model {model.name}"
 
 

@@ -24,7 +24,7 @@ from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.bags import most_keypoints, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.sufficiency import Variation
+from deep_nrsfm_ros.data.sufficiency import Sufficiency
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
@@ -43,7 +43,7 @@ from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Preset, Recipe
 from deep_nrsfm_ros.reporting.page import Training, write_report
-from deep_nrsfm_ros.reporting.shapes import doubt
+from deep_nrsfm_ros.reporting.shapes import handedness_warning
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, keep_what_is_fixed, start_from
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
@@ -229,7 +229,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     check_room(given.output, limits.free_disk)
     if importlib.util.find_spec("torch") is None:
         raise ValueError("training needs torch, which is not installed: pip install torch")
-    curated, variation = prepare(given, read_data(given, report), report.say)
+    curated, sufficiency = prepare(given, read_data(given, report), report.say)
     asked = {name: value for name, value in vars(given).items() if name not in NOT_ASKED}
     for options in (*preset, override(LayoutLossWeights(), given), limits, chosen_curation(given)):
         asked |= dataclasses.asdict(options)
@@ -237,7 +237,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
     others = nullcontext(checkpoint_file(given.output, given.name))
     first = keep_record(given.output, given.name, asked, resume=given.resume)
     with others if rank() else first as checkpoint:
-        learn(given, preset, limits, start, curated, variation, checkpoint, report, should_stop)
+        learn(given, preset, limits, start, curated, sufficiency, checkpoint, report, should_stop)
 
 
 def learn(
@@ -246,7 +246,7 @@ def learn(
     limits: Limits,
     start: Model | None,
     curated: Curated,
-    variation: Variation,
+    sufficiency: Sufficiency,
     checkpoint: Path,
     report: Reporter,
     should_stop: Callable[[], bool],
@@ -295,11 +295,11 @@ def learn(
     if start:
         model = inherit(model, start)
     save_model(model_path, model)
-    depth = doubt(model, dataset)
+    depth = handedness_warning(model, dataset)
     if depth:
         report.warn(depth)
     whole = Training(
-        *(model, model_path, dataset, curated, variation, report.curves, report.warnings)
+        *(model, model_path, dataset, curated, sufficiency, report.curves, report.warnings)
     )
     html = write_page(whole, report, compare=bool(trainer.ended))
     state, message = "finished", f"{model_path} {json.dumps(model.quality)}"

@@ -139,7 +139,7 @@ def open_bag(path: Path) -> BagFile:
     return bag
 
 
-def answer_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
+def lifter_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
     """Return the topics `points` and `camera_rotation` of every lifter that was recorded."""
     topics = {topic.name: topic for topic in bag.topics}
     pairs = []

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-from deep_nrsfm_ros.data.bag_files import BagError, BagFile, Topic, answer_topics
+from deep_nrsfm_ros.data.bag_files import BagError, BagFile, Topic, lifter_topics
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, InputType
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.topics import WILDCARD, match
@@ -38,7 +38,7 @@ def keypoint_topics(bag: BagFile, name: str, mapping: FieldMapping | None) -> li
         found = [t for t in bag.topics if match(name, t.name) is not None]
     else:
         wanted = [mapping.type] if mapping else INPUT_TYPES
-        answers = {points.name for points, _ in answer_topics(bag)}  # of such a type, but not meant
+        answers = {points.name for points, _ in lifter_topics(bag)}  # of such a type, but not meant
         found = [t for t in bag.topics if t.input_type in wanted and t.name not in answers]
     if not found or len(found) > 1 and WILDCARD not in name:
         many = f"{len(found)} topics called {name}" if name else f"{len(found)} keypoint topics"

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
-from deep_nrsfm_ros.data.dataset import Dataset, EnsembleBuilder
+from deep_nrsfm_ros.data.dataset import Dataset, DatasetBuilder
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import MessageError
@@ -80,7 +80,7 @@ def read_bags(
     Memory stays within about twice the dataset. Raises BagError naming the bag when one is
     missing, damaged beyond reading or without such a topic, or when no message is readable.
     """
-    frames, warnings = EnsembleBuilder(KeypointMap(source, target), min_confidence), []
+    frames, warnings = DatasetBuilder(KeypointMap(source, target), min_confidence), []
     messages, unreadable, reason = 0, 0, ""
     if not paths:
         raise BagError("no bag to read; name at least one")
@@ -172,7 +172,7 @@ def frames(
 ) -> Iterator[Frame]:
     """Yield one frame each of points (f, q, 2) and confidence (f, q), `rate` a second.
 
-    start: stamp of the first frame in ns. An `Dataset` gives `points` and, as confidence,
+    start: stamp of the first frame in ns. A `Dataset` gives `points` and, as confidence,
     `visible`.
     """
     for i in range(len(points)):

@@ -1,4 +1,4 @@
-"""What of an dataset is fit to be learned from: the rest is left out, counted and shown."""
+"""What of a dataset is fit to be learned from: the rest is left out, counted and shown."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.batched import blocks
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.configuration import check, option
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.outliers import find_outliers
@@ -46,12 +46,12 @@ class Curation:
     )
 
 
-AS_IT_IS = Curation(min_visible=0, min_change=0.0, outlier_threshold=0.0)
+KEEP_ALL = Curation(min_visible=0, min_change=0.0, outlier_threshold=0.0)
 """Everything turned off."""
 
 
 @dataclass(frozen=True)
-class Suspect:
+class OutlierFrame:
     """A frame with outliers.
 
     frame: its place in the data as given. points: (p, 2) and visible: (p,) as given.
@@ -69,23 +69,23 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Curated:
-    """What is left of an dataset, and what became of the rest.
+    """What is left of a dataset, and what became of the rest.
 
-    frames: (f,) where each frame of `dataset` was among the `given` ones.
+    frames: (f,) where each frame of `dataset` was among all `total` ones.
     few_visible, near_duplicates, inconsistent: frames left out, each counted once.
-    hidden: (p,) how often each keypoint was hidden in frames that stayed, which are `mended`.
-    suspects: some frames with outliers, the worst first.
+    hidden: (p,) how often each keypoint was hidden in frames that stayed, which are `corrected`.
+    outlier_frames: some frames with outliers, the worst first.
     """
 
     dataset: Dataset
     frames: NDArray[np.int64]
-    given: int
+    total: int
     few_visible: int
     near_duplicates: int
     inconsistent: int
-    mended: int
+    corrected: int
     hidden: NDArray[np.int64]
-    suspects: tuple[Suspect, ...]
+    outlier_frames: tuple[OutlierFrame, ...]
 
     @property
     def summary(self) -> str:
@@ -97,9 +97,10 @@ class Curated:
         }
         parts = [f"{count} {what}" for what, count in out.items() if count]
         sentences = [f"left out {', '.join(parts)}"] if parts else []
-        if self.mended:
-            sentences.append(f"hid {self.hidden.sum()} outlying keypoints in {self.mended} frames")
-        return f"of {self.given} frames, {'; '.join(sentences)}" if sentences else ""
+        if self.corrected:
+            hidden = self.hidden.sum()
+            sentences.append(f"hid {hidden} outlying keypoints in {self.corrected} frames")
+        return f"of {self.total} frames, {'; '.join(sentences)}" if sentences else ""
 
     @property
     def hidden_by_name(self) -> list[tuple[str, int, int]]:
@@ -112,10 +113,10 @@ class Curated:
     def warnings(self) -> tuple[str, ...]:
         """Return a sentence for each count that is suspiciously high."""
         found = []
-        judged = self.given - self.few_visible - self.near_duplicates
-        if self.few_visible > 0.5 * self.given:
+        judged = self.total - self.few_visible - self.near_duplicates
+        if self.few_visible > 0.5 * self.total:
             found.append(
-                f"{self.few_visible} of {self.given} frames show too few keypoints; look at the "
+                f"{self.few_visible} of {self.total} frames show too few keypoints; look at the "
                 "detector, --min-confidence and the keypoint layout"
             )
         if self.inconsistent > _SUSPICIOUS * judged:
@@ -148,7 +149,8 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
         )
     frames = np.flatnonzero(enough)
     if options.min_change:
-        frames = frames[novel(dataset.points[frames], dataset.visible[frames], options.min_change)]
+        points, visible = dataset.points[frames], dataset.visible[frames]
+        frames = frames[changed_frames(points, visible, options.min_change)]
     judged, visible = len(frames), dataset.visible[frames]
     outliers: Bools = np.zeros_like(visible)
     worst: NDArray[np.float64] = np.zeros(judged)
@@ -158,8 +160,9 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
     stay = (number <= _HOPELESS * visible.sum(1)) & (
         (number == 0) | (visible.sum(1) - number >= options.min_visible)
     )
+    order = np.argsort(-worst, kind="stable")
     suspects = tuple(
-        Suspect(
+        OutlierFrame(
             int(frames[i]),
             dataset.points[frames[i]],
             visible[i],
@@ -167,7 +170,7 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
             float(worst[i]),
             not stay[i],
         )
-        for i in apart(np.argsort(-worst, kind="stable"), frames, _APART * len(dataset), _EXAMPLES)
+        for i in spread_out(order, frames, _APART * len(dataset), _EXAMPLES)
         if number[i]
     )
     kept = dataset[frames[stay]]
@@ -186,7 +189,9 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
     )
 
 
-def apart(order: NDArray[np.int64], frames: NDArray[np.int64], gap: float, most: int) -> list[int]:
+def spread_out(
+    order: NDArray[np.int64], frames: NDArray[np.int64], gap: float, most: int
+) -> list[int]:
     """Return the first of `order` whose frames are more than `gap` frames from each other.
 
     order: indices into frames (f,). The neighbours of a frame show the same thing once more.
@@ -200,7 +205,7 @@ def apart(order: NDArray[np.int64], frames: NDArray[np.int64], gap: float, most:
     return chosen
 
 
-def novel(points: NDArray[np.float32], visible: Bools, least: float) -> Bools:
+def changed_frames(points: NDArray[np.float32], visible: Bools, least: float) -> Bools:
     """Tell (f,) which of the frames (f, p, 2) differ from the few kept before them.
 
     A frame that shows no other keypoints than a kept one, and whose points, centred and scaled by
@@ -208,7 +213,7 @@ def novel(points: NDArray[np.float32], visible: Bools, least: float) -> Bools:
     """
     kept = np.zeros(len(points), bool)
     recent: deque[_Kept] = deque(maxlen=_RECENT)
-    for part in blocks(len(points)):
+    for part in slices(len(points)):
         seen = visible[part]
         fitted = _fitted(points[part], seen)
         patterns = (int.from_bytes(row) for row in np.packbits(seen, 1))

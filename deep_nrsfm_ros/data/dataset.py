@@ -75,7 +75,7 @@ def concatenate(datasets: list[Dataset]) -> Dataset:
     )
 
 
-class EnsembleBuilder:
+class DatasetBuilder:
     """Objects gathered block by block, so that memory holds arrays, not messages.
 
     count: how many there are.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from deep_nrsfm_ros.data.bag_files import BagError, BagFile, Topic, answer_topics, open_bag
+from deep_nrsfm_ros.data.bag_files import BagError, BagFile, Topic, lifter_topics, open_bag
 from deep_nrsfm_ros.data.bags import STORAGES, point_cloud
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import stamp_of
@@ -27,7 +27,7 @@ _STORE = get_typestore(Stores.ROS2_JAZZY)
 _CLOUD, _QUATERNION = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/QuaternionStamped"
 
 
-class Answer(NamedTuple):
+class LiftedMessage(NamedTuple):
     """What the lifter said of one frame: n objects of p keypoints.
 
     stamp: ns. shapes: (n, p, 3) camera axes, NaN where not lifted. confidence: (n, p).
@@ -40,20 +40,20 @@ class Answer(NamedTuple):
     rotation: NDArray[np.float32] | None
 
 
-def has_answers(path: Path) -> bool:
+def has_lifted_messages(path: Path) -> bool:
     """Tell whether a lifter's answers were recorded in the bag; raise BagError for no bag."""
     with closing(open_bag(path)) as bag:
-        return any(points.total for points, _ in answer_topics(bag))
+        return any(points.total for points, _ in lifter_topics(bag))
 
 
-def read_answers(
+def read_lifted_messages(
     path: Path,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     warn: Callable[[str], None] = lambda message: None,
-) -> list[Answer]:
+) -> list[LiftedMessage]:
     """Return the answers in a bag by time; raise BagError unless they are of one lifter."""
     with closing(open_bag(path)) as bag:
-        pairs = answer_topics(bag)
+        pairs = lifter_topics(bag)
         if len(pairs) != 1:
             names = ", ".join(points.name for points, _ in pairs) or "none"
             raise BagError(f"bag {path} has {len(pairs)} lifters' points ({names}); expected one")
@@ -65,7 +65,8 @@ def read_answers(
         answers = []
         for stamp, message in _messages(bag, points, warn):
             values = read_points(message)
-            answers.append(Answer(stamp, values[..., :3], values[..., 3], rotations.get(stamp)))
+            shapes, confidence = values[..., :3], values[..., 3]
+            answers.append(LiftedMessage(stamp, shapes, confidence, rotations.get(stamp)))
             on_progress(len(answers), max(len(answers), points.total))
     return sorted(answers, key=lambda answer: answer.stamp)
 
@@ -87,7 +88,7 @@ def _messages(bag: BagFile, topic: Topic, warn: Callable[[str], None]) -> list[t
     return found
 
 
-def write_answers(path: Path, seen: Detections, lifted: Lifted, storage: str = "mcap") -> int:
+def write_lifted_bag(path: Path, seen: Detections, lifted: Lifted, storage: str = "mcap") -> int:
     """Write a bag as a recording of the lifter at work; return how many messages it has.
 
     seen: the keypoints, on `KEYPOINTS`; lifted: what came of them, as the lifter publishes it.

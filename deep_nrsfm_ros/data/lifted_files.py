@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.data.lifted_bags import write_answers
+from deep_nrsfm_ros.data.lifted_bags import write_lifted_bag
 from deep_nrsfm_ros.data.recording import Recording
 
 _DIGITS = 6  # of numbers in JSON
@@ -42,7 +42,7 @@ def write_recording(path: Path, recording: Recording, model: str) -> None:
         text = json.dumps(_document(recording, model), allow_nan=False)
         _replace(path, lambda file: file.write(text.encode()))
     else:
-        write_answers(path, recording.seen, recording.lifted)
+        write_lifted_bag(path, recording.detections, recording.lifted)
 
 
 def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
@@ -58,7 +58,7 @@ def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
 
 def _arrays(recording: Recording, model: str) -> dict[str, NDArray[Any]]:
     """Return the arrays of an npz: those of `Lifted` (m, ...) and what they are of."""
-    seen, target = recording.seen, recording.target
+    seen, target = recording.detections, recording.target
     return recording.lifted._asdict() | {
         "frame": seen.frame,
         "identities": seen.identities,
@@ -71,7 +71,7 @@ def _arrays(recording: Recording, model: str) -> dict[str, NDArray[Any]]:
 
 def _document(recording: Recording, model: str) -> dict[str, Any]:
     """Return the same, frame by frame, for JSON; objects that were not lifted are left out."""
-    seen, target, sound = recording.seen, recording.target, recording.sound
+    seen, target, sound = recording.detections, recording.target, recording.is_lifted
     frames: list[dict[str, Any]] = [
         {"stamp": stamp, "objects": []} for stamp in seen.stamps.tolist()
     ]

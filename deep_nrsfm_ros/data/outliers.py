@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.batched import blocks
+from deep_nrsfm_ros.batched import slices
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -153,7 +153,7 @@ def find_outliers(
     """
     model = PointModel.fit(points, visible, threshold)
     outliers, worst = np.zeros_like(visible), np.zeros(len(points))
-    for part in blocks(len(points)):
+    for part in slices(len(points)):
         outliers[part], worst[part] = _judge(model, points[part], visible[part], threshold)
     return outliers, worst
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.detections import Detections, gather
-from deep_nrsfm_ros.data.lifted_bags import Answer
+from deep_nrsfm_ros.data.lifted_bags import LiftedMessage
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
@@ -24,18 +24,19 @@ _TOGETHER = 50_000_000  # ns within which an answer and keypoints are of one fra
 
 @dataclass(frozen=True)
 class Recording:
-    """The m objects of a recording: `seen` in the layout `source`, `lifted` in that of `target`.
+    """The m objects of a recording.
 
-    Objects that were not lifted are NaN with confidence 0.
+    `detections` are in the layout `source`, `lifted` in the layout `target`. Objects that were
+    not lifted are NaN with confidence 0.
     """
 
     source: KeypointLayout
     target: KeypointLayout
-    seen: Detections
+    detections: Detections
     lifted: Lifted
 
     @property
-    def sound(self) -> NDArray[np.bool_]:
+    def is_lifted(self) -> NDArray[np.bool_]:
         """Tell (m,) which objects were lifted."""
         sound: NDArray[np.bool_] = ~np.isnan(self.lifted.shapes.sum((1, 2)))
         return sound
@@ -59,8 +60,8 @@ def lift_recording(
     return Recording(source, target, seen, lift_all(lift, points, confidence, on_progress))
 
 
-def lifted_before(
-    answers: Sequence[Answer],
+def join_lifted_messages(
+    answers: Sequence[LiftedMessage],
     seen: Detections | None,
     source: KeypointLayout,
     target: KeypointLayout,
@@ -96,7 +97,7 @@ def lifted_before(
     return Recording(source, target, seen, lifted)
 
 
-def _rows(seen: Detections, answer: Answer) -> NDArray[np.int64]:
+def _rows(seen: Detections, answer: LiftedMessage) -> NDArray[np.int64]:
     """Return the rows of `seen` that an answer is about, in its order."""
     if not len(seen.stamps):
         return np.empty(0, np.int64)
@@ -106,7 +107,7 @@ def _rows(seen: Detections, answer: Answer) -> NDArray[np.int64]:
     return np.flatnonzero(seen.frame == frame)[: len(answer.shapes)]
 
 
-def _unseen(answers: Sequence[Answer], keypoints: int) -> Detections:
+def _unseen(answers: Sequence[LiftedMessage], keypoints: int) -> Detections:
     """Return frames for answers of which nobody recorded the keypoints."""
     shown = [np.zeros((len(answer.shapes), keypoints), np.float32) for answer in answers]
     nothing = [Observation(np.zeros((*c.shape, 2), np.float32), c) for c in shown]

@@ -1,4 +1,4 @@
-"""Whether an dataset varies enough for NRSfM, from the 2D keypoints alone.
+"""Whether a dataset varies enough for NRSfM, from the 2D keypoints alone.
 
 Depth shows only where the object turns against the camera, and a shape basis only where it
 deforms. Both leave traces in the spectrum of the stacked W (2 f x p): rank two is a flat object
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.batched import blocks
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.nrsfm.geometry import on_one_line, polar
 
@@ -31,7 +31,7 @@ _ROUNDS = 10  # of filling missing points, for each rank
 
 
 @dataclass(frozen=True)
-class Variation:
+class Sufficiency:
     """What the data shows.
 
     frames: how many. points: keypoints that are seen often enough to count.
@@ -60,7 +60,7 @@ class Variation:
         )
 
 
-def examine(dataset: Dataset) -> Variation:
+def assess_sufficiency(dataset: Dataset) -> Sufficiency:
     """Tell whether a model can be learned from the dataset; deterministic, within a second."""
     seen = dataset.visible.sum(0)
     counts = seen >= max(1, _RARELY * len(dataset))
@@ -74,7 +74,7 @@ def examine(dataset: Dataset) -> Variation:
             "least 4, better 8; check the layout and lower --min-confidence",
         )
     lines = np.zeros(len(dataset), bool)
-    for part in blocks(len(dataset)):
+    for part in slices(len(dataset)):
         seen_there = dataset.visible[part][:, counts]
         lines[part] = on_one_line(dataset.points[part][:, counts], seen_there)
     usable = (dataset.visible[:, counts].sum(1) >= 3) & ~lines
@@ -103,7 +103,7 @@ def examine(dataset: Dataset) -> Variation:
     deformation = float(np.sqrt(max(0.0, 1 - (values[:3] ** 2).sum())))
     found = (frames, points, tuple(values.tolist()), span, deformation)
     refusal = _flatness(values)
-    return Variation(*found, refusal, () if refusal else _doubts(frames, span, deformation))
+    return Sufficiency(*found, refusal, () if refusal else _doubts(frames, span, deformation))
 
 
 def view_span(motion: Floats) -> float:
@@ -134,9 +134,9 @@ def view_span(motion: Floats) -> float:
     return float(np.percentile(angles, 90))
 
 
-def _refused(frames: int, points: int, refusal: str) -> Variation:
+def _refused(frames: int, points: int, refusal: str) -> Sufficiency:
     """Return a refusal for data too small to have a spectrum."""
-    return Variation(frames, points, (), 0.0, 0.0, refusal, ())
+    return Sufficiency(frames, points, (), 0.0, 0.0, refusal, ())
 
 
 def _flatness(values: Floats) -> str:

@@ -23,7 +23,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.batched import blocks
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.nrsfm.bones import Bones, shares
 from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, random_cameras, rotation_from_camera
 
@@ -57,7 +57,7 @@ def correct(
     if n > _BLOCK:
         parts = [
             correct(S[b], M[b], W[b], visible[b], covariance, noise[b], bones)
-            for b in blocks(n, _BLOCK)
+            for b in slices(n, _BLOCK)
         ]
         return np.concatenate(parts)
     M = (M if M.ndim == 4 else M[:, None]).astype(np.float64)
@@ -75,7 +75,7 @@ def correct(
     r = ((W - (S[..., None, :] @ M)[..., 0, :]) * visible[..., None]).reshape(n, 2 * p)
     E = _mean(covariance, H, R, r)
     if bones is not None:
-        G, wanted, varies = bones.observe(S + E.reshape(S.shape))
+        G, wanted, varies = bones.length_constraint(S + E.reshape(S.shape))
         b = wanted.shape[1]
         R = np.pad(R, ((0, 0), (0, b), (0, b)))
         R[:, 2 * p :, 2 * p :] = varies + least * np.eye(b)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.batched import blocks
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.kernel import supports
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
@@ -159,7 +159,7 @@ def lift_all(
     on_progress: called with how many are done and how many there are.
     """
     parts = []
-    for part in blocks(len(points), _BLOCK) or [slice(0)]:
+    for part in slices(len(points), _BLOCK) or [slice(0)]:
         parts.append(lifter(points[part], confidence[part]))
         on_progress(part.stop, len(points))
     return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))

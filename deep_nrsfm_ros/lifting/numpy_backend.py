@@ -23,7 +23,7 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     weak_perspective,
 )
 from deep_nrsfm_ros.nrsfm.network import Network, reconstruct
-from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, observe
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 
 Float32 = NDArray[np.float32]
 
@@ -110,7 +110,7 @@ class NumpyBackend:
         The network sees the points (n, p, 2) of mask (n, p, 1); the correction the visible alone.
         """
         known = self.known
-        W, gain, unit, origin = observe(known.network, known.normaliser, points, mask)
+        W, gain, unit, origin = normalise(known.network, known.normaliser, points, mask)
         S, M, residual = self._average(gain * W, W, visible, unit if perspective else None)
         R = rotation_from_camera(M)
         if known.covariance is not None:

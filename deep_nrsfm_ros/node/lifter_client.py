@@ -15,8 +15,8 @@ from sensor_msgs.msg import PointCloud2
 
 from deep_nrsfm_ros.data.detections import gather
 from deep_nrsfm_ros.data.keypoint_files import stamp_of
-from deep_nrsfm_ros.data.lifted_bags import Answer
-from deep_nrsfm_ros.data.recording import Recording, lifted_before
+from deep_nrsfm_ros.data.lifted_bags import LiftedMessage
+from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, read_observation, read_points
@@ -52,7 +52,7 @@ class LifterClient(Node):
         self._source, self._target, self._show = source, target, show
         self._min_confidence, self._size = min_confidence, size
         self._seen: OrderedDict[int, Observation] = OrderedDict()  # by stamp; 0: has no header
-        self._waiting: Answer | None = None
+        self._waiting: LiftedMessage | None = None
         self._keypoints = self.resolve_topic_name(keypoints)
         lifter = lifter.rstrip("/")
         self.create_subscription(PointCloud2, f"{lifter}/points", self._take_points, 10)
@@ -96,7 +96,7 @@ class LifterClient(Node):
         except ValueError as problem:
             self._complain(str(problem))
             return
-        self._waiting = Answer(stamp_of(message), values[..., :3], values[..., 3], None)
+        self._waiting = LiftedMessage(stamp_of(message), values[..., :3], values[..., 3], None)
 
     def _take_rotation(self, message: QuaternionStamped) -> None:
         """Show the points that were waiting for it."""
@@ -114,7 +114,7 @@ class LifterClient(Node):
         seen = self._seen.get(answer.stamp) or self._seen.get(0)
         detections = seen and gather([seen], [answer.stamp], len(self._source))
         try:
-            self._show(lifted_before([answer], detections, self._source, self._target))
+            self._show(join_lifted_messages([answer], detections, self._source, self._target))
         except ValueError as problem:
             self._complain(str(problem))
 

@@ -27,7 +27,7 @@ class Bones(NamedTuple):
     lengths: NDArray[np.float64]  # (b,) shares of the sum of all
     spread: NDArray[np.float64]  # (b,) their standard deviations
 
-    def observe(self, X: Floats) -> tuple[Floats, Floats, Floats]:
+    def length_constraint(self, X: Floats) -> tuple[Floats, Floats, Floats]:
         """Return what shapes X (n, p, 3) lack of the lengths: G (n, b, 3p), (n, b), (n, b, b).
 
         That is: by how much each bone grows with the shape, should grow, and the covariance of

@@ -20,7 +20,7 @@ def votes(S: Floats, layout: KeypointLayout) -> Floats:
     """Return how far (f, v) each shape's front keypoints are before the plane of the other three.
 
     One column for each of `KeypointLayout.handedness`, in RMS radii of the shape: positive on the
-    real object, negative where depth is mirrored. A distance, and not the tetrahedron's volume,
+    real object, negative where depth is is_mirrored. A distance, and not the tetrahedron's volume,
     in which four keypoints far from each other would outvote all others.
     Raises ValueError if the layout has no handedness.
     """
@@ -34,8 +34,8 @@ def votes(S: Floats, layout: KeypointLayout) -> Floats:
     return found
 
 
-def mirrored(S: Floats, layout: KeypointLayout, seen: NDArray[np.bool_] | None = None) -> bool:
-    """Return whether the shapes (f, p, 3) are mirrored on the whole.
+def is_mirrored(S: Floats, layout: KeypointLayout, seen: NDArray[np.bool_] | None = None) -> bool:
+    """Return whether the shapes (f, p, 3) are is_mirrored on the whole.
 
     Each vote counts by its median over the shapes, so that a few that are wrong, a keypoint close
     to its plane and one that is as often behind it as before it say little. Where `seen` (f, p)
@@ -48,7 +48,7 @@ def disagreement(S: Floats, layout: KeypointLayout, seen: NDArray[np.bool_] | No
     """Return what somebody who uses a model that lifts shapes (f, p, 3) should know, or "".
 
     On a sound one no vote is against most of the shapes. Where one is, depth is wrong in part, and
-    no mirroring of the whole mends it. `seen` as in `mirrored`.
+    no mirroring of the whole mends it. `seen` as in `is_mirrored`.
     """
     heard = _heard(S, layout, seen) if layout.handedness else []
     shares = [(front, (vote > 0).mean()) for (*_, front), vote in heard]
@@ -67,14 +67,14 @@ def object_frame(
 ) -> NDArray[np.float32]:
     """Return the orthonormal A (3, 3) that takes reconstructed axes to the object's: S A.
 
-    Reflects (det -1) where the shapes S (f, p, 3) are mirrored on the whole, and turns the mean
+    Reflects (det -1) where the shapes S (f, p, 3) are is_mirrored on the whole, and turns the mean
     shape so that x points to the front, y to the left and z up (REP-103), by the first of the
     layout's handedness. Layouts without one keep the network's axes.
     """
     A = np.eye(3)
     if not layout.handedness:
         return A.astype(np.float32)
-    if mirrored(S, layout, seen):
+    if is_mirrored(S, layout, seen):
         A[2, 2] = -1
     left, right, up, _ = (S @ A).mean(0)[_places(layout)[0]]
     y = (left - right) / _norm(left - right)

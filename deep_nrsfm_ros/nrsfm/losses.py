@@ -15,7 +15,7 @@ from torch import Tensor
 from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Network, forward, whiten
-from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, observe
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
 
@@ -204,5 +204,5 @@ class Objective:
                 (len(points), 1, 1), generator=generator, device=device
             )
             mask = mask * (torch.rand(mask.shape, generator=generator, device=device) >= level)
-        seen = observe(net, self.normaliser, points, mask)
+        seen = normalise(net, self.normaliser, points, mask)
         return seen.W * seen.gain, (frames.points - seen.origin) / seen.unit, seen.unit

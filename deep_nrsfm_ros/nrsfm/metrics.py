@@ -75,12 +75,12 @@ def camera_errors(shapes: Floats, truth: Floats) -> CameraErrors:
     return CameraErrors(
         float(procrustes_distances(S, T).mean()),
         float(apart.mean()),
-        float(np.median(degrees(align(S, T).rotation))),
+        float(np.median(rotation_angles(align(S, T).rotation))),
         float(align(S, T, allow_reflection=True).mirrored.mean()),
     )
 
 
-def degrees(turns: Floats) -> Floats:
+def rotation_angles(turns: Floats) -> Floats:
     """Return the angles (...) of rotations (..., 3, 3)."""
     cosine = (np.trace(turns, axis1=-2, axis2=-1) - 1) / 2
     angles: Floats = np.degrees(np.arccos(np.clip(cosine, -1, 1)))

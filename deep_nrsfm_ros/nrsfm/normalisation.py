@@ -57,7 +57,7 @@ class Normaliser:
         return W * normalised.unit + normalised.origin
 
 
-def observe(net: Network, normaliser: Normaliser, points: Array, mask: Array) -> Normalised:
+def normalise(net: Network, normaliser: Normaliser, points: Array, mask: Array) -> Normalised:
     """Return points (n, p, 2) of mask (n, p, 1) as the network shall see them.
 
     What is missing is filled as the network expects it, see `complete`; then all is normalised.

@@ -14,12 +14,17 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.data.curation import Curated, apart
+from deep_nrsfm_ros.data.curation import Curated, spread_out
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.sufficiency import Variation
+from deep_nrsfm_ros.data.sufficiency import Sufficiency
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
-from deep_nrsfm_ros.reporting.shapes import LiftedFrames, fit, lift_sample, shape_space
+from deep_nrsfm_ros.reporting.shapes import (
+    LiftedFrames,
+    label_free_errors,
+    lift_sample,
+    shape_space,
+)
 from deep_nrsfm_ros.reporting.template import embedded, render
 
 if TYPE_CHECKING:
@@ -52,7 +57,7 @@ class Training:
     path: Path
     dataset: Dataset
     curated: Curated
-    variation: Variation
+    sufficiency: Sufficiency
     progress: Sequence[Progress]
     warnings: Sequence[str] = ()
 
@@ -75,15 +80,15 @@ def write_report(training: Training, folders: Sequence[Path]) -> Path:
 
 def page(training: Training, folders: Sequence[Path] = ()) -> str:
     """Return the report as HTML; names and other data are escaped."""
-    model, dataset, variation = training.model, training.dataset, training.variation
+    model, dataset, sufficiency = training.model, training.dataset, training.sufficiency
     found = lift_sample(model, dataset)
     scenes: list[dict[str, Any]] = []
     shapes = _shapes(model, found, dataset.visible.sum(0) > 0, scenes)
     order = np.argsort(found.lifted.residual, kind="stable")
     gap = _APART * len(dataset)
     frames = {
-        "Best": _frames(apart(order, found.frames, gap, _FRAMES), found, training, scenes),
-        "Worst": _frames(apart(order[::-1], found.frames, gap, _FRAMES), found, training, scenes),
+        title: _frames(spread_out(ranking, found.frames, gap, _FRAMES), found, training, scenes)
+        for title, ranking in (("Best", order), ("Worst", order[::-1]))
     }
     return render(
         "report.html.j2",
@@ -92,22 +97,22 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         model=model,
         name=training.path.stem,
         path=shlex.quote(str(training.path.resolve())),
-        warnings=[*training.warnings, *training.curated.warnings, *variation.warnings],
+        warnings=[*training.warnings, *training.curated.warnings, *sufficiency.warnings],
         curves=[_curve(training.progress, field, label) for field, label in _CURVES.items()],
         comparison=_comparison(training, folders),
         shapes=shapes,
         frames=frames,
         looked_at=len(found.frames),
         residual=float(found.lifted.residual.mean()),
-        variation=variation,
-        spectrum=bars(variation.spectrum[:12], "spectrum of the stacked keypoints, %"),
+        sufficiency=sufficiency,
+        spectrum=bars(sufficiency.spectrum[:12], "spectrum of the stacked keypoints, %"),
         curated=training.curated,
         hidden=sorted(
             (row for row in training.curated.hidden_by_name if row[1]), key=lambda row: -row[1]
         ),
         suspects=[
             (suspect, skeleton(suspect.points, suspect.visible, model.layout, suspect.outliers))
-            for suspect in training.curated.suspects
+            for suspect in training.curated.outlier_frames
         ],
         provenance=_rows(model.provenance),
         scenes=embedded(scenes),
@@ -138,7 +143,7 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
         here = None
         if model.layout.keypoints == training.dataset.layout.keypoints:
             with suppress(ValueError):  # it lifts none of these frames
-                here = fit(model, training.dataset)
+                here = label_free_errors(model, training.dataset)
         quality = [model.quality.get(key) for key in _QUALITY]
         rows.append({"model": model, "quality": quality, "here": here})
     return rows

@@ -106,7 +106,7 @@ def in_place(centre: NDArray[np.floating], shape: NDArray[np.floating]) -> bool:
 
 def stage_of(recording: Recording) -> Stage:
     """Return the stage in the middle of which a recording's objects are, by their medians."""
-    sound = recording.sound
+    sound = recording.is_lifted
     shapes = recording.lifted.shapes[sound]
     centres = shapes.mean(1)
     if len(shapes) and in_place(np.median(np.abs(centres), 0), shapes[len(shapes) // 2]):
@@ -123,7 +123,7 @@ def scenes(recording: Recording, every: int = 1, stage: Stage | None = None) -> 
 
     stage: where its camera and objects stand, if it goes on from another recording.
     """
-    seen, lifted, stage = recording.seen, recording.lifted, stage or stage_of(recording)
+    seen, lifted, stage = recording.detections, recording.lifted, stage or stage_of(recording)
     ends = np.searchsorted(seen.frame, np.arange(len(seen.stamps) + 1))
     for frame in range(0, len(seen.stamps), every):
         rows = slice(ends[frame], ends[frame + 1])
@@ -136,7 +136,9 @@ def scenes(recording: Recording, every: int = 1, stage: Stage | None = None) -> 
 
 def stride(recording: Recording, most: int) -> int:
     """Return n such that every n-th frame makes at most `most` frames, and objects on average."""
-    return max(1, math.ceil(max(len(recording.seen.stamps), len(recording.seen)) / most))
+    return max(
+        1, math.ceil(max(len(recording.detections.stamps), len(recording.detections)) / most)
+    )
 
 
 def recording_page(
@@ -146,7 +148,10 @@ def recording_page(
     every = stride(recording, most)
     shown = list(scenes(recording, every))
     if every > 1:
-        notes = [*notes, f"{len(shown)} of {len(recording.seen.stamps)} frames: one in {every}"]
+        notes = [
+            *notes,
+            f"{len(shown)} of {len(recording.detections.stamps)} frames: one in {every}",
+        ]
     return _page(recording.source, recording.target, title, notes, shown)
 
 

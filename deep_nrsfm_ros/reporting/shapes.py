@@ -18,7 +18,7 @@ from deep_nrsfm_ros.nrsfm.geometry import (
 )
 from deep_nrsfm_ros.nrsfm.handedness import disagreement
 from deep_nrsfm_ros.nrsfm.network import forward
-from deep_nrsfm_ros.nrsfm.normalisation import observe
+from deep_nrsfm_ros.nrsfm.normalisation import normalise
 
 Floats = NDArray[np.float64]
 
@@ -39,13 +39,13 @@ class ShapeSpace(NamedTuple):
 
 
 class LiftedFrames(NamedTuple):
-    """Frames (n,) of an dataset as a model lifts them, the ones that cannot be lifted left out."""
+    """Frames (n,) of a dataset as a model lifts them, the ones that cannot be lifted left out."""
 
     frames: NDArray[np.int64]
     lifted: Lifted
 
 
-class Fit(NamedTuple):
+class LabelFreeErrors(NamedTuple):
     """Label-free errors of a model on given frames, means; relative to the size of the object.
 
     cycle: of the shape, as training measures it: the network alone on its own shapes, seen by
@@ -68,7 +68,7 @@ def lift_sample(model: Model, dataset: Dataset, most: int = _SAMPLE) -> LiftedFr
     return LiftedFrames(frames[sound], Lifted(*(array[sound] for array in lifted)))
 
 
-def doubt(model: Model, dataset: Dataset) -> str:
+def handedness_warning(model: Model, dataset: Dataset) -> str:
     """Return what the lifted frames say against the model's depth, "" if nothing.
 
     See `handedness.disagreement`; only keypoints that were seen count.
@@ -76,7 +76,7 @@ def doubt(model: Model, dataset: Dataset) -> str:
     try:
         frames, lifted = lift_sample(model, dataset)
     except ValueError:
-        return ""  # no frame is lifted: there is no depth to doubt
+        return ""  # no frame is lifted: there is no depth to handedness_warning
     return disagreement(lifted.shapes, model.layout, dataset.visible[frames])
 
 
@@ -116,7 +116,7 @@ def _to_screen(model: Model, mean: Floats) -> Floats:
     return turn
 
 
-def fit(model: Model, dataset: Dataset, most: int = 128) -> Fit:
+def label_free_errors(model: Model, dataset: Dataset, most: int = 128) -> LabelFreeErrors:
     """Return how well a model explains up to `most` frames of its own layout.
 
     Raises ValueError if it lifts none of them.
@@ -127,7 +127,7 @@ def fit(model: Model, dataset: Dataset, most: int = 128) -> Fit:
     again = lift_all(Lifter(model), views, confidence)
     sound = np.isfinite(again.scale)
     after = again.shapes[sound] * again.scale[sound, None, None]
-    return Fit(
+    return LabelFreeErrors(
         float(found.residual.mean()),
         cycle_error(model, dataset[frames]),
         _difference(after, T[sound]),
@@ -137,7 +137,7 @@ def fit(model: Model, dataset: Dataset, most: int = 128) -> Fit:
 def cycle_error(model: Model, dataset: Dataset) -> float:
     """Return the mean of ||S' - S|| / ||S||: S' is the network's shape of S seen from elsewhere."""
     mask = dataset.visible[..., None].astype(np.float32)
-    seen = observe(model.network, model.normaliser, dataset.points, mask)
+    seen = normalise(model.network, model.normaliser, dataset.points, mask)
     S, M = forward(model.network, seen.W * seen.gain)
     residual = (seen.W - S @ M) * mask
     residual -= mask * residual.sum(1, keepdims=True) / np.maximum(mask.sum(1, keepdims=True), 1)

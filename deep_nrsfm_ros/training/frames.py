@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deep_nrsfm_ros.batched import blocks
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.nrsfm.losses import Frames
 
 
@@ -53,4 +53,4 @@ class FrameStore:
 
     def blocks(self) -> Iterator[Frames]:
         """Return all usable frames, some at a time."""
-        return map(self.batch, blocks(len(self)))
+        return map(self.batch, slices(len(self)))

@@ -1,4 +1,4 @@
-"""What is done with an dataset before a training: curated, then looked at for variation."""
+"""What is done with a dataset before a training: curated, then looked at for sufficiency."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import argparse
 from collections.abc import Callable
 
 from deep_nrsfm_ros.configuration import override
-from deep_nrsfm_ros.data.curation import AS_IT_IS, Curated, Curation, curate
+from deep_nrsfm_ros.data.curation import KEEP_ALL, Curated, Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.sufficiency import Variation, examine
+from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
 
 
 def prepare(
     given: argparse.Namespace, dataset: Dataset, say: Callable[[str], None]
-) -> tuple[Curated, Variation]:
+) -> tuple[Curated, Sufficiency]:
     """Return what is fit to be trained on and how it varies; raise ValueError if nothing is."""
     curated = curate(dataset, chosen_curation(given))
     if curated.summary:
         say(curated.summary)
-    variation = examine(curated.dataset)
-    if variation.refusal:
-        raise ValueError(f"a model cannot be learned from this: {variation.refusal}")
-    for warning in (*curated.warnings, *variation.warnings):
+    sufficiency = assess_sufficiency(curated.dataset)
+    if sufficiency.refusal:
+        raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
+    for warning in (*curated.warnings, *sufficiency.warnings):
         say(f"warning: {warning}")
-    return curated, variation
+    return curated, sufficiency
 
 
 def chosen_curation(given: argparse.Namespace) -> Curation:
@@ -31,4 +31,4 @@ def chosen_curation(given: argparse.Namespace) -> Curation:
 
     Motion capture is clean and is left as it is, unless they say otherwise.
     """
-    return override(AS_IT_IS if given.cmu else Curation(), given)
+    return override(KEEP_ALL if given.cmu else Curation(), given)

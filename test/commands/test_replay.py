@@ -19,7 +19,7 @@ import deep_nrsfm_ros
 from deep_nrsfm_ros.commands.replay import main
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.detections import Detections, stamps_at
-from deep_nrsfm_ros.data.lifted_bags import write_answers
+from deep_nrsfm_ros.data.lifted_bags import write_lifted_bag
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras
@@ -49,7 +49,7 @@ def answered(tmp_path: Path, points: np.ndarray) -> Path:
     sure = np.full((5, 17), 0.5, np.float32)
     order = np.arange(5)
     seen = Detections(points, 2 * sure, order, np.array(["0"] * 5), stamps_at(10, 5) + 10**18)
-    write_answers(
+    write_lifted_bag(
         tmp_path / "answered", seen, Lifted(shapes, rotations, ones, places, 0 * ones, sure)
     )
     return tmp_path / "answered"

@@ -513,7 +513,7 @@ def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
     monkeypatch.setattr(train, "stop_with_parent", lambda stopped: stopped)
     words = (*arguments, "--steps", "3")
     for told in ("", "no depth in mine"):
-        monkeypatch.setattr(train, "doubt", lambda model, dataset, told=told: told)
+        monkeypatch.setattr(train, "handedness_warning", lambda model, dataset, told=told: told)
         assert in_process(*words, "--json-progress") == 0
         *_, end = map(json.loads, capsys.readouterr().out.splitlines())
         assert (end["state"], end.get("warning", "")) == ("finished", told)

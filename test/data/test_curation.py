@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.data.curation import AS_IT_IS, Curation, apart, curate, novel
+from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation, changed_frames, curate, spread_out
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
@@ -43,11 +43,11 @@ def spoiled(sound: Dataset, frames: np.ndarray, keypoint: int) -> Dataset:
 
 def test_what_is_off_is_as_it_is() -> None:
     given_ = dataset(50)
-    left = curate(given_, AS_IT_IS)
+    left = curate(given_, KEEP_ALL)
     np.testing.assert_array_equal(left.dataset.points, given_.points)
     np.testing.assert_array_equal(left.dataset.visible, given_.visible)
     np.testing.assert_array_equal(left.frames, np.arange(50))
-    assert left.summary == "" and left.warnings == () and left.suspects == ()
+    assert left.summary == "" and left.warnings == () and left.outlier_frames == ()
 
 
 def test_frames_with_few_visible_points_are_left_out() -> None:
@@ -95,7 +95,7 @@ def test_a_frame_that_shows_more_is_not_a_duplicate() -> None:
     visible = np.ones((4, P), bool)
     visible[:2, 0] = False
     visible[3, 1] = False
-    assert novel(pose, visible, 0.02).tolist() == [True, False, True, False]
+    assert changed_frames(pose, visible, 0.02).tolist() == [True, False, True, False]
 
 
 @pytest.mark.parametrize("f", [300, 6000])
@@ -109,18 +109,18 @@ def test_jumps_are_hidden_and_hardly_anything_else(f: int) -> None:
     assert hidden[~jumped].mean() < 0.01
     assert left.hidden[4] == hidden[:, 4].sum() and left.hidden.sum() == hidden.sum()
     assert (left.dataset.points[hidden] == 0).all()
-    assert f"hid {hidden.sum()} outlying keypoints in {left.mended} frames" in left.summary
-    assert left.given == f == len(left.dataset) + left.inconsistent
+    assert f"hid {hidden.sum()} outlying keypoints in {left.corrected} frames" in left.summary
+    assert left.total == f == len(left.dataset) + left.inconsistent
 
 
 def test_the_worst_are_shown_as_they_were_given() -> None:
     bad = spoiled(dataset(400), np.array([17, 300]), 4)
     left = curate(bad, ONLY_OUTLIERS)
-    assert {s.frame for s in left.suspects[:2]} == {17, 300}
-    first = left.suspects[0]
+    assert {s.frame for s in left.outlier_frames[:2]} == {17, 300}
+    first = left.outlier_frames[0]
     np.testing.assert_array_equal(first.points, bad.points[first.frame])
     assert first.outliers[4] and first.deviation > 6 and not first.dropped
-    deviations = [s.deviation for s in left.suspects]
+    deviations = [s.deviation for s in left.outlier_frames]
     assert deviations == sorted(deviations, reverse=True)
 
 
@@ -130,7 +130,7 @@ def test_a_hopeless_frame_is_left_out() -> None:
     bad.points[50, :6] = rng.uniform(-2000, 2000, (6, 2))
     left = curate(bad, ONLY_OUTLIERS)
     assert 50 not in left.frames and left.inconsistent >= 1
-    assert any(s.frame == 50 and s.dropped for s in left.suspects)
+    assert any(s.frame == 50 and s.dropped for s in left.outlier_frames)
     assert "that contradict the rest" in left.summary
 
 
@@ -198,5 +198,5 @@ def test_every_frame_is_accounted_for(seed: int, f: int, share: float, options: 
 
 def test_apart_skips_neighbours() -> None:
     frames = np.array([0, 1, 2, 50, 51, 90])
-    assert apart(np.array([4, 3, 0, 1, 5]), frames, 10, 2) == [4, 0]
-    assert apart(np.array([4, 3, 0, 1, 5]), frames, 10, 9) == [4, 0, 5]
+    assert spread_out(np.array([4, 3, 0, 1, 5]), frames, 10, 2) == [4, 0]
+    assert spread_out(np.array([4, 3, 0, 1, 5]), frames, 10, 9) == [4, 0, 5]

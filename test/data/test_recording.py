@@ -12,19 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from deep_nrsfm_ros.data.bag_files import BagError, answer_topics, open_bag
+from deep_nrsfm_ros.data.bag_files import BagError, lifter_topics, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.data.keypoint_files import read_keypoints
 from deep_nrsfm_ros.data.lifted_bags import (
     KEYPOINTS,
     POINTS,
-    has_answers,
-    read_answers,
-    write_answers,
+    has_lifted_messages,
+    read_lifted_messages,
+    write_lifted_bag,
 )
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
-from deep_nrsfm_ros.data.recording import Recording, lift_recording, lifted_before
+from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages, lift_recording
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter
@@ -58,9 +58,9 @@ def recording() -> Recording:
 
 
 def test_lifts_everyone_who_is_seen_well_enough(recording: Recording) -> None:
-    assert recording.sound.tolist() == [True, True, True, False]
+    assert recording.is_lifted.tolist() == [True, True, True, False]
     points, confidence = KeypointMap(BODY25, HUMAN17)(
-        recording.seen.points, recording.seen.confidence
+        recording.detections.points, recording.detections.confidence
     )
     assert recording.lifted.shapes.shape == (4, 17, 3) and points.shape == (4, 17, 2)
     assert (recording.lifted.confidence[:3] > 0).any()
@@ -69,13 +69,13 @@ def test_lifts_everyone_who_is_seen_well_enough(recording: Recording) -> None:
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_bags_give_back_what_was_lifted(tmp_path: Path, recording: Recording, storage: str) -> None:
     bag = tmp_path / "bag"
-    assert write_answers(bag, recording.seen, recording.lifted, storage) == 4 + 2 + 2
-    assert has_answers(bag)
+    assert write_lifted_bag(bag, recording.detections, recording.lifted, storage) == 4 + 2 + 2
+    assert has_lifted_messages(bag)
     seen = read_keypoints(bag, 25)  # not the answers, though they are of a keypoint type
-    np.testing.assert_array_equal(seen.points, recording.seen.points)
-    np.testing.assert_array_equal(seen.stamps, recording.seen.stamps)
+    np.testing.assert_array_equal(seen.points, recording.detections.points)
+    np.testing.assert_array_equal(seen.stamps, recording.detections.stamps)
     assert seen.frame_id == "cam"
-    again = lifted_before(read_answers(bag), seen, BODY25, HUMAN17)
+    again = join_lifted_messages(read_lifted_messages(bag), seen, BODY25, HUMAN17)
     was = recording.lifted
     np.testing.assert_array_equal(again.lifted.shapes, was.shapes)
     np.testing.assert_array_equal(again.lifted.confidence, was.confidence)
@@ -84,31 +84,31 @@ def test_bags_give_back_what_was_lifted(tmp_path: Path, recording: Recording, st
     np.testing.assert_allclose(again.lifted.scale, was.scale, rtol=1e-4)
     np.testing.assert_allclose(again.lifted.translation, was.translation, atol=1e-2)
     with pytest.raises(ValueError, match="points are 17 an object; the model has 25 keypoints"):
-        lifted_before(read_answers(bag), seen, BODY25, BODY25)
+        join_lifted_messages(read_lifted_messages(bag), seen, BODY25, BODY25)
     with pytest.raises(BagError, match="exists already"):
-        write_answers(bag, recording.seen, recording.lifted)
+        write_lifted_bag(bag, recording.detections, recording.lifted)
 
 
 def test_answers_without_keypoints_are_shown_alone(tmp_path: Path, recording: Recording) -> None:
-    write_answers(tmp_path / "bag", recording.seen, recording.lifted)
-    alone = lifted_before(read_answers(tmp_path / "bag"), None, BODY25, HUMAN17)
-    assert alone.seen.frame.tolist() == [0, 0, 1] and not alone.seen.confidence.any()
+    write_lifted_bag(tmp_path / "bag", recording.detections, recording.lifted)
+    alone = join_lifted_messages(read_lifted_messages(tmp_path / "bag"), None, BODY25, HUMAN17)
+    assert alone.detections.frame.tolist() == [0, 0, 1] and not alone.detections.confidence.any()
     np.testing.assert_array_equal(alone.lifted.shapes, recording.lifted.shapes[:3])
     assert np.isnan(alone.lifted.scale).all()
 
 
 def test_answers_far_from_any_keypoints_are_of_none(recording: Recording, tmp_path: Path) -> None:
-    write_answers(tmp_path / "bag", recording.seen, recording.lifted)
-    answers = [a._replace(stamp=a.stamp + 10**12) for a in read_answers(tmp_path / "bag")]
-    assert not lifted_before(answers, recording.seen, BODY25, HUMAN17).sound.any()
+    write_lifted_bag(tmp_path / "bag", recording.detections, recording.lifted)
+    answers = [a._replace(stamp=a.stamp + 10**12) for a in read_lifted_messages(tmp_path / "bag")]
+    assert not join_lifted_messages(answers, recording.detections, BODY25, HUMAN17).is_lifted.any()
     nobody = gather([], [], 25)
-    assert not len(lifted_before(answers, nobody, BODY25, HUMAN17).seen)
+    assert not len(join_lifted_messages(answers, nobody, BODY25, HUMAN17).detections)
 
 
 def test_a_lifter_is_known_by_its_topics(tmp_path: Path, recording: Recording) -> None:
-    write_answers(tmp_path / "bag", recording.seen, recording.lifted)
+    write_lifted_bag(tmp_path / "bag", recording.detections, recording.lifted)
     with closing(open_bag(tmp_path / "bag")) as bag:
-        assert [points.name for points, _ in answer_topics(bag)] == [POINTS]
+        assert [points.name for points, _ in lifter_topics(bag)] == [POINTS]
         for name, expected in (("", KEYPOINTS), (POINTS, POINTS)):
             assert [found.topic.name for found in keypoint_topics(bag, name, None)] == [expected]
 
@@ -124,7 +124,7 @@ def test_npz_holds_every_object(tmp_path: Path, recording: Recording) -> None:
             "0",
             "0",
         ]
-        assert file["stamps"].tolist() == recording.seen.stamps.tolist()
+        assert file["stamps"].tolist() == recording.detections.stamps.tolist()
         assert file["names"].tolist() == list(HUMAN17.keypoints)
         assert file["edges"].tolist() == [list(edge) for edge in HUMAN17.edge_indices()]
         assert str(file["model"]) == "mine"

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.sufficiency import examine
+from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
@@ -45,7 +45,7 @@ def noisy(W: np.ndarray, share: float, seed: int = 2) -> np.ndarray:
 
 def test_a_deforming_object_from_all_sides_is_fine() -> None:
     S = shapes(400, 0.3)
-    found = examine(dataset(S @ random_cameras(400, np.random.default_rng(0))))
+    found = assess_sufficiency(dataset(S @ random_cameras(400, np.random.default_rng(0))))
     assert found.refusal == "" and found.warnings == ()
     assert found.view_span > 90 and 0.1 < found.deformation < 0.9
     assert len(found.spectrum) == found.points == P and found.frames == 400
@@ -55,7 +55,7 @@ def test_a_deforming_object_from_all_sides_is_fine() -> None:
 
 @pytest.mark.parametrize("degrees", [25.0, 50.0])
 def test_view_span_of_a_rigid_object_is_that_of_the_cameras(degrees: float) -> None:
-    found = examine(dataset(noisy(seen_from(shapes(500, 0.0), degrees), 0.01)))
+    found = assess_sufficiency(dataset(noisy(seen_from(shapes(500, 0.0), degrees), 0.01)))
     assert found.refusal == ""
     assert found.view_span == pytest.approx(0.9 * degrees, abs=4)
 
@@ -94,18 +94,18 @@ HOPELESS = {
 @pytest.mark.parametrize(("make", "complaint"), HOPELESS.values(), ids=HOPELESS)
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_what_cannot_work_is_refused_with_the_mend(make, complaint: str, noise: float) -> None:
-    assert re.search(complaint, examine(dataset(noisy(make(), noise))).refusal)
+    assert re.search(complaint, assess_sufficiency(dataset(noisy(make(), noise))).refusal)
 
 
 def test_points_on_a_line_are_refused() -> None:
-    found = examine(dataset(on_a_line()))
+    found = assess_sufficiency(dataset(on_a_line()))
     assert "in 400 of 400 frames all keypoints lie on one line" in found.refusal
 
 
 def test_keypoints_that_are_never_seen_do_not_count() -> None:
     visible = np.zeros((400, P), bool)
     visible[:, [0, 5, 9]] = True
-    found = examine(dataset(seen_from(shapes(400, 0.3), 90), visible))
+    found = assess_sufficiency(dataset(seen_from(shapes(400, 0.3), 90), visible))
     assert "only 3 keypoints are seen (point_0, point_5, point_9)" in found.refusal
 
 
@@ -120,7 +120,7 @@ DOUBTFUL = {
 def test_what_is_doubtful_is_warned_of(
     f: int, deformation: float, degrees: float, doubt: str
 ) -> None:
-    found = examine(dataset(seen_from(shapes(f, deformation), degrees)))
+    found = assess_sufficiency(dataset(seen_from(shapes(f, deformation), degrees)))
     assert found.refusal == ""
     assert any(re.search(doubt, warning) for warning in found.warnings), found.warnings
 
@@ -130,21 +130,23 @@ def test_missing_points_do_not_look_like_variation() -> None:
     visible = rng.random((500, P)) < 0.7
     W = seen_from(S, 40)
     whole, holes = (
-        examine(dataset(np.where(v[..., None], W, 0), v)) for v in (np.ones_like(visible), visible)
+        assess_sufficiency(dataset(np.where(v[..., None], W, 0), v))
+        for v in (np.ones_like(visible), visible)
     )
     assert holes.refusal == ""
     assert holes.view_span == pytest.approx(whole.view_span, abs=6)
     assert holes.deformation < 0.1
 
 
-def test_an_empty_ensemble_is_refused() -> None:
-    assert "only 0 keypoints are seen (none)" in examine(dataset(np.zeros((0, P, 2)))).refusal
+def test_an_empty_dataset_is_refused() -> None:
+    nothing = assess_sufficiency(dataset(np.zeros((0, P, 2))))
+    assert "only 0 keypoints are seen (none)" in nothing.refusal
 
 
 @settings(max_examples=25, deadline=None)
 @given(scale=st.floats(1e-3, 1e3), x=st.floats(-1e3, 1e3), y=st.floats(-1e3, 1e3))
 def test_unit_and_place_do_not_matter(scale: float, x: float, y: float) -> None:
     W = seen_from(shapes(50, 0.3), 60)
-    before, after = examine(dataset(W)), examine(dataset(scale * (W + [x, y])))
+    before, after = (assess_sufficiency(dataset(X)) for X in (W, scale * (W + [x, y])))
     np.testing.assert_allclose(before.spectrum, after.spectrum, atol=2e-3)
     assert before.refusal == after.refusal

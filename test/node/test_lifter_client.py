@@ -54,7 +54,7 @@ def test_keypoints_and_answers_are_joined(
             second += 1
             publisher.publish(message(second))
             executor.spin_once(timeout_sec=0.2)
-            found = [r for r in shown if r.seen.confidence.any() and r.sound.all()]
+            found = [r for r in shown if r.detections.confidence.any() and r.is_lifted.all()]
             # The rotation is a message of its own, which may come too late for a frame.
             found = [r for r in found if np.isfinite(r.lifted.rotations[0]).all()]
             return found[-1] if found else None
@@ -64,12 +64,12 @@ def test_keypoints_and_answers_are_joined(
         executor.shutdown()
         watcher.destroy_node()
         rclpy.shutdown(context=context)
-    (stamp,) = recording.seen.stamps.tolist()
+    (stamp,) = recording.detections.stamps.tolist()
     expected = np.random.default_rng(stamp // 10**9).uniform(1, 900, (2, KEYPOINTS, 2))
-    np.testing.assert_allclose(recording.seen.points, expected, rtol=1e-6)
+    np.testing.assert_allclose(recording.detections.points, expected, rtol=1e-6)
     R = recording.lifted.rotations
     np.testing.assert_allclose(R[0] @ R[0].T, np.eye(3), atol=1e-5)
-    assert np.isnan(R[1]).all() and len(recording.seen) == 2
+    assert np.isnan(R[1]).all() and len(recording.detections) == 2
     W = recording.lifted.scale[:, None, None] * recording.lifted.shapes[..., :2]
     W += recording.lifted.translation[:, None]
     assert np.linalg.norm(W - expected) < np.linalg.norm(expected - expected.mean(1, keepdims=True))

@@ -33,7 +33,7 @@ def bones_of(X: np.ndarray, spread: float = 0.02) -> Bones:
 def test_lengths_grow_as_their_derivatives_say(seed: int) -> None:
     rng = np.random.default_rng(seed)
     X, E = rng.standard_normal((2, 3, P, 3))
-    G, _, _ = bones_of(X[0]).observe(X)
+    G, _, _ = bones_of(X[0]).length_constraint(X)
     grown = (lengths(X + 1e-6 * E) - lengths(X - 1e-6 * E)) / 2e-6
     np.testing.assert_allclose((G @ E.reshape(3, -1, 1))[..., 0], grown, atol=1e-4)
 
@@ -43,7 +43,7 @@ def test_lengths_grow_as_their_derivatives_say(seed: int) -> None:
 def test_a_shape_of_the_right_proportions_lacks_nothing_at_any_size(seed: int, size: float) -> None:
     X = np.random.default_rng(seed).standard_normal((1, P, 3))
     bones = bones_of(X[0])
-    _, wanted, varies = bones.observe(size * X)
+    _, wanted, varies = bones.length_constraint(size * X)
     np.testing.assert_allclose(wanted, 0, atol=1e-9 * size)
     # A larger one as a whole surprises no more than one whose lengths all vary at random would.
     whole = size * lengths(X)[0]
@@ -65,7 +65,7 @@ def test_the_correction_is_the_mean_given_keypoints_and_lengths(seed: int, noise
     # Information adds up: of the errors, of the keypoints but for a translation, of the lengths.
     H = np.kron(np.eye(P), M[0].T)
     free = np.eye(2 * P) - np.tile(np.eye(2), (P, P)) / P
-    G, wanted, varies = (part[0] for part in bones.observe(by_keypoints))
+    G, wanted, varies = (part[0] for part in bones.length_constraint(by_keypoints))
     known = np.linalg.inv(covariance) + H.T @ free @ H / noise**2
     known += G.T @ np.linalg.solve(varies, G)
     r = (W - S @ M)[0].ravel()

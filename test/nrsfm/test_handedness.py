@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
-from deep_nrsfm_ros.nrsfm.handedness import disagreement, mirrored, object_frame, votes
+from deep_nrsfm_ros.nrsfm.handedness import disagreement, is_mirrored, object_frame, votes
 
 some = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -53,7 +53,7 @@ def test_object_frame_rights_an_ensemble_and_names_its_axes(seed: int, inside_ou
     network_axes = rotations(1, rng)[0] * (-1 if inside_out else 1)
     S = people(seed) @ network_axes
     assert ((votes(S, PERSON) < 0) == inside_out).all()
-    assert mirrored(S, PERSON) == inside_out
+    assert is_mirrored(S, PERSON) == inside_out
     A = object_frame(S, PERSON)
     np.testing.assert_allclose(A @ A.T, np.eye(3), atol=1e-5)
     assert np.linalg.det(A) == pytest.approx(-1 if inside_out else 1, abs=1e-5)
@@ -133,7 +133,7 @@ def test_one_wrong_vote_is_outvoted(four: int, inside_out: bool) -> None:
     assert np.median(votes(S, HUMAN17)[:, four]) < 0
     if inside_out:
         S = S * MIRROR
-    assert mirrored(S, HUMAN17) == inside_out
+    assert is_mirrored(S, HUMAN17) == inside_out
     assert np.linalg.det(object_frame(S, HUMAN17)) == pytest.approx(1 - 2 * inside_out, abs=1e-5)
 
 
@@ -147,7 +147,7 @@ def test_a_mirrored_ensemble_becomes_the_same_as_the_one_that_is_not() -> None:
 def test_a_vote_that_is_far_off_in_a_few_frames_does_not_decide() -> None:
     S = walkers()
     S[:12, HUMAN17.index("nose"), 0] -= 100
-    assert not mirrored(S, HUMAN17)
+    assert not is_mirrored(S, HUMAN17)
 
 
 def test_keypoints_that_nobody_saw_do_not_vote() -> None:
@@ -155,13 +155,13 @@ def test_keypoints_that_nobody_saw_do_not_vote() -> None:
     S = walkers()
     S[:, [HUMAN17.index(name) for name in legs], 0] -= 1  # anywhere
     seen = np.ones(S.shape[:2], bool)
-    assert mirrored(S, HUMAN17) and mirrored(S, HUMAN17, seen)
+    assert is_mirrored(S, HUMAN17) and is_mirrored(S, HUMAN17, seen)
     seen[:, [HUMAN17.index(name) for name in legs]] = False
-    assert not mirrored(S, HUMAN17, seen)
+    assert not is_mirrored(S, HUMAN17, seen)
     assert np.linalg.det(object_frame(S, HUMAN17, seen)) > 0
-    assert mirrored(S, HUMAN17, np.zeros_like(seen))  # then all that there is
+    assert is_mirrored(S, HUMAN17, np.zeros_like(seen))  # then all that there is
     seen[:2] = True  # two frames of thirty are no match for the nose
-    assert not mirrored(S, HUMAN17, seen)
+    assert not is_mirrored(S, HUMAN17, seen)
 
 
 def test_the_first_of_several_gives_the_axes() -> None:

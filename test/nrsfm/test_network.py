@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.nrsfm.network import (
@@ -225,7 +225,7 @@ def turned_in_plane(architecture: Architecture, seed: int) -> tuple[float, float
     net = initialise(architecture, 7, rng).map(lambda w: w.astype(float))
     W, Q = rng.standard_normal((7, 2)), np.linalg.qr(rng.standard_normal((2, 2)))[0]
     (S, M), (turned_S, turned_M) = forward(net, W), forward(net, W @ Q)
-    assert np.linalg.norm(S) > 1e-3
+    assume(np.linalg.norm(S) > 1e-3)  # random weights may silence the last layer
     return np.linalg.norm(turned_S - S) / np.linalg.norm(S), np.linalg.norm(turned_M - M @ Q)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.nrsfm.network import Architecture, complete, initialise
-from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, observe
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 
 some = settings(max_examples=30, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -102,7 +102,7 @@ def test_what_the_network_sees_is_completed_first(whitening: float) -> None:
     net = dataclasses.replace(net, L=L, L_inverse=np.linalg.inv(L))
     points = rng.standard_normal((5, 6, 2)).astype(np.float32)
     mask = (np.arange(6) != 3)[None, :, None].repeat(5, 0).astype(np.float32)
-    seen = observe(net, Normaliser(), points, mask)
+    seen = normalise(net, Normaliser(), points, mask)
     for found, expected in zip(
         seen, Normaliser().encode(*complete(net, points, mask)), strict=True
     ):

@@ -15,7 +15,7 @@ import pytest
 
 from deep_nrsfm_ros.data.curation import Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.sufficiency import examine
+from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
@@ -64,7 +64,7 @@ def training_of(
         "path": Path("folder") / "mine.safetensors",
         "dataset": curated.dataset,
         "curated": curated,
-        "variation": examine(curated.dataset),
+        "sufficiency": assess_sufficiency(curated.dataset),
         "progress": progress,
     }
     return Training(**(fields | changes))
@@ -144,9 +144,9 @@ def test_what_no_frame_shows_is_drawn_pale() -> None:
 
 def test_it_tells_what_was_left_out_and_hidden(text: str) -> None:
     curated = training_of().curated
-    for count in (curated.given, curated.few_visible, curated.mended, len(curated.dataset)):
+    for count in (curated.total, curated.few_visible, curated.corrected, len(curated.dataset)):
         assert f'<td class="figure">{count}</td>' in text
-    assert curated.mended > 0 and HUMAN17.keypoints[3] in text
+    assert curated.corrected > 0 and HUMAN17.keypoints[3] in text
     assert "times the usual: points hidden" in " ".join(text.split())
 
 

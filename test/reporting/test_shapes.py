@@ -13,7 +13,13 @@ from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, random_cameras, rotation_from_camera
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
-from deep_nrsfm_ros.reporting.shapes import cycle_error, doubt, fit, lift_sample, shape_space
+from deep_nrsfm_ros.reporting.shapes import (
+    cycle_error,
+    handedness_warning,
+    label_free_errors,
+    lift_sample,
+    shape_space,
+)
 
 P = 10
 
@@ -92,10 +98,10 @@ def test_a_sample_is_spread_evenly() -> None:
 def test_figures_do_not_depend_on_chance_or_unit() -> None:
     seen = frames(40, P)
     mine = model(seen.layout)
-    first = fit(mine, seen)
-    assert first == fit(mine, seen) and np.isfinite(first).all()
+    first = label_free_errors(mine, seen)
+    assert first == label_free_errors(mine, seen) and np.isfinite(first).all()
     larger = Dataset(10 * seen.points, seen.visible, seen.layout, "made up")
-    np.testing.assert_allclose(fit(mine, larger), first, rtol=1e-2)
+    np.testing.assert_allclose(label_free_errors(mine, larger), first, rtol=1e-2)
     assert cycle_error(mine, seen) == pytest.approx(first.cycle, rel=1e-5)
 
 
@@ -104,7 +110,7 @@ def test_depth_is_doubted_where_keypoints_contradict_each_other() -> None:
     names = seen.layout.keypoints
     four, inside_out = (names[0], names[1], names[2], names[3]), (names[1], *names[0:4:2], names[3])
     told = [
-        doubt(model(KeypointLayout("thing", names, handedness=handedness)), seen)
+        handedness_warning(model(KeypointLayout("thing", names, handedness=handedness)), seen)
         for handedness in ((four,), (inside_out,), (four, inside_out), ())
     ]
     # One of two that are each other's mirror image is wrong, and both of both.
@@ -116,4 +122,4 @@ def test_depth_is_doubted_where_keypoints_contradict_each_other() -> None:
 def test_what_no_model_lifts_is_not_doubted() -> None:
     nothing = frames(5, P)
     blind = Dataset(nothing.points, np.zeros((5, P), bool), nothing.layout, "made up")
-    assert doubt(model(nothing.layout), blind) == ""
+    assert handedness_warning(model(nothing.layout), blind) == ""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from deep_nrsfm_ros.batched import blocks
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.training import frames as pools
 from deep_nrsfm_ros.training.frames import FrameStore
 
@@ -52,7 +52,7 @@ def test_a_batch_has_the_usable_frames_and_zeros_for_missing_points(pool: FrameS
 def test_blocks_are_all_usable_frames_once(
     pool: FrameStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pools, "blocks", partial(blocks, size=10))
+    monkeypatch.setattr(pools, "slices", partial(slices, size=10))
     parts = list(pool.blocks())
     assert [len(part.points) for part in parts] == [10, 10, 5]
     whole = pool.batch(slice(None))

@@ -31,8 +31,8 @@ def people(f: int = 60) -> Dataset:
 )
 def test_motion_capture_is_left_as_it_is_unless_told(words: tuple[str, ...], left: int) -> None:
     said: list[str] = []
-    curated, variation = prepare(arguments().parse_args(words), people(), said.append)
-    assert len(curated.dataset) == variation.frames == left
+    curated, sufficiency = prepare(arguments().parse_args(words), people(), said.append)
+    assert len(curated.dataset) == sufficiency.frames == left
     assert any("near-duplicates" in sentence for sentence in said) == (left == 60)
     assert any(sentence.startswith("warning: ") for sentence in said)
 
