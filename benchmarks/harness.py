@@ -23,7 +23,8 @@ from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
-from deep_nrsfm_ros.training.loop import finish, train
+from deep_nrsfm_ros.training.finish import finish
+from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
 from deep_nrsfm_ros.training.progress import Progress
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -105,10 +106,8 @@ class Session:
                 dataset.points,
                 dataset.visible,
                 preset,
-                on_step=keep,
-                on_progress=show,
-                checkpoint=checkpoint,
-                checkpoint_seconds=CHECKPOINT_SECONDS,
+                callbacks=Callbacks(on_step=keep, on_progress=show),
+                checkpointing=Checkpointing(checkpoint, CHECKPOINT_SECONDS),
             )
         checkpoint.unlink(missing_ok=True)
 

@@ -25,7 +25,8 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
-from deep_nrsfm_ros.training.loop import finish, train
+from deep_nrsfm_ros.training.finish import finish
+from deep_nrsfm_ros.training.loop import Callbacks, train
 from deep_nrsfm_ros.training.trainer import Trainer
 
 METRIC = "shape %"
@@ -79,8 +80,10 @@ class Race:
                 self.dataset.points,
                 self.dataset.visible,
                 preset,
-                on_step=look,
-                should_stop=lambda: self.reached or self._gone() > self.limit,
+                callbacks=Callbacks(
+                    on_step=look,
+                    should_stop=lambda: self.reached or self._gone() > self.limit,
+                ),
             )
         if not self.reached:
             self.seconds = self._gone()

@@ -61,7 +61,7 @@ def measure(f: int) -> dict[str, float]:
     """Train for an epoch on f frames in this process."""
     import torch
 
-    from deep_nrsfm_ros.training.loop import train
+    from deep_nrsfm_ros.training.loop import Callbacks, train
     from deep_nrsfm_ros.training.trainer import Trainer
 
     torch.set_num_threads(1)
@@ -76,7 +76,8 @@ def measure(f: int) -> dict[str, float]:
                 times.append(time.perf_counter())
 
         times[:] = [time.perf_counter()]
-        train(dataset.points, dataset.visible, base._replace(recipe=recipe), on_step=note)
+        preset = base._replace(recipe=recipe)
+        train(dataset.points, dataset.visible, preset, callbacks=Callbacks(on_step=note))
 
     epoch(curate(_ensemble(10 * base.recipe.batch)).dataset)
     before = memory("VmRSS")

@@ -266,7 +266,8 @@ def learn(
     import torch  # seconds to import: bad arguments should not wait for it
 
     from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
-    from deep_nrsfm_ros.training.loop import finish, train
+    from deep_nrsfm_ros.training.finish import finish
+    from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, Setup, train
 
     if given.threads:
         torch.set_num_threads(given.threads)
@@ -276,13 +277,14 @@ def learn(
         dataset.points,
         dataset.visible,
         preset,
-        limits=limits,
-        on_progress=report.training,
-        should_stop=should_stop,
-        checkpoint=checkpoint,
-        start=network,
-        team=team,
-        layout_loss=LayoutLoss(weights, dataset.layout) if weights != LayoutLossWeights() else None,
+        Setup(
+            network,
+            LayoutLoss(weights, dataset.layout) if weights != LayoutLossWeights() else None,
+            limits,
+            team,
+        ),
+        Callbacks(on_progress=report.training, should_stop=should_stop),
+        Checkpointing(checkpoint),
     )
     team.leave()
     if team.rank:

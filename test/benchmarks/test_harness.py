@@ -18,6 +18,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training import loop as training
+from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.trainer import Trainer
 
 STEPS = 23  # snapshots do not divide it
@@ -92,7 +93,7 @@ def test_snapshots_are_those_of_one_uninterrupted_training(
     seconds = [model.provenance["cpu_seconds"] for model in models]
     assert seconds == sorted(seconds) and seconds[-1] > 0
     whole = training.train(dataset.points, dataset.visible, preset)
-    assert same(models[-1], training.finish(whole, "x", dataset.layout, dataset.source))
+    assert same(models[-1], finish(whole, "x", dataset.layout, dataset.source))
     assert not same(models[-2], models[-1])
 
 

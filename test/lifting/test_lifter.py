@@ -18,7 +18,7 @@ from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
-from deep_nrsfm_ros.training.loop import finish
+from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.trainer import Trainer
 
 N = 12

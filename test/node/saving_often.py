@@ -18,5 +18,5 @@ if __name__ == "__main__":
         from deep_nrsfm_ros.commands.train import main
         from deep_nrsfm_ros.training import loop as training
 
-        training.train = functools.partial(training.train, checkpoint_seconds=0.2)
+        training.Checkpointing = functools.partial(training.Checkpointing, seconds=0.2)
         main()

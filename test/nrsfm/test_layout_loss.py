@@ -19,7 +19,7 @@ from deep_nrsfm_ros.nrsfm.handedness import votes
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Architecture, reconstruct
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights
-from deep_nrsfm_ros.training.loop import train
+from deep_nrsfm_ros.training.loop import Setup, train
 
 ANIMAL = KeypointLayout(
     "animal",
@@ -160,7 +160,7 @@ def test_a_training_heeds_it() -> None:
         None,
         LayoutLoss(LayoutLossWeights(bone_length_weight=3.0, handedness_weight=1.0), ANIMAL),
     ):
-        trainer = train(seen, np.ones((300, 6), bool), preset, layout_loss=loss)
+        trainer = train(seen, np.ones((300, 6), bool), preset, Setup(layout_loss=loss))
         net = trainer.net.map(lambda w: w.numpy())
         S, _ = reconstruct(net, preset.normaliser.encode(seen, np.ones((300, 6, 1))).W)
         found.append(

@@ -16,7 +16,7 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training.distributed import ProcessGroup, join, rank
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
-from deep_nrsfm_ros.training.loop import train
+from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, Setup, train
 from deep_nrsfm_ros.training.trainer import Trainer
 
 PRESET = Preset(
@@ -46,7 +46,9 @@ def main(folder: Path) -> None:
     team = join()
     found = first_step(torch.from_numpy(points), team)
     reports: list[object] = []
-    trainer = train(*data, limits=Limits(), team=team, on_progress=reports.append)
+    trainer = train(
+        *data, Setup(limits=Limits(), group=team), Callbacks(on_progress=reports.append)
+    )
     errors = team.mean(trainer.measure())
     found |= {"weights": trainer.weights, "errors": torch.tensor(errors)}
     found |= {"reports": torch.tensor(len(reports)), "frames": torch.tensor(trainer.frames_in_all)}
@@ -59,10 +61,11 @@ def main(folder: Path) -> None:
         return rank() == team.size - 1 and asked > 6
 
     file = folder / "checkpoint"
-    stopped = train(*data, team=team, should_stop=stop, checkpoint=file)
+    stopped = train(*data, Setup(group=team), Callbacks(should_stop=stop), Checkpointing(file))
     found["stopped"] = torch.tensor(stopped.step)
     first: list[int] = []
-    train(*data, team=team, checkpoint=file, on_step=lambda trainer: first.append(trainer.step))
+    note = Callbacks(on_step=lambda trainer: first.append(trainer.step))
+    train(*data, Setup(group=team), note, Checkpointing(file))
     found |= {"resumed": torch.tensor(first[0]), "resumed_to": torch.tensor(first[-1])}
     team.leave()
     names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]

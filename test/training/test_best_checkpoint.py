@@ -14,16 +14,20 @@ from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.training import best_checkpoint as best
+from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
-from deep_nrsfm_ros.training.loop import finish, train
+from deep_nrsfm_ros.training.loop import train
 from deep_nrsfm_ros.training.trainer import Trainer
+from test.fixtures.training_options import by_dataclass
 
 RECIPE = Recipe(steps=40, batch=16, seeds=1)
 PRESET = Preset(Architecture(widths=(8, 4)), Normaliser(), RECIPE)
 
 
 def run(figure: Any, **how: Any) -> Trainer:
-    return train(figure.points, np.ones(figure.points.shape[:2], bool), PRESET, **how)
+    return train(
+        figure.points, np.ones(figure.points.shape[:2], bool), PRESET, **by_dataclass(**how)
+    )
 
 
 @pytest.fixture
@@ -79,7 +83,7 @@ def test_what_is_cancelled_keeps_the_best_and_goes_on_from_the_last(
     weights = told([5, 3, 9, 8, 7, 6, 5, 4, 4, 4])
     whole = run(figure, limits=Limits())
     calls = iter(range(10**6))
-    how = {"limits": Limits(), "checkpoint": tmp_path / "checkpoint"}
+    how = {"limits": Limits(), "file": tmp_path / "checkpoint"}
     cancelled = run(figure, **how, should_stop=lambda: next(calls) >= 18)
     assert (cancelled.step, cancelled.kept, cancelled.ended) == (18, 8, "")
     np.testing.assert_array_equal(cancelled.weights, weights[8])
@@ -92,7 +96,7 @@ def test_what_is_cancelled_keeps_the_best_and_goes_on_from_the_last(
 def test_the_patience_goes_on_too(figure: Any, told: Any, tmp_path: Path) -> None:
     told([5, 3, 4])
     calls = iter(range(10**6))
-    how = {"limits": Limits(patience=0.35), "checkpoint": tmp_path / "checkpoint"}
+    how = {"limits": Limits(patience=0.35), "file": tmp_path / "checkpoint"}
     run(figure, **how, should_stop=lambda: next(calls) >= 18)
     assert run(figure, **how).step == 24
 

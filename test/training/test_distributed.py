@@ -20,7 +20,7 @@ from deep_nrsfm_ros.nrsfm.losses import Frames
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup, join, rank
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
-from deep_nrsfm_ros.training.loop import train
+from deep_nrsfm_ros.training.loop import Setup, train
 from deep_nrsfm_ros.training.trainer import Trainer
 
 WORK = Path(__file__).with_name("processes.py")
@@ -73,7 +73,7 @@ def test_the_first_step_is_that_of_one_process_with_both_batches(
 
 def test_two_processes_agree_with_one(figure: Any, found: list[dict[str, torch.Tensor]]) -> None:
     visible = np.ones(figure.points.shape[:2], bool)
-    alone = train(figure.points, visible, PRESET, limits=Limits())
+    alone = train(figure.points, visible, PRESET, Setup(limits=Limits()))
     first, second = found
     torch.testing.assert_close(first["weights"], second["weights"], rtol=0, atol=0)
     np.testing.assert_allclose(first["errors"], alone.measure(), rtol=TOLERANCE)
@@ -104,7 +104,7 @@ def test_shares_add_up() -> None:
     frames = torch.arange(10)
     assert sorted(torch.cat([team.shard(frames) for team in teams]).tolist()) == list(range(10))
     with pytest.raises(ValueError, match="3 processes are more than"):
-        train(np.eye(4, 2)[None], np.ones((1, 4), bool), PRESET, team=teams[0])
+        train(np.eye(4, 2)[None], np.ones((1, 4), bool), PRESET, Setup(group=teams[0]))
 
 
 def test_other_launchers_do_not_make_a_team(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,8 @@ from deep_nrsfm_ros.nrsfm.network import Architecture, Network, forward, initial
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, keep_what_is_fixed, start_from
-from deep_nrsfm_ros.training.loop import finish, train
+from deep_nrsfm_ros.training.finish import finish
+from deep_nrsfm_ros.training.loop import Callbacks, Setup, train
 from deep_nrsfm_ros.training.trainer import Trainer
 
 RECIPE = Recipe(steps=100, batch=64, learning_rate=1e-3)
@@ -40,8 +41,8 @@ def tuned(source: Model, layout: KeypointLayout, points: np.ndarray, steps: int 
         np.ascontiguousarray(points),
         np.ones(points.shape[:2], bool),
         preset,
-        start=start_from(source, layout),
-        should_stop=lambda: next(calls) >= steps,
+        Setup(start=start_from(source, layout)),
+        Callbacks(should_stop=lambda: next(calls) >= steps),
     )
 
 

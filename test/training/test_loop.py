@@ -19,11 +19,13 @@ from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training import loop as training
+from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
-from deep_nrsfm_ros.training.loop import finish, train
+from deep_nrsfm_ros.training.loop import Callbacks, train
 from deep_nrsfm_ros.training.progress import Progress
 from deep_nrsfm_ros.training.trainer import Trainer, learning_rate
+from test.fixtures.training_options import by_dataclass
 
 SMALL = Preset(
     Architecture(widths=(8, 4)),
@@ -38,7 +40,9 @@ def small(**changes: Any) -> Preset:
 
 
 def run(figure: Any, preset: Preset = SMALL, **how: Any) -> Trainer:
-    return train(figure.points, np.ones(figure.points.shape[:2], bool), preset, **how)
+    return train(
+        figure.points, np.ones(figure.points.shape[:2], bool), preset, **by_dataclass(**how)
+    )
 
 
 def stop_after(steps: int) -> Any:
@@ -102,7 +106,11 @@ def test_every_architecture_trains(figure: Any, threshold: str, recovery: str, c
     architecture = Architecture((16, 8), threshold, recovery, camera)
     recipe = Recipe(steps=80, batch=16, learning_rate=3e-2)
     data = figure.points[:64], np.ones((64, 12), bool)
-    before = train(*data, Preset(architecture, Normaliser(), recipe), should_stop=lambda: True)
+    before = train(
+        *data,
+        Preset(architecture, Normaliser(), recipe),
+        callbacks=Callbacks(should_stop=lambda: True),
+    )
     after = train(*data, Preset(architecture, Normaliser(), recipe))
     assert sum(after.measure()) < 0.9 * sum(before.measure())
 
@@ -112,15 +120,15 @@ def test_going_on_from_a_checkpoint_is_as_if_it_had_never_stopped(
     figure: Any, tmp_path: Path, stops: int
 ) -> None:
     file = tmp_path / "checkpoint"
-    stopped = run(figure, checkpoint=file, should_stop=stop_after(stops))
+    stopped = run(figure, file=file, should_stop=stop_after(stops))
     assert stopped.step == stops and file.exists()
-    assert_same(run(figure, checkpoint=file), run(figure))
+    assert_same(run(figure, file=file), run(figure))
     assert [f.name for f in tmp_path.iterdir()] == ["checkpoint"]
 
 
 def test_checkpoints_are_written_on_the_way(figure: Any, tmp_path: Path) -> None:
     file = tmp_path / "checkpoint"
-    run(figure, checkpoint=file, checkpoint_seconds=0.0)
+    run(figure, file=file, seconds=0.0)
     assert int(load_file(file)["step"]) == 12
 
 
@@ -128,9 +136,9 @@ def test_a_checkpoint_keeps_the_seed_that_was_chosen(figure: Any, tmp_path: Path
     preset, file = small(**SCREENED, seed=7), tmp_path / "checkpoint"
     whole = run(figure, preset)
     # 3 x (4 steps and a look), one look after the screening, then 2 steps.
-    stopped = run(figure, preset, checkpoint=file, should_stop=stop_after(3 * 5 + 1 + 2))
+    stopped = run(figure, preset, file=file, should_stop=stop_after(3 * 5 + 1 + 2))
     assert 4 < stopped.step < 12 and stopped.seed == whole.seed
-    assert_same(run(figure, preset, checkpoint=file), whole)
+    assert_same(run(figure, preset, file=file), whole)
 
 
 def test_stopping_returns_at_once(figure: Any) -> None:
@@ -147,10 +155,10 @@ def test_a_stopped_screening_keeps_the_best_so_far_and_goes_on(
     figure: Any, tmp_path: Path, stops: int
 ) -> None:
     preset, file = small(**SCREENED, seed=7), tmp_path / "checkpoint"
-    stopped = run(figure, preset, checkpoint=file, should_stop=stop_after(stops))
+    stopped = run(figure, preset, file=file, should_stop=stop_after(stops))
     assert stopped.step == (stops if stops < 4 else 4) and not stopped.ended
     assert stopped.seed in range(21, 21 + max(stops // 4, 1))
-    went_on = run(figure, preset, checkpoint=file)
+    went_on = run(figure, preset, file=file)
     assert_same(went_on, run(figure, preset))
     assert went_on.ended
 
@@ -165,24 +173,24 @@ def test_a_crash_in_the_screening_loses_one_interval(figure: Any, tmp_path: Path
         return False
 
     with pytest.raises(InterruptedError):
-        run(figure, preset, checkpoint=file, checkpoint_seconds=0.0, should_stop=crash)
+        run(figure, preset, file=file, seconds=0.0, should_stop=crash)
     saved = load_file(file)
     assert (int(saved["seed"]), int(saved["step"]), int(saved["leader.seed"])) == (1, 2, 0)
-    assert_same(run(figure, preset, checkpoint=file), run(figure, preset))
+    assert_same(run(figure, preset, file=file), run(figure, preset))
 
 
 def test_a_screening_of_other_seeds_is_refused(figure: Any, tmp_path: Path) -> None:
     file = tmp_path / "checkpoint"
-    run(figure, small(**SCREENED), checkpoint=file, should_stop=stop_after(6))
+    run(figure, small(**SCREENED), file=file, should_stop=stop_after(6))
     for other in (small(**SCREENED | {"seeds": 1}), small(**SCREENED, seed=5)):
         with pytest.raises(ValueError, match="other seeds"):
-            run(figure, other, checkpoint=file)
+            run(figure, other, file=file)
 
 
 def test_stopping_before_anything_is_learned_leaves_no_checkpoint(
     figure: Any, tmp_path: Path
 ) -> None:
-    run(figure, checkpoint=tmp_path / "checkpoint", should_stop=lambda: True)
+    run(figure, file=tmp_path / "checkpoint", should_stop=lambda: True)
     assert not list(tmp_path.iterdir())
 
 
@@ -256,10 +264,10 @@ def damage(kind: str, file: Path) -> None:
 )
 def test_a_damaged_checkpoint_is_refused(figure: Any, tmp_path: Path, kind: str) -> None:
     file = tmp_path / "checkpoint"
-    run(figure, checkpoint=file, should_stop=stop_after(3))
+    run(figure, file=file, should_stop=stop_after(3))
     damage(kind, file)
     with pytest.raises(ValueError, match="checkpoint"):
-        run(figure, checkpoint=file)
+        run(figure, file=file)
 
 
 @pytest.mark.parametrize("changes", [{"steps": 0}, {"mask": 0.95}, {"schedule": "linear"}])
@@ -328,7 +336,7 @@ def test_steps_may_end_before_the_time(figure: Any, second_a_step: list[float]) 
 def test_time_that_is_gone_stays_gone(
     figure: Any, tmp_path: Path, second_a_step: list[float]
 ) -> None:
-    how = {"limits": Limits(minutes=0.5), "checkpoint": tmp_path / "checkpoint"}
+    how = {"limits": Limits(minutes=0.5), "file": tmp_path / "checkpoint"}
     assert run(figure, small(steps=1000), **how, should_stop=stop_after(12)).step == 12
     assert run(figure, small(steps=1000), **how).step == 30
 

@@ -1,0 +1,91 @@
+"""The last step of a training: from the trained network to a model that can be lifted with."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from deep_nrsfm_ros import __version__
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.correction import bone_lengths, error_covariance
+from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.nrsfm.geometry import Floats
+from deep_nrsfm_ros.nrsfm.handedness import object_frame
+from deep_nrsfm_ros.nrsfm.network import coherence, complete, reconstruct
+from deep_nrsfm_ros.training.trainer import Trainer
+
+_MOST_FRAMES = 2048  # on which the object frame, the error covariance and the bones are measured
+
+
+def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> Model:
+    """Return the trained model with object frame, error covariance, bones and provenance.
+
+    Args:
+        trainer: the trainer that `loop.train` has returned.
+        name: name of the model.
+        layout: layout of the p keypoints that the trainer was trained on.
+        source: where the data come from, in words, for the provenance.
+
+    Returns:
+        The model. Its `quality` is label-free: errors relative to the size of the object, 0 is
+        perfect, and the coherence of the final dictionary, 0 to 1.
+    """
+    net = trainer.net.map(lambda w: w.cpu().numpy())
+    normaliser = trainer.preset.normaliser
+
+    def lift(W: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return shapes S, cameras M and the normalised input of complete points W (f, p, 2)."""
+        encoded = normaliser.encode(W, np.ones_like(W[..., :1]))
+        return *reconstruct(net, encoded.W), encoded.W
+
+    sample = trainer.sample(min(_MOST_FRAMES, 4 * len(trainer.frames)))
+    mask = sample.mask.cpu().numpy()
+    W, _ = complete(net, sample.points.cpu().numpy(), mask)
+    S, _, _ = lift(W)
+    rng = np.random.default_rng(trainer.seed)
+    covariance = error_covariance(lift, W, rng)
+    return Model(
+        name,
+        net,
+        layout,
+        normaliser,
+        object_frame(S, layout, mask[..., 0] > 0),
+        error_covariance=covariance,
+        bone_lengths=bone_lengths(lift, W, layout.bone_indices(), covariance, rng),
+        provenance=_provenance(trainer, source),
+        quality=_quality(trainer, coherence(net)),
+    )
+
+
+def _provenance(trainer: Trainer, source: str) -> dict[str, Any]:
+    """Return how the model was made, for its file."""
+    provenance: dict[str, Any] = {
+        "data": source,
+        "frames": trainer.frames_in_all,
+        "recipe": dataclasses.asdict(trainer.preset.recipe),
+    }
+    if trainer.objective.layout_loss is not None:
+        provenance["layout_loss"] = dataclasses.asdict(trainer.objective.layout_loss.weights)
+    provenance |= {"seed": trainer.seed, "step": trainer.step}
+    if trainer.kept is not None:
+        provenance["kept_step"] = trainer.kept
+    provenance["cpu_seconds"] = round(trainer.cpu_seconds, 2)  # of the first process
+    if trainer.team.size > 1:
+        provenance["processes"] = trainer.team.size
+    provenance["versions"] = {"deep_nrsfm_ros": __version__, "torch": torch.__version__}
+    return provenance
+
+
+def _quality(trainer: Trainer, dictionary_coherence: float) -> dict[str, float]:
+    """Return the label-free quality of the model, for its file."""
+    reprojection_error, cycle_error = trainer.measure()
+    return {
+        "reprojection_error": round(reprojection_error, 5),
+        "cycle_error": round(cycle_error, 5),
+        "combined": round(math.hypot(reprojection_error, cycle_error), 5),
+        "coherence": round(dictionary_coherence, 5),
+    }
