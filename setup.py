@@ -114,7 +114,7 @@ setup(
             "matplotlib",  # the demo's picture and the benchmarks' plots
             "scipy",  # the demo's ground truth: triangulation from four calibrated cameras
         ],
-        # Not in requirements.lock: only the table of benchmarks.speed.forward has a row for it.
+        # Not in requirements.lock: only benchmarks.speed.forward_pass has a row for it.
         "speed": [
             "onnxruntime",  # what the forward pass is measured against
             "onnx",  # the format, for torch's exporter

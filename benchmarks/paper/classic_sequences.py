@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from benchmarks.baselines.batches import RANKS
 from benchmarks.baselines.methods import block_matrix, em_ppca, rigid
+from benchmarks.data.mat_files import read_sequence
 from benchmarks.harness import LIFTING_LEGEND, Session, command
-from benchmarks.mat_files import read_sequence
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, figures
 from deep_nrsfm_ros.data.dataset import Dataset

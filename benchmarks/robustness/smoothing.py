@@ -65,7 +65,7 @@ def benchmark(session: Session) -> Table:
     """Lift each clip, with the filter and without."""
     lifter = Lifter(load_model(find_model("human", model_folders(default_models_dir()))))
     table = Table(
-        *("steadiness", "Steadiness of what is lifted", ("clip", "filter")),
+        *("smoothing", "Steadiness of what is lifted", ("clip", "filter")),
         tuple(FIGURES),
         FIGURES,
         bars("rotation deg", "points %", "shake %"),

@@ -11,7 +11,7 @@ import numpy as np
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.speed.harness import arguments, by_turns, on_one_thread, show
+from benchmarks.speed.timing import arguments, by_turns, on_one_thread, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.bags import STORAGES, frames, read_bags, write_bag
 from deep_nrsfm_ros.layouts.presets import CMU31

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.speed.harness import arguments, show
 from benchmarks.speed.round_trip import LOSSLESS, NODES, Contender, keypoints, started
+from benchmarks.speed.timing import arguments, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.layouts.presets import CMU31
 

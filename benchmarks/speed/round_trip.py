@@ -22,7 +22,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
-from benchmarks.speed.harness import environment, fresh_domain
+from benchmarks.speed.timing import environment, fresh_domain
 from deep_nrsfm_ros.commands.demo.client import node
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.serialised import Header
@@ -160,7 +160,7 @@ class Contender(NamedTuple):
 
 
 NODES: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "relay": ("benchmarks.speed.relay", "relay", {}),
+    "relay": ("benchmarks.speed.relay_node", "relay", {}),
     "lifter": ("deep_nrsfm_ros.node.lifter", "lifter", {"model": "cmu31"}),
 }
 """What is measured: module, name of the node, parameters."""

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import torch
 from tqdm import tqdm
 
-from benchmarks.paper.nrsfm_on_cmu import PAPER
-from benchmarks.speed.harness import arguments, show
+from benchmarks.paper.table1_cmu import PAPER
+from benchmarks.speed.timing import arguments, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, evaluate, figures, read_split
 from deep_nrsfm_ros.data.dataset import Dataset

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.speed.harness import arguments, show
+from benchmarks.speed.timing import arguments, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.curation import curate
 from deep_nrsfm_ros.data.dataset import Dataset

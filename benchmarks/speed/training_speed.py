@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 
-from benchmarks.speed.harness import arguments, by_turns, show
 from benchmarks.speed.plain_torch import PlainTraining
+from benchmarks.speed.timing import arguments, by_turns, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.distributed import join

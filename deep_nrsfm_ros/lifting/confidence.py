@@ -37,7 +37,10 @@ class Calibration(NamedTuple):
 
 
 CALIBRATED = Calibration(-6.47, -2.29, -1.49, 1.29, -0.27)
-"""Fitted to people whom no model saw: `python -m benchmarks.robustness.reliability --data DATA`."""
+"""Fitted to subjects that no model was trained on.
+
+Source: `python -m benchmarks.robustness.confidence_calibration --data DATA`.
+"""
 
 
 def log_odds_terms(visible: NDArray[np.bool_], residual: Floats, spread: Floats) -> Floats:

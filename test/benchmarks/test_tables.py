@@ -13,15 +13,23 @@ import pytest
 
 from benchmarks.baselines import batches
 from benchmarks.harness import Session
-from benchmarks.paper import ablation, coherence, mirror, nrsfm_on_cmu, unseen
-from benchmarks.robustness import missing, noise
+from benchmarks.paper import ablation, coherence, mirrored_frames, table1_cmu, table3_unseen
+from benchmarks.robustness import missing_keypoints, noise
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import ALONE, LIFTING
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 
 LONE = ("--subjects", "01", "--seeds", "0", "1", "--steps", "3")
-ALL_TABLES = [nrsfm_on_cmu, mirror, ablation, unseen, noise, missing, coherence]
+ALL_TABLES = [
+    table1_cmu,
+    mirrored_frames,
+    ablation,
+    table3_unseen,
+    noise,
+    missing_keypoints,
+    coherence,
+]
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +45,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         small = dataclasses.replace(preset.architecture, widths=(8, 4))
         monkeypatch.setitem(PRESETS, name, preset._replace(architecture=small))
     monkeypatch.setattr(batches, "RANKS", (2,))
-    monkeypatch.setattr(unseen, "TRAINED_ON", {"86": ("86",), "union": ("01", "86")})
+    monkeypatch.setattr(table3_unseen, "TRAINED_ON", {"86": ("86",), "union": ("01", "86")})
 
 
 @pytest.fixture
@@ -81,8 +89,8 @@ def test_runs_end_to_end(
 
 @pytest.mark.usefixtures("few")
 def test_nrsfm_on_cmu_has_the_papers_figures_beside_ours(data: Path, output: Path) -> None:
-    nrsfm_on_cmu.main(["--data", str(data), "--output", str(output), *LONE])
-    found = {row["method"]: row for row in rows(output, "nrsfm_on_cmu")}
+    table1_cmu.main(["--data", str(data), "--output", str(output), *LONE])
+    found = {row["method"]: row for row in rows(output, "table1_cmu")}
     assert list(found) == [
         *("paper: Deep NRSfM", "paper: Simple", "paper: Sparse", "paper: EM-SfM"),
         "paper's network, ours, network alone",
@@ -99,8 +107,8 @@ def test_nrsfm_on_cmu_has_the_papers_figures_beside_ours(data: Path, output: Pat
 
 
 def test_papers_table_is_whole() -> None:
-    assert nrsfm_on_cmu.PAPER["Simple"]["127"] == {"shape %": 23.70, "point cm": 10.9473}
-    assert all(len(subjects) == 10 for subjects in nrsfm_on_cmu.PAPER.values())
+    assert table1_cmu.PAPER["Simple"]["127"] == {"shape %": 23.70, "point cm": 10.9473}
+    assert all(len(subjects) == 10 for subjects in table1_cmu.PAPER.values())
 
 
 def test_batches_are_compared_one_by_one(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,11 +160,11 @@ def test_noise_has_the_ratio_asked_for(dataset: Dataset) -> None:
 
 @pytest.mark.parametrize(("what", "count"), [("0", 0), ("1", 1), ("9", 9), ("arm", 6), ("leg", 4)])
 def test_hides_points(dataset: Dataset, what: str, count: int) -> None:
-    test = missing.hidden(dataset, what)
+    test = missing_keypoints.hidden(dataset, what)
     assert ((~test.visible).sum(1) == count).all()
     assert (test.points[~test.visible] == 0).all()
     np.testing.assert_array_equal(test.points[test.visible], dataset.points[test.visible])
-    if what in missing.LIMBS:
+    if what in missing_keypoints.LIMBS:
         sides = {tuple(np.flatnonzero(~frame)) for frame in test.visible}
         names = {"".join(dataset.layout.keypoints[i][0] for i in side) for side in sides}
         assert names == {"l" * count, "r" * count}
@@ -164,7 +172,7 @@ def test_hides_points(dataset: Dataset, what: str, count: int) -> None:
 
 def test_similarity_forgives_the_scale_only(session: Session, dataset: Dataset) -> None:
     model = session.trained("a title", dataset, session.preset("default", 0))
-    found = unseen.errors(model, dataset, ALONE)
+    found = table3_unseen.errors(model, dataset, ALONE)
     assert 0 < found["similarity %"] < found["proper %"] + 1e-6 or found["mirrored %"] > 0
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.robustness import smoothing as steadiness
+from benchmarks.robustness import smoothing
 from benchmarks.robustness.smoothing import Clip
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.nrsfm.geometry import centre, rotation_from_vector
@@ -30,11 +30,11 @@ def turning(degrees: float, frames: int = 100) -> Lifted:
 
 
 def test_from_end_to_end(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steadiness, "CACHE", tmp_path)
-    monkeypatch.setattr(steadiness, "HELD", 9)
-    monkeypatch.setattr(steadiness, "_LAGS", np.array([0.0, 0.01]))
-    steadiness.main(["--data", str(data), "--output", str(tmp_path)])
-    rows = list(csv.DictReader((tmp_path / "steadiness.csv").open()))
+    monkeypatch.setattr(smoothing, "CACHE", tmp_path)
+    monkeypatch.setattr(smoothing, "HELD", 9)
+    monkeypatch.setattr(smoothing, "_LAGS", np.array([0.0, 0.01]))
+    smoothing.main(["--data", str(data), "--output", str(tmp_path)])
+    rows = list(csv.DictReader((tmp_path / "smoothing.csv").open()))
     assert len(rows) == 14
     held = {row["filter"]: row for row in rows if "held" in row["clip"]}
     assert float(held["on"]["rotation deg"]) < float(held["off"]["rotation deg"])
@@ -43,7 +43,7 @@ def test_from_end_to_end(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_steady_turn_does_not_shake() -> None:
     lifted = turning(2.0)
     clip = Clip(lifted.translation, lifted.confidence, RATE, noisy=False)
-    found = steadiness.figures(lifted, lifted, clip)
+    found = smoothing.figures(lifted, lifted, clip)
     assert found["rotation deg"] == pytest.approx(2, abs=1e-2)
     assert 1 < found["points %"] < 100 * np.radians(2)
     assert found["shake %"] < 0.2 and found["lag ms"] == 0
@@ -52,7 +52,7 @@ def test_a_steady_turn_does_not_shake() -> None:
 def test_a_delay_is_the_lag() -> None:
     lifted = turning(2.0)
     late = lifted.shapes[:-3]
-    assert steadiness.lag(lifted.shapes[3:], late, RATE) == pytest.approx(3 / RATE)
+    assert smoothing.lag(lifted.shapes[3:], late, RATE) == pytest.approx(3 / RATE)
 
 
 def test_only_the_largest_person_of_a_video_is_followed(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_only_the_largest_person_of_a_video_is_followed(tmp_path: Path) -> None:
     with gzip.open(tmp_path / "video.jsonl.gz", "wt") as file:
         for people in (crowd, [], crowd[::-1]):
             file.write(json.dumps({"people": people}) + "\n")
-    clip = steadiness.filmed(tmp_path / "video.jsonl.gz")
+    clip = smoothing.filmed(tmp_path / "video.jsonl.gz")
     assert clip.points.shape == (2, 17, 2)
     np.testing.assert_array_equal(*clip.points)
     assert np.ptp(clip.points[0]) > 5

@@ -18,16 +18,16 @@ from hypothesis import strategies as st
 
 from benchmarks.speed import (
     bag_reading,
-    forward,
+    forward_pass,
     latency,
+    latency_breakdown,
     round_trip,
     time_to_error,
     training_scale,
     training_speed,
-    where_time_goes,
 )
 from benchmarks.speed import (
-    harness as speed,
+    timing as speed,
 )
 from benchmarks.table import Table
 from deep_nrsfm_ros.layouts.presets import CMU31
@@ -72,12 +72,12 @@ def test_forward_compares_with_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     small = dataclasses.replace(architecture, widths=(8, 4))
     network = initialise(small, len(CMU31), np.random.default_rng(0))
     model = Model("m", network, CMU31, normaliser, np.eye(3, dtype=np.float32))
-    monkeypatch.setattr(forward, "models", lambda: {"default": model})
-    monkeypatch.setattr(forward, "BATCHES", (2,))
-    found = {row["by"]: row for row in rows(forward, tmp_path)}
-    assert {forward.OURS, "torch eager", "torch.jit", "NumPy", "Lifter"} <= found.keys()
-    assert any(forward.ONNX in by for by in found)  # measured, or said not to be installed
-    ours = float(found[forward.OURS]["p50 us"])
+    monkeypatch.setattr(forward_pass, "models", lambda: {"default": model})
+    monkeypatch.setattr(forward_pass, "BATCHES", (2,))
+    found = {row["by"]: row for row in rows(forward_pass, tmp_path)}
+    assert {forward_pass.OURS, "torch eager", "torch.jit", "NumPy", "Lifter"} <= found.keys()
+    assert any(forward_pass.ONNX in by for by in found)  # measured, or said not to be installed
+    ours = float(found[forward_pass.OURS]["p50 us"])
     for row in found.values():
         if row["ratio"]:
             assert float(row["ratio"]) == pytest.approx(float(row["p50 us"]) / ours)
@@ -87,7 +87,7 @@ def test_all_passes_compute_the_same() -> None:
     network = initialise(PRESETS["default"].architecture, 9, np.random.default_rng(0))
     W = np.random.default_rng(1).standard_normal((3, 9, 2), dtype=np.float32)
     with torch.no_grad():
-        results: dict[str, Any] = {n: call() for n, call in forward.passes(network, W).items()}
+        results: dict[str, Any] = {n: call() for n, call in forward_pass.passes(network, W).items()}
     for S, M in results.values():
         np.testing.assert_allclose(np.asarray(S), results["NumPy"][0], rtol=1e-3, atol=1e-4)
         np.testing.assert_allclose(np.asarray(M), results["NumPy"][1], rtol=1e-3, atol=1e-4)
@@ -127,8 +127,8 @@ def test_the_relay_answers_everything(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_time_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
-    monkeypatch.setattr(where_time_goes.time, "perf_counter", lambda: clock[0])
-    watch = where_time_goes.Stopwatch()
+    monkeypatch.setattr(latency_breakdown.time, "perf_counter", lambda: clock[0])
+    watch = latency_breakdown.Stopwatch()
 
     def spend(seconds: float) -> None:
         clock[0] += seconds
@@ -142,15 +142,20 @@ def test_time_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_step_has_its_functions() -> None:
-    functions = [function for step in where_time_goes.STEPS.values() for function in step]
+    functions = [function for step in latency_breakdown.STEPS.values() for function in step]
     assert all(callable(getattr(owner, name)) for owner, name in functions)
 
 
 def test_shares_are_of_the_sum() -> None:
-    times = {"read": 30.0, "network": 90.0, where_time_goes.SUM: 120.0, where_time_goes.WHOLE: 100}
-    values = where_time_goes.tabulate({1: times}).values()
+    times = {
+        "read": 30.0,
+        "network": 90.0,
+        latency_breakdown.SUM: 120.0,
+        latency_breakdown.WHOLE: 100,
+    }
+    values = latency_breakdown.tabulate({1: times}).values()
     assert values[("read",)] == {"1 object": [30], "1 object %": [25]}
-    assert values[(where_time_goes.SHARE,)] == {"1 object": [1.2]}
+    assert values[(latency_breakdown.SHARE,)] == {"1 object": [1.2]}
 
 
 @pytest.mark.usefixtures("few")

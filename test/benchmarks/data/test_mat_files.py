@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from benchmarks.mat_files import read_category, read_sequence
+from benchmarks.data.mat_files import read_category, read_sequence
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 
 F, P = 5, 7

@@ -1,7 +1,7 @@
 """Where detectors see joints, where motion capture has them, and what models make of both.
 
 Nothing of the pose2sim clip enters here: by these figures the model `human` was chosen, on that
-clip it is tested (`benchmarks.real.real_detections`).
+clip it is tested (`benchmarks.real.mediapipe_comparison`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.real.real_detections import SUBJECTS
+from benchmarks.real.mediapipe_comparison import SUBJECTS
 from benchmarks.robustness.smoothing import VIDEO, Clip, filmed
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.mocap import read_trials, trials

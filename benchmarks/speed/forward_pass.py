@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from benchmarks.speed.harness import arguments, by_turns, on_one_thread, show
 from benchmarks.speed.plain_torch import PlainNetwork
+from benchmarks.speed.timing import arguments, by_turns, on_one_thread, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.model_files.folders import model_folders
@@ -103,7 +103,7 @@ def benchmark(given: Namespace) -> Iterator[Table]:
     """Time the passes and the lifters, in turns."""
     rounds, seconds = (1, 0.005) if given.quick else (5, 0.4)
     table = Table(
-        "forward",
+        "forward_pass",
         "One pass of the network, and the whole Lifter",
         ("network", "batch", "by"),
         ("p50 us", "ratio"),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.real import detector_joints
-from benchmarks.real.detector_joints import CAMERA, as_filmed, facing, proportions
+from benchmarks.real import model_selection
+from benchmarks.real.model_selection import CAMERA, as_filmed, facing, proportions
 from benchmarks.robustness.smoothing import Clip
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.presets import HUMAN17
@@ -23,7 +23,7 @@ def test_proportions_do_not_depend_on_size_and_place() -> None:
 
 def test_only_who_faces_the_camera_surely_is_measured() -> None:
     points, confidence = np.zeros((3, 17, 2)), np.ones((3, 17))
-    places = [HUMAN17.index(joint) for joint in detector_joints._TRUNK]
+    places = [HUMAN17.index(joint) for joint in model_selection._TRUNK]
     points[:, places] = TRUNK
     points[1, places] *= [0.5, 1]  # seen from the side
     confidence[2, places[0]] = 0.3
@@ -32,7 +32,7 @@ def test_only_who_faces_the_camera_surely_is_measured() -> None:
 
 
 def test_a_camera_sees_the_truth_but_for_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(detector_joints, "NOISE", 0.0)
+    monkeypatch.setattr(model_selection, "NOISE", 0.0)
     rng = np.random.default_rng(0)
     shapes = 0.4 * rng.standard_normal((20, 17, 3))
     seen = as_filmed(shapes, rng)

@@ -8,9 +8,9 @@ import numpy as np
 
 from benchmarks.baselines.batches import BASELINES, solve
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.furniture import CATEGORIES
+from benchmarks.data.mat_files import observed, read_category
+from benchmarks.data.synthetic_furniture import CATEGORIES
 from benchmarks.harness import LIFTING_LEGEND, Session, command
-from benchmarks.mat_files import observed, read_category
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, figures
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -57,7 +57,7 @@ def images(session: Session, category: str) -> Dataset:
 def benchmark(session: Session) -> Table:
     """Train and solve each category on its own images and compare."""
     table = Table(
-        "structure_from_category",
+        "table2_categories",
         "Structure from category, in-sample",
         ("category", "method"),
         _SHOWN,

@@ -110,7 +110,7 @@ def benchmark(session: Session) -> Table:
     lifters = [Observed(load_model(find_model(name, folders))) for name in MODELS]
     fitted = fit([on_mocap(session, lifter, fitted_to, 0) for lifter in lifters])
     table = Table(
-        "reliability",
+        "confidence_calibration",
         "Reliability of the confidence",
         ("model", "rated on", "confidence"),
         FIGURES,

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.furniture import CATEGORIES
+from benchmarks.data.synthetic_furniture import CATEGORIES
 
 
 @pytest.mark.parametrize("make", CATEGORIES.values(), ids=CATEGORIES.keys())

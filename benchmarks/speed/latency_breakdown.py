@@ -20,8 +20,8 @@ from unittest import mock
 import numpy as np
 import rclpy
 
-from benchmarks.speed.harness import arguments, fresh_domain, on_one_thread, show
 from benchmarks.speed.round_trip import keypoints
+from benchmarks.speed.timing import arguments, fresh_domain, on_one_thread, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.client import node
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -140,7 +140,7 @@ def tabulate(found: dict[int, dict[str, float]]) -> Table:
     """Return the table of microseconds by number of objects: step -> time."""
     names = [f"{objects} object{'s' * (objects > 1)}" for objects in found]
     table = Table(
-        "where_time_goes",
+        "latency_breakdown",
         "Where the microseconds of one message go: model cmu31, 31 keypoints",
         ("step",),
         (*names, *(f"{name} %" for name in names)),
@@ -169,7 +169,7 @@ def benchmark(given: Namespace) -> Iterator[Table]:
     os.environ["ROS_DOMAIN_ID"] = str(fresh_domain())
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         parameters = {"input": "/lifter/points"}
-        stack.enter_context(node("benchmarks.speed.relay", parameters, Path(name) / "log"))
+        stack.enter_context(node("benchmarks.speed.relay_node", parameters, Path(name) / "log"))
         rclpy.init(args=["--ros-args", "-p", "model:=cmu31"])
         stack.callback(rclpy.try_shutdown)
         subject = Lifter()

@@ -39,7 +39,7 @@ SIMILARITY = {
 def benchmark(session: Session) -> Table:
     """Train on some trials and compare on others."""
     table = Table(
-        "unseen",
+        "table3_unseen",
         "Unseen data",
         ("trained on", "tested on", "method"),
         (*SIMILARITY, *CONVENTIONS),

@@ -51,7 +51,7 @@ class Spoiled(NamedTuple):
 def benchmark(session: Session) -> Table:
     """Spoil each subject's frames and count what is found."""
     table = Table(
-        "spoiled",
+        "corrupted_data",
         "Curation of spoiled frames",
         ("subject",),
         tuple(FIGURES),

@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from benchmarks.data.pose2sim_scenes import LIMBS, Scene, scenes
 from benchmarks.harness import Session, command
-from benchmarks.scenes import LIMBS, Scene, scenes
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.pose2sim import JOINTS
@@ -84,7 +84,7 @@ def benchmark(session: Session) -> Table:
     }
     scope = {"scope": "one person, one room, one clip: figures of these four views, no more"}
     table = Table(
-        "real_detections",
+        "mediapipe_comparison",
         "Real detections of a person by four cameras, 12 limb joints",
         ("trial", "system", "camera"),
         tuple(FIGURES),

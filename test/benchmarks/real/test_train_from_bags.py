@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.real import from_bags
+from benchmarks.real import train_from_bags
 from deep_nrsfm_ros.data.bags import read_bags
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 
@@ -28,13 +28,13 @@ def rows(path: Path) -> list[dict[str, str]]:
 def test_the_video_becomes_a_bag_of_all_people_in_it(tmp_path: Path) -> None:
     person = [v for k in range(25) for v in (100.0 + k, 200.0 + k, 0.9 if k else 0.0)]
     (tmp_path / "detections").mkdir()
-    with gzip.open(tmp_path / from_bags.VIDEO, "wt") as lines:
+    with gzip.open(tmp_path / train_from_bags.VIDEO, "wt") as lines:
         for count in (1, 2, 0):
             people = [{"pose_keypoints_2d": person}] * count
             lines.write(json.dumps({"people": people}) + "\n")
-    session = from_bags.Session(tmp_path, tmp_path / "out", None, 1)
-    bag = session.bag("video", lambda: from_bags._people(tmp_path / from_bags.VIDEO))
-    reading = read_bags([bag], from_bags.TOPIC, BODY25, HUMAN17)
+    session = train_from_bags.Session(tmp_path, tmp_path / "out", None, 1)
+    bag = session.bag("video", lambda: train_from_bags._people(tmp_path / train_from_bags.VIDEO))
+    reading = read_bags([bag], train_from_bags.TOPIC, BODY25, HUMAN17)
     assert (reading.messages, reading.unreadable, len(reading.dataset)) == (3, 0, 3)
     nose = HUMAN17.index("nose")
     assert not reading.dataset.visible[:, nose].any()
@@ -42,11 +42,11 @@ def test_the_video_becomes_a_bag_of_all_people_in_it(tmp_path: Path) -> None:
 
 
 def test_a_bag_that_was_cut_off_is_written_anew(tmp_path: Path) -> None:
-    session = from_bags.Session(tmp_path, tmp_path, None, 1)
-    recording = from_bags.excavator.record(5, 0)
+    session = train_from_bags.Session(tmp_path, tmp_path, None, 1)
+    recording = train_from_bags.excavator.record(5, 0)
     (tmp_path / "machine").mkdir()
     (tmp_path / "machine" / "machine.db3").write_bytes(b"half")
-    bag = session.bag("machine", lambda: from_bags._work(recording))
+    bag = session.bag("machine", lambda: train_from_bags._work(recording))
     assert (bag / "metadata.yaml").exists()
     session.bag("machine", lambda: pytest.fail("it is there"))
 
@@ -54,22 +54,22 @@ def test_a_bag_that_was_cut_off_is_written_anew(tmp_path: Path) -> None:
 def test_the_machine_from_bag_to_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(from_bags, "WORK", 200)
-    monkeypatch.setattr(from_bags, "WORK_LATER", 50)
+    monkeypatch.setattr(train_from_bags, "WORK", 200)
+    monkeypatch.setattr(train_from_bags, "WORK_LATER", 50)
     words = ["machine", "--data", "unused", "--output", str(tmp_path), "--steps", "30"]
-    from_bags.main(words)
+    train_from_bags.main(words)
     table = rows(tmp_path / "from_excavator.csv")
     assert [row["frames"] for row in table] == ["200"] * 3 + ["50"] * 3
     assert all(0 < float(row["proper %"]) < 150 for row in table)
     assert 0 < float(table[0]["metres"]) < 10
     capfd.readouterr()
-    from_bags.main(words)
+    train_from_bags.main(words)
     assert "training" not in capfd.readouterr().err
     assert rows(tmp_path / "from_excavator.csv") == table
 
 
 def test_the_service_makes_the_model_that_the_program_makes(tmp_path: Path, data: Path) -> None:
-    from_bags.main(["mocap", "--data", str(data), "--output", str(tmp_path), "--steps", "5"])
+    train_from_bags.main(["mocap", "--data", str(data), "--output", str(tmp_path), "--steps", "5"])
     table = rows(tmp_path / "from_mocap.csv")
     direct, served = table[:2], table[2:4]
     assert [row["lifted"] for row in direct] == ["network alone", "as shipped"]
@@ -81,6 +81,6 @@ def test_the_service_makes_the_model_that_the_program_makes(tmp_path: Path, data
 
 def test_a_part_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
-        from_bags.main(["nothing", "--data", "unused"])
+        train_from_bags.main(["nothing", "--data", "unused"])
     assert end.value.code == 2
     assert "no part nothing; there are video, machine, mocap" in capsys.readouterr().err

@@ -51,7 +51,7 @@ def benchmark(session: Session) -> Table:
     """Hide points of the training frames from trained models."""
     columns = [*map(str, COUNTS), *LIMBS]
     table = Table(
-        "missing",
+        "missing_keypoints",
         "Missing points",
         ("subject", "trained", "lifting"),
         in_pairs(columns),

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.baselines.methods import rigid
-from benchmarks.real import excavator, plausibility
+from benchmarks.data import synthetic_excavator as excavator
+from benchmarks.real import plausibility
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, lifter
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, read_split

@@ -8,10 +8,10 @@ import pytest
 from scipy.io import savemat
 
 from benchmarks.baselines import batches
-from benchmarks.furniture import CATEGORIES
+from benchmarks.data.synthetic_furniture import CATEGORIES
 from benchmarks.harness import Session
-from benchmarks.paper import structure_from_category
-from benchmarks.paper.structure_from_category import CAMERAS, FACES, images, main
+from benchmarks.paper import table2_categories
+from benchmarks.paper.table2_categories import CAMERAS, FACES, images, main
 from deep_nrsfm_ros.commands.evaluate import LIFTING
 
 
@@ -35,7 +35,7 @@ def session(data, tmp_path: Path):
 def test_each_object_is_seen_by_cameras_of_its_own(
     session, category, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(structure_from_category, "OBJECTS", 30)
+    monkeypatch.setattr(table2_categories, "OBJECTS", 30)
     dataset = images(session, category)
     assert len(dataset) == 30 * CAMERAS
     assert dataset.shapes is not None
@@ -54,7 +54,7 @@ def test_command_compares_all_methods_on_each_category(
     data, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batches, "RANKS", (3,))
-    monkeypatch.setattr(structure_from_category, "OBJECTS", 30)
+    monkeypatch.setattr(table2_categories, "OBJECTS", 30)
     output = tmp_path / "output"
     main(
         [
@@ -63,7 +63,7 @@ def test_command_compares_all_methods_on_each_category(
         ]
     )
     assert "stand-in for the IKEA data" in capsys.readouterr().out
-    with (output / "structure_from_category.csv").open() as file:
+    with (output / "table2_categories.csv").open() as file:
         table = list(csv.DictReader(file))
     methods = {row["method"] for row in table if row["category"] == FACES}
     assert len(methods) == len(LIFTING) + 3

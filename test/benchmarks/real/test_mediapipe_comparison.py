@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import scenes
-from benchmarks.real import real_detections
-from benchmarks.scenes import LIMBS, Seen
+from benchmarks.data import pose2sim_scenes
+from benchmarks.data.pose2sim_scenes import LIMBS, Seen
+from benchmarks.real import mediapipe_comparison
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.cameras import Camera
 from deep_nrsfm_ros.data.pose2sim import JOINTS
@@ -43,7 +43,7 @@ def output(
 ) -> Path:
     """Return an output folder that holds what MediaPipe saw of the session's videos."""
     write_session(tmp_path / WHEEL, ring, ring, [0.0] * 4, FRAMES)
-    monkeypatch.setattr(scenes, "CACHE", tmp_path)
+    monkeypatch.setattr(pose2sim_scenes, "CACHE", tmp_path)
     places = [BODY25B.index(joint) for joint in JOINTS]
     times = {"Balancing": np.arange(FRAMES), "Static": np.zeros(5)}
     with zipfile.ZipFile(tmp_path / WHEEL, "a") as archive:
@@ -61,29 +61,29 @@ def output(
 def test_a_perfect_mediapipe_makes_no_error(
     data: Path, output: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    real_detections.main(["--data", str(data), "--output", str(output), "--subjects", "01"])
+    mediapipe_comparison.main(["--data", str(data), "--output", str(output), "--subjects", "01"])
     printed = capsys.readouterr().out
-    assert printed.strip() == (output / "real_detections.md").read_text().strip()
-    assert (output / "real_detections.png").stat().st_size > 1000
-    rows = list(csv.DictReader((output / "real_detections.csv").open()))
+    assert printed.strip() == (output / "mediapipe_comparison.md").read_text().strip()
+    assert (output / "mediapipe_comparison.png").stat().st_size > 1000
+    rows = list(csv.DictReader((output / "mediapipe_comparison.csv").open()))
     cameras = ["cam01", "cam02", "cam03", "cam04", "mean"]
     found = {(row["trial"], row["system"]): [] for row in rows}
     for row in rows:
         found[row["trial"], row["system"]].append(row)
     assert all([row["camera"] for row in group] == cameras for group in found.values())
-    systems = list(real_detections.SYSTEMS)
+    systems = list(mediapipe_comparison.SYSTEMS)
     assert [key[1] for key in found if key[0] == "balancing"] == systems
     # The detections that come with the standing trial are made up.
     assert [key[1] for key in found if key[0] == "standing"] == [
-        system for system in systems if not system.startswith(real_detections.ON_CLIP)
+        system for system in systems if not system.startswith(mediapipe_comparison.ON_CLIP)
     ]
     for (trial, system), group in found.items():
-        perfect, mean = system == real_detections.WORLD, group[-1]
+        perfect, mean = system == mediapipe_comparison.WORLD, group[-1]
         assert (float(mean["PA mm"]) < 2) == perfect
         if perfect:
             assert float(mean["camera mm"]) < 5 and float(mean["mirrored %"]) == 0
             assert float(mean["ms"]) == pytest.approx(100)
-        if trial == "standing" and system != real_detections.MEAN_SHAPE:
+        if trial == "standing" and system != mediapipe_comparison.MEAN_SHAPE:
             assert float(mean["jitter deg"]) < 0.01
         else:
             assert mean["jitter deg"] == ""
@@ -95,7 +95,7 @@ def test_without_mediapipe_it_says_what_to_do(
     (output / "mediapipe-0.10.14" / "Static" / "cam02.npz").unlink()
     monkeypatch.setitem(sys.modules, "examples.mediapipe_detector", None)
     with pytest.raises(SystemExit, match="2"):
-        real_detections.main(["--data", str(data), "--output", str(output)])
+        mediapipe_comparison.main(["--data", str(data), "--output", str(output)])
     assert "`make demo-live` installs MediaPipe" in capsys.readouterr().err
 
 
@@ -104,13 +104,13 @@ def test_jitter_is_the_angle_between_neighbours() -> None:
     turns = Rotation.from_rotvec(np.radians(2.0 * np.arange(9))[:, None] * [0, 0.6, 0.8])
     shapes = shape @ turns.as_matrix() + np.arange(9)[:, None, None]
     shapes[4] = np.nan  # nobody was seen
-    assert real_detections.jitter(shapes) == pytest.approx(2)
+    assert mediapipe_comparison.jitter(shapes) == pytest.approx(2)
 
 
 def test_mean_shape_of_one_shape_seen_from_everywhere_is_that_shape() -> None:
     rng = np.random.default_rng(0)
     shape = rng.standard_normal((12, 3))
     shapes = rng.uniform(1, 2, (30, 1, 1)) * (shape @ Rotation.random(30, rng).as_matrix())
-    mean = real_detections.mean_shape(shapes)
-    error = real_detections.scores(mean[None], shape[None] - 7)
+    mean = mediapipe_comparison.mean_shape(shapes)
+    error = mediapipe_comparison.scores(mean[None], shape[None] - 7)
     assert error["PA mm"] < 1e-6 and error["mirrored %"] == 0

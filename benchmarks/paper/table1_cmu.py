@@ -48,7 +48,7 @@ def benchmark(session: Session) -> Table:
     """Train, solve and compare each subject on its own frames."""
     printed = f"as printed; the ratio of its cm and % fits skeletons 1 / {HEIGHT_18:.3f} as high"
     table = Table(
-        "nrsfm_on_cmu",
+        "table1_cmu",
         "NRSfM on CMU motion capture, in-sample",
         ("subject", "method"),
         (*CONVENTIONS, *TIME),

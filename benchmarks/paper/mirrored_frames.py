@@ -18,7 +18,7 @@ _SHOWN = ("shape %", "proper %", "mirrored %")
 def benchmark(session: Session) -> Table:
     """Train with each seed and count mirrored frames; a row for each, as a mean would hide one."""
     table = Table(
-        "mirror",
+        "mirrored_frames",
         "Mirrored frames, seed by seed",
         ("subject", "tested on", "lifted", "run"),
         _SHOWN,

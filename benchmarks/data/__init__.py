@@ -1,0 +1,1 @@
+"""Data of the benchmarks: synthetic objects, MATLAB files and the pose2sim session."""
