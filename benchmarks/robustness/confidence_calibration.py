@@ -76,15 +76,15 @@ class Rated(NamedTuple):
 class Witness(NumpyBackend):
     """Keeps the terms of the log odds (n, p, 5) of what it has lifted, a part for each call."""
 
-    def __init__(self, known: LifterConstants) -> None:
-        """Take what a lifter knows."""
-        super().__init__(known)
+    def __init__(self, constants: LifterConstants) -> None:
+        """Take model and options."""
+        super().__init__(constants)
         self.kept: list[Floats] = []
 
     def keypoint_confidence(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
         """Return the confidence, and keep what it comes from."""
         visible = confidence > 0
-        known = log_odds_terms(visible, residual, self.spread(S))
+        known = log_odds_terms(visible, residual, self.relative_error_std(S))
         self.kept.append(np.concatenate([known, ~visible[..., None]], 2))
         return super().keypoint_confidence(confidence, residual, S)
 

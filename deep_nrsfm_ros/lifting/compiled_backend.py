@@ -48,13 +48,13 @@ class CompiledBackend:
             floats += [_panels(encoder), _padded(b), _panels(decoder), _padded(b_ if i else b_.T)]
         last = options.widths[-1]
         code_head = _padded(net.code_head.reshape(6, last, last).swapaxes(1, 2)).swapaxes(1, 2)
-        floats += [_panels(code_head.reshape(-1, last)), net.camera_head, constants.spread]
+        floats += [_panels(code_head.reshape(-1, last)), net.camera_head, constants.error_std]
         # Three rows for each point: (p, 3, 3, p), both p filled up.
         rows = _padded(covariance.reshape(p, 3, p, 3).swapaxes(2, 3), _kernel.DOUBLES)
         rows = _padded(rows.swapaxes(0, 3), _kernel.DOUBLES).swapaxes(0, 3)
         floats += [rows]
-        doubles = [filling(net), constants.test_time_rotations, constants.frame]
-        doubles += [CALIBRATED, np.stack(bones[1:], 1), constants.noise, constants.length]
+        doubles = [filling(net), constants.test_time_rotations, constants.object_frame]
+        doubles += [CALIBRATED, np.stack(bones[1:], 1), constants.noise, constants.reference_length]
         doubles += [
             UNKNOWN_VARIANCE * np.trace(covariance) / (3 * p),
             MIN_RELATIVE_DEPTH,

@@ -1,15 +1,20 @@
-"""Confidence: the chance that a lifted point is near its true place.
+"""Confidence: the probability that a lifted point is close to its true position.
 
-Near is within `CORRECT_DISTANCE` of the object's size, twice its RMS radius (1.1 m of an
-adult), after the best scale, in the camera's axes: it covers shape and rotation. The odds of a
-point that is seen are
+Close means within `CORRECT_DISTANCE` = 10 % of the object's size. The size is twice the RMS radius,
+1.1 m for an adult. The distance is measured in camera axes after the best scale, so it includes the
+errors of shape and rotation. The odds of a visible point are
 
-    odds = exp(constant) spread^a residual^b share^c
+    odds = exp(constant) spread^a residual^b visible^c
 
-with its spread, the standard deviation of the model's errors there relative to the object's RMS
-radius, which the model has learned without labels; the reprojection residual of its object; and
-the share of the object's points that are seen. Those of a missing point are less by a factor. A
-point that the detector is sure of by 0.7 counts as seen with the chance 0.7, else as missing.
+spread: standard deviation of the model's error at this point, relative to the object's RMS radius.
+    The model has estimated it without 3D labels.
+residual: relative reprojection error of the object.
+visible: fraction of the object's points that are visible.
+
+A factor lowers the odds of a missing point. A point with detector confidence 0.7 counts as visible
+with probability 0.7 and as missing with probability 0.3.
+
+Source: ours, not in the paper.
 """
 
 from __future__ import annotations
@@ -22,17 +27,25 @@ from numpy.typing import NDArray
 Floats = NDArray[Any]
 
 CORRECT_DISTANCE = 0.1
-"""Distance, in sizes of the object, within which a point is near its true place."""
-RESIDUAL_OFFSET = 0.02  # what a residual is never better than
+"""Distance, in sizes of the object, below which a lifted point counts as correct."""
+RESIDUAL_OFFSET = 0.02  # added to a residual, so that a residual of 0 has a finite logarithm
 
 
 class Calibration(NamedTuple):
-    """Exponents of the odds, and the logarithms of their factors."""
+    """Coefficients of the log odds.
+
+    Attributes:
+        constant: log odds where all other terms are 0.
+        spread: exponent of the spread.
+        residual: exponent of the residual.
+        visible: exponent of the fraction of visible points.
+        missing: added to the log odds of a missing point.
+    """
 
     constant: float
     spread: float
     residual: float
-    share: float
+    visible: float
     missing: float
 
 
@@ -44,9 +57,12 @@ Source: `python -m benchmarks.robustness.confidence_calibration --data DATA`.
 
 
 def log_odds_terms(visible: NDArray[np.bool_], residual: Floats, spread: Floats) -> Floats:
-    """Return what the log odds of a seen point are a sum of, (n, p, 4), by `Calibration`.
+    """Return the terms (n, p, 4) that the first four coefficients of `Calibration` multiply.
 
-    visible: (n, p). residual: (n,). spread: (n, p).
+    Args:
+        visible: (n, p).
+        residual: (n,) relative reprojection error, typically 0.05 to 0.3.
+        spread: (n, p) standard deviation of the error relative to the RMS radius, typically 0.2.
     """
     n, p = visible.shape
     values = np.ones((n, p, 4), np.float32)
@@ -57,16 +73,20 @@ def log_odds_terms(visible: NDArray[np.bool_], residual: Floats, spread: Floats)
 
 
 def keypoint_confidence(
-    confidence: Floats, residual: Floats, spread: Floats, by: Calibration = CALIBRATED
+    confidence: Floats, residual: Floats, spread: Floats, calibration: Calibration = CALIBRATED
 ) -> NDArray[np.float32]:
-    """Return the chance (n, p) that each point is near its true place.
+    """Return the probability (n, p) in [0, 1] that each lifted point is correct.
 
-    confidence: (n, p) of the detector, 0 = missing. The rest as in `log_odds_terms`.
+    Args:
+        confidence: (n, p) of the detector; 0 where missing, above 1 counts as 1.
+        residual: (n,) as in `log_odds_terms`.
+        spread: (n, p) as in `log_odds_terms`.
+        calibration: coefficients of the log odds.
     """
-    sure = np.minimum(confidence, np.float32(1))
-    seen = np.exp(
-        -(log_odds_terms(confidence > 0, residual, spread) @ np.array(by[:4], np.float32))
-    )
-    chance: NDArray[np.float32] = sure / (1 + seen)
-    chance += (1 - sure) / (1 + seen * np.float32(np.exp(-by.missing)))
-    return chance
+    detected = np.minimum(confidence, np.float32(1))
+    coefficients = np.array(calibration[:4], np.float32)
+    inverse_odds = np.exp(-(log_odds_terms(confidence > 0, residual, spread) @ coefficients))
+    missing_factor = np.float32(np.exp(-calibration.missing))
+    probability: NDArray[np.float32] = detected / (1 + inverse_odds)
+    probability += (1 - detected) / (1 + inverse_odds * missing_factor)
+    return probability

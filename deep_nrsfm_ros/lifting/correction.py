@@ -1,24 +1,31 @@
-"""What the reprojection error tells about the shape, depth included.
+"""Correct lifted shapes, depth included, by what the network leaves unexplained of the keypoints.
 
-The errors E = S* - S of a network hang together: where a hand comes out too low, so does the
-wrist, and both are off in depth as well. Their second moment Sigma needs no 3D label: shapes of
-the training frames, seen by random cameras, are known when they are lifted again. Given what is
-left over of the keypoints, r = W - S M = E M + noise, the mean of a Gaussian E is
+The errors E = S* - S of a network's points are correlated: where a hand is lifted too low, the
+wrist is too, and both have an error of depth. Their second moment Sigma is estimated without 3D
+labels: shapes lifted from the training frames are projected by random cameras and lifted again.
+Given the residual of the keypoints, r = W - S M = E M + noise, the mean of a Gaussian E is
 
     Sigma H^T (H Sigma H^T + noise^2 I)^-1 r,    H E = E M.
 
-For Sigma = I and no noise this is back-projection, S + (W - S M) M^T. Ours, not in the paper.
+With Sigma = I and no noise this is back-projection, S + (W - S M) M^T.
 
-Lengths of bones are further observations, once the keypoints have moved the shape; see `bones`.
+The lengths of bones are further measurements. They are linearised about the shape that the
+keypoints have corrected; see `nrsfm.bones`.
 
-A perspective camera sees each point along its own ray (u, v, 1): with the depth d of the centre,
-x + t_x = u (z + d) says that the point's own M = R^T [e_x - u e_z, e_y - v e_z] takes it to
-W = d (u, v), up to the translation, and all of the above holds.
+A perspective camera sees each point along its own ray (u, v, 1). With the depth d of the centre,
+x + t_x = u (z + d): the point's own M = R^T [e_x - u e_z, e_y - v e_z] projects it to W = d (u, v)
+up to the translation, and the equations above hold.
+
+Symbols: S (n, p, 3) shapes, M (n, 3, 2) or (n, p, 3, 2) cameras, W (n, p, 2) keypoints, E errors,
+H (n, k, 3p) measurement matrix, R (n, k, k) covariance of the measurements, r (n, k) residuals.
+
+Source: ours, not in the paper.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +34,31 @@ from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.nrsfm.bones import Bones, shares
 from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, random_cameras, rotation_from_camera
 
+Lift: TypeAlias = Callable[[Floats], tuple[Floats, Floats, Floats]]
+"""Returns S (n, p, 3), M (n, 3, 2) and the centred keypoints (n, p, 2), in units of S, of
+keypoints (n, p, 2)."""
+
 _ROUNDS = 2
-_FLOOR = 1e-4  # variance of every direction, relative to the mean: any keypoints can be met
-_BLOCK = 64  # frames at a time: more do not fit the cache, and take five times as long
-_LEAST_SHARE = 0.3  # of the deviation of a length, that is the object's own in any case
-_LEAST_SPREAD = 0.01  # of a length: no bone is known better
-_SHORTEST = 1e-6  # share of all lengths, where two keypoints are one
-UNKNOWN_VARIANCE = 1e4  # variance of what is not known at all, relative to that of the errors
+_MIN_VARIANCE = 1e-4  # of every direction, relative to the mean: any keypoints can be met
+_BLOCK = 64  # frames at a time: more exceed the cache and take five times as long
+_MIN_OWN_DEVIATION = 0.3  # share of a length's deviation that is always ascribed to the object
+_MIN_LENGTH_DEVIATION = 0.01  # of a length: no bone is known more precisely
+_MIN_LENGTH = 1e-6  # share of all lengths, for two keypoints at the same place
+UNKNOWN_VARIANCE = (
+    1e4  # of a missing keypoint and of the translation, relative to the mean of Sigma
+)
+
+
+class ErrorModel(NamedTuple):
+    """Prior of the errors of a network.
+
+    Attributes:
+        covariance: (3p, 3p) second moment Sigma in the axes of S, in squared units of S.
+        bones: lengths that the shape should have; None: lengths are not used.
+    """
+
+    covariance: Floats
+    bones: Bones | None = None
 
 
 def correct(
@@ -41,101 +66,111 @@ def correct(
     M: Floats,
     W: Floats,
     visible: NDArray[np.bool_],
-    covariance: Floats,
+    errors: ErrorModel,
     noise: Floats | float = 0.0,
-    bones: Bones | None = None,
 ) -> Floats:
-    """Return S (n, p, 3) moved towards the visible of the keypoints W (n, p, 2).
+    """Return the shapes (n, p, 3) moved towards their visible keypoints.
 
-    M: (n, 3, 2) cameras, or (n, p, 3, 2), one of each point. covariance: (3p, 3p) of the errors in
-    the axes of S. noise: standard deviation (n,) of the keypoints' coordinates; 0 meets them
-    exactly, but for a translation, which may be any. Missing keypoints follow the others.
-    bones: lengths that the shape should have as well, about where the keypoints move it.
+    Missing keypoints move with the visible ones, by their covariance.
+
+    Args:
+        S: (n, p, 3) shapes.
+        M: (n, 3, 2) cameras, or (n, p, 3, 2), one for each point.
+        W: (n, p, 2) keypoints in units of S; the translation is free.
+        visible: (n, p).
+        errors: prior of the errors of S.
+        noise: standard deviation (n,) of the coordinates of W, in units of S. 0: the shape meets
+            the keypoints exactly.
     """
     n, p, _ = S.shape
     noise = np.broadcast_to(noise, n)
     if n > _BLOCK:
-        parts = [
-            correct(S[b], M[b], W[b], visible[b], covariance, noise[b], bones)
-            for b in slices(n, _BLOCK)
-        ]
+        parts = [correct(S[b], M[b], W[b], visible[b], errors, noise[b]) for b in slices(n, _BLOCK)]
         return np.concatenate(parts)
+    covariance, bones = errors
     M = (M if M.ndim == 4 else M[:, None]).astype(np.float64)
     H: Floats = np.zeros((n, p, 2, p, 3))
     H[:, range(p), :, range(p)] = np.broadcast_to(M, (n, p, 3, 2)).transpose(1, 0, 3, 2)
     H = H.reshape(n, 2 * p, 3 * p)
     unknown = UNKNOWN_VARIANCE * np.trace(covariance) / (3 * p)
-    least = 1e-12 * unknown  # not quite zero: there is an answer even where M is no camera
-    spread = np.where(visible, np.square(noise)[:, None] + least, unknown)  # (n, p)
+    least = 1e-12 * unknown  # above zero, so that the system is regular even where M is no camera
+    variance = np.where(visible, np.square(noise)[:, None] + least, unknown)  # (n, p)
     R: Floats = np.zeros((n, p, 2, p, 2))
     for axis in range(2):
-        R[:, :, axis, :, axis] = unknown  # of the translation, the same for all points
-        R[:, range(p), axis, range(p), axis] += spread
+        R[:, :, axis, :, axis] = unknown  # of the translation, which all points share
+        R[:, range(p), axis, range(p), axis] += variance
     R = R.reshape(n, 2 * p, 2 * p)
     r = ((W - (S[..., None, :] @ M)[..., 0, :]) * visible[..., None]).reshape(n, 2 * p)
-    E = _mean(covariance, H, R, r)
+    E = _posterior_mean(covariance, H, R, r)
     if bones is not None:
-        G, wanted, varies = bones.length_constraint(S + E.reshape(S.shape))
-        b = wanted.shape[1]
+        G, missing_length, length_covariance = bones.length_constraint(S + E.reshape(S.shape))
+        b = missing_length.shape[1]
         R = np.pad(R, ((0, 0), (0, b), (0, b)))
-        R[:, 2 * p :, 2 * p :] = varies + least * np.eye(b)
-        r = np.concatenate((r, wanted + (G @ E[..., None])[..., 0]), 1)
-        E = _mean(covariance, np.concatenate((H, G), 1), R, r)
+        R[:, 2 * p :, 2 * p :] = length_covariance + least * np.eye(b)
+        r = np.concatenate((r, missing_length + (G @ E[..., None])[..., 0]), 1)
+        E = _posterior_mean(covariance, np.concatenate((H, G), 1), R, r)
     corrected: Floats = S + E.reshape(S.shape).astype(S.dtype)
     return corrected
 
 
-def _mean(covariance: Floats, H: Floats, R: Floats, r: Floats) -> Floats:
-    """Return the mean (n, 3p) of errors of which H (n, k, 3p) shows r (n, k), with noise R."""
+def _posterior_mean(covariance: Floats, H: Floats, R: Floats, r: Floats) -> Floats:
+    """Return the mean (n, 3p) of the errors, of which H (n, k, 3p) measures r with covariance R."""
     CH = covariance @ H.swapaxes(1, 2)
     E: Floats = (CH @ np.linalg.solve(H @ CH + R, r[..., None]))[..., 0]
     return E
 
 
-def error_covariance(
-    lift: Callable[[Floats], tuple[Floats, Floats, Floats]],
-    W: Floats,
-    rng: np.random.Generator,
-) -> NDArray[np.float32]:
-    """Return the second moment (3p, 3p) of a network's errors, found without labels.
+def error_covariance(lift: Lift, W: Floats, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return the second moment (3p, 3p) of a network's errors, estimated without 3D labels.
 
-    lift: gives S (n, p, 3), M (n, 3, 2) and the keypoints as the network took them (n, p, 2),
-    centred and in units of S. W: (n, p, 2) complete keypoints.
+    Args:
+        lift: the network with its normalisation.
+        W: (n, p, 2) complete keypoints.
+        rng: draws the random cameras.
     """
     _, p, _ = W.shape
-    everything = np.ones(W.shape[:2], bool)
+    all_visible = np.ones(W.shape[:2], bool)
     covariance = np.eye(3 * p)
     for _ in range(_ROUNDS):
-        T = centre(correct(*lift(W), everything, covariance))
+        T = centre(correct(*lift(W), all_visible, ErrorModel(covariance)))
         Q = random_cameras(len(T), rng)
-        S, M, seen = lift(T @ Q)
-        unit = np.linalg.norm(seen, axis=(1, 2)) / np.linalg.norm(T @ Q, axis=(1, 2))
-        # The same shape where M, in place of Q, sees it alike.
+        S, M, keypoints = lift(T @ Q)
+        unit = np.linalg.norm(keypoints, axis=(1, 2)) / np.linalg.norm(T @ Q, axis=(1, 2))
+        # Rotate the known shape into the object's axes that the lifted camera M implies.
         T = unit[:, None, None] * T @ rotation_from_camera(Q).swapaxes(1, 2)
         E = (T @ rotation_from_camera(M) - S).reshape(len(T), 3 * p).astype(np.float64)
         covariance = E.T @ E / len(E)
-        covariance += _FLOOR * np.trace(covariance) / (3 * p) * np.eye(3 * p)
+        covariance += _MIN_VARIANCE * np.trace(covariance) / (3 * p) * np.eye(3 * p)
     return covariance.astype(np.float32)
 
 
 def bone_lengths(
-    lift: Callable[[Floats], tuple[Floats, Floats, Floats]],
+    lift: Lift,
     W: Floats,
     pairs: Sequence[tuple[int, int]],
     covariance: Floats,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """Return the lengths and spread (b, 2) of bones, as those of `Bones`, found without labels.
+    """Return the length and its standard deviation (b, 2) of each bone, without 3D labels.
 
-    lift, W: as in `error_covariance`, which gives the covariance. pairs: of keypoints.
+    Both are shares of the sum of all lengths, as in `Bones`. The variance of lifted lengths exceeds
+    that of the object by the error of lifting, which is measured by lifting known shapes again.
+
+    Args:
+        lift: the network with its normalisation.
+        W: (n, p, 2) complete keypoints.
+        pairs: b pairs of keypoints.
+        covariance: (3p, 3p) as `error_covariance` returns it.
+        rng: draws the random cameras.
     """
     if not pairs:
         return np.zeros((0, 2), np.float32)
-    everything = np.ones(W.shape[:2], bool)
-    T = centre(correct(*lift(W), everything, covariance))
-    again = correct(*lift(T @ random_cameras(len(T), rng)), everything, covariance)
-    found, found_again = shares(T, pairs), shares(again, pairs)
-    lengths, variance = np.maximum(found.mean(0), _SHORTEST), found.var(0)
-    error = ((found_again - found) ** 2).mean(0)
-    least = np.maximum(_LEAST_SHARE**2 * variance, (_LEAST_SPREAD * lengths) ** 2)
+    all_visible = np.ones(W.shape[:2], bool)
+    errors = ErrorModel(covariance)
+    T = centre(correct(*lift(W), all_visible, errors))
+    T_again = correct(*lift(T @ random_cameras(len(T), rng)), all_visible, errors)
+    first, second = shares(T, pairs), shares(T_again, pairs)
+    lengths, variance = np.maximum(first.mean(0), _MIN_LENGTH), first.var(0)
+    error = ((second - first) ** 2).mean(0)
+    least = np.maximum(_MIN_OWN_DEVIATION**2 * variance, (_MIN_LENGTH_DEVIATION * lengths) ** 2)
     return np.stack((lengths, np.sqrt(np.maximum(variance - error, least))), 1).astype(np.float32)

@@ -1,6 +1,9 @@
-"""Fitting the network's shapes to keypoints, in NumPy: what `lifting` does with each object.
+"""The lifter's computation in NumPy: the readable form, used where the kernel does not run.
 
-`kernel/` does the same, compiled.
+`compiled_backend` computes the same in C; one test compares the two.
+
+Symbols: n objects, p keypoints, k test-time rotations, S (n, p, 3) shapes, M (n, 3, 2) cameras,
+R (n, 3, 3) rotations from object to camera axes, W (n, p, 2) normalised keypoints.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.lifting.confidence import keypoint_confidence
-from deep_nrsfm_ros.lifting.correction import correct
+from deep_nrsfm_ros.lifting.correction import ErrorModel, correct
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.geometry import (
     centre,
@@ -27,146 +30,175 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 
 Float32 = NDArray[np.float32]
 
-# The mirror image of an object, whose y axis points to its left, and of an image.
-_ACROSS = np.array([1, -1, 1], np.float32)
-MIN_RELATIVE_DEPTH = np.float32(
-    0.1
-)  # depth of a point, relative to its object's, that is not undercut
-RESIDUAL_SCALE = 0.02  # squared residual by which a turn loses all but 1/e of its weight
+# Signs of the mirror image: the y axis of an object points to its left, the x axis of an image
+# lies across.
+_MIRROR = np.array([1, -1, 1], np.float32)
+MIN_RELATIVE_DEPTH = np.float32(0.1)
+"""Least depth of a point, as a fraction of its object's, in a perspective projection."""
+RESIDUAL_SCALE = 0.02
+"""Difference of squared residuals that lowers the weight of a test-time rotation to 1/e."""
 
 
 class LifterConstants(NamedTuple):
-    """What a lifter knows before it sees any keypoints."""
+    """Model and options of a lifter, in the form that a backend computes with.
+
+    Attributes:
+        network: weights of the network.
+        normaliser: how keypoints are centred and scaled.
+        object_frame: (3, 3) rotation from the network's axes to the object's.
+        test_time_rotations: (k, 2, 2) rotations of the input within the image plane.
+        partners: index of each keypoint's left-right partner; None: no mirror images.
+        covariance: (3p, 3p) of the errors in object axes, for the correction; None: no correction.
+        bones: lengths for the correction; None: lengths are not used.
+        error_std: (p,) standard deviation of the error of each point, in units of the network.
+        noise: standard deviation of the keypoints, relative to the size of the object.
+        refill: rounds of filling missing keypoints with those of the lifted shape.
+        reference_length: length of the reference pair in the output.
+        reference: indices of the reference pair; None: the RMS radius is the reference.
+        min_visible: objects with fewer visible keypoints are not lifted.
+    """
 
     network: Network
     normaliser: Normaliser
-    frame: Float32  # (3, 3) the network's axes to the object's
-    test_time_rotations: Float32  # (k, 2, 2) of the input within the image plane
-    partners: Sequence[int] | None  # of each keypoint in the mirror image; None: no mirror images
-    covariance: NDArray[np.float64] | None  # (3p, 3p) by which to correct; None: not at all
-    bones: Bones | None  # by which to correct as well
-    spread: Float32  # (p,) standard deviation of the errors of each point
-    noise: float  # of the keypoints, relative to the size of the object
-    refill: int  # rounds
-    length: float  # of the reference in the output
-    reference: tuple[int, int] | None  # two keypoints; None: the RMS radius
+    object_frame: Float32
+    test_time_rotations: Float32
+    partners: Sequence[int] | None
+    covariance: NDArray[np.float64] | None
+    bones: Bones | None
+    error_std: Float32
+    noise: float
+    refill: int
+    reference_length: float
+    reference: tuple[int, int] | None
     min_visible: int
 
 
 class NumpyBackend:
-    """Lifts by what it knows."""
+    """Lifts keypoints with NumPy.
 
-    def __init__(self, known: LifterConstants) -> None:
-        """Take the constants."""
-        self.known = known
-        self._partners = None if known.partners is None else np.array(known.partners)
+    Attributes:
+        constants: model and options.
+    """
+
+    def __init__(self, constants: LifterConstants) -> None:
+        """Take model and options."""
+        self.constants = constants
+        self._partners = None if constants.partners is None else np.array(constants.partners)
 
     def __call__(
         self, points: Float32, confidence: Float32, perspective: bool
     ) -> tuple[tuple[Float32, ...], NDArray[np.bool_]]:
-        """Return the fields of `lifting.Lifted`, and (n,) where there is nothing to lift.
+        """Return the fields of `Lifted`, and which of the n objects cannot be lifted.
 
-        Arguments as those of `Lifter.__call__`, their shapes checked.
+        Args:
+            points: (n, p, 2) as in `Lifter.__call__`; the shape is not checked again.
+            confidence: (n, p) in [0, 1], 0 = missing.
+            perspective: as in `Lifter.__call__`.
         """
         visible = confidence > 0
         mask = visible[..., None].astype(np.float32)
-        whole = np.ones_like(mask)
-        fitted = self._fit(points, mask, visible, perspective)
+        complete = np.ones_like(mask)
+        solution = self._solve(points, mask, visible, perspective)
         if not visible.all():
-            for _ in range(self.known.refill):
-                S, _, _, unit, origin = fitted
-                seen = unit * S[..., :2] + origin
+            for _ in range(self.constants.refill):
+                S, _, _, unit, origin = solution
+                reprojected = unit * S[..., :2] + origin
                 if perspective:
-                    seen /= np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
-                filled = np.where(visible[..., None], points, seen)
-                fitted = self._fit(filled, whole, visible, perspective)
-        S, R, residual, _, _ = fitted
+                    reprojected /= np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
+                filled = np.where(visible[..., None], points, reprojected)
+                solution = self._solve(filled, complete, visible, perspective)
+        S, R, residual, _, _ = solution
         S = centre(S)
-        sure = self.keypoint_confidence(confidence, residual, S)
-        S *= self.known.length / self._reference_size(S)
+        probability = self.keypoint_confidence(confidence, residual, S)
+        S *= self.constants.reference_length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
-        lost = on_one_line(points, visible)
-        lost |= visible.sum(1) < self.known.min_visible
-        return (S, R, scale, translation, residual, sure), lost
+        not_lifted = on_one_line(points, visible)
+        not_lifted |= visible.sum(1) < self.constants.min_visible
+        return (S, R, scale, translation, residual, probability), not_lifted
 
     def keypoint_confidence(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
-        """Return the confidence (n, p) of shapes S (n, p, 3) in the network's unit, centred."""
-        return keypoint_confidence(confidence, residual, self.spread(S))
+        """Return the probability (n, p) that each lifted point is correct.
 
-    def spread(self, S: Float32) -> Float32:
-        """Return the standard deviation (n, p) of the model's errors, relative to the RMS radius.
+        Args:
+            confidence: (n, p) of the detector.
+            residual: (n,) relative reprojection error.
+            S: (n, p, 3) centred shapes in units of the network.
+        """
+        return keypoint_confidence(confidence, residual, self.relative_error_std(S))
 
-        S: as in `sure`.
+    def relative_error_std(self, S: Float32) -> Float32:
+        """Return the standard deviation (n, p) of the errors, relative to the RMS radius.
+
+        Args:
+            S: (n, p, 3) centred shapes in units of the network.
         """
         radius = np.sqrt((S * S).sum(2).mean(1))
-        spread: Float32 = self.known.spread / np.maximum(radius, 1e-9)[:, None]
-        return spread
+        relative: Float32 = self.constants.error_std / np.maximum(radius, 1e-9)[:, None]
+        return relative
 
-    def _fit(
+    def _solve(
         self, points: Float32, mask: Float32, visible: NDArray[np.bool_], perspective: bool
     ) -> tuple[Float32, Float32, Float32, Float32, Float32]:
-        """Return S in camera axes, R, residual (n,), and what leads to the image: unit, origin.
+        """Return S in camera axes, R, residual (n,), and unit and origin of S in the image.
 
-        The network sees the points (n, p, 2) of mask (n, p, 1); the correction the visible alone.
+        The network reads all points of mask (n, p, 1); the correction only the visible ones.
         """
-        known = self.known
-        W, gain, unit, origin = normalise(known.network, known.normaliser, points, mask)
+        constants = self.constants
+        W, gain, unit, origin = normalise(constants.network, constants.normaliser, points, mask)
         S, M, residual = self._average(gain * W, W, visible, unit if perspective else None)
         R = rotation_from_camera(M)
-        if known.covariance is not None:
-            seen = visible[..., None]
-            size = np.sqrt((W * W * seen).sum((1, 2)) / np.maximum(2 * seen.sum((1, 2)), 1))
-            noise = known.noise * size
+        if constants.covariance is not None:
+            shown = visible[..., None]
+            size = np.sqrt((W * W * shown).sum((1, 2)) / np.maximum(2 * shown.sum((1, 2)), 1))
+            errors = ErrorModel(constants.covariance, constants.bones)
             cameras = M[:, None] - R[:, None, 2, :, None] * points[:, :, None] if perspective else M
-            S = correct(S @ R, cameras, W, visible, known.covariance, noise, known.bones)
+            S = correct(S @ R, cameras, W, visible, errors, constants.noise * size)
             S = S @ R.swapaxes(1, 2)
         return S, R, residual, unit, origin
 
     def _average(
         self, x: Float32, W: Float32, visible: NDArray[np.bool_], unit: Float32 | None
     ) -> tuple[Float32, Float32, Float32]:
-        """Return S (n, p, 3) in camera axes, M (n, 3, 2) from the object's, residual (n,).
+        """Return S (n, p, 3) in camera axes, M (n, 3, 2) from object axes, residual (n,).
 
-        Means over the turns of the network's input x within the image plane, and over their
-        mirror images, each by the residual that it leaves of W.
+        Test-time augmentation: means over rotations of the network's input x within the image
+        plane, and over their mirror images, weighted by the residual of W that each leaves.
         """
-        turns, partners = self.known.test_time_rotations, self._partners
+        rotations, partners = self.constants.test_time_rotations, self._partners
         n, p, _ = W.shape
-        turned = x @ turns.swapaxes(1, 2)[:, None]  # (k, n, p, 2)
+        inputs = x @ rotations.swapaxes(1, 2)[:, None]  # (k, n, p, 2)
         if partners is not None:
-            turned = np.concatenate((turned, (turned * _ACROSS[1:])[:, :, partners]))
-            turns = np.concatenate((turns, turns))
-        k = len(turns)
-        S, M = reconstruct(self.known.network, turned.reshape(k * n, p, 2))
-        A = self.known.frame
+            inputs = np.concatenate((inputs, (inputs * _MIRROR[1:])[:, :, partners]))
+            rotations = np.concatenate((rotations, rotations))
+        k = len(rotations)
+        S, M = reconstruct(self.constants.network, inputs.reshape(k * n, p, 2))
+        A = self.constants.object_frame
         S, M = (S @ A).reshape(k, n, p, 3), (A.T @ M).reshape(k, n, 3, 2)
         if partners is not None:
             half = k // 2
-            S[half:] = S[half:, :, partners] * _ACROSS
-            M[half:] *= _ACROSS[:, None] * _ACROSS[1:]
-        M = M @ turns[:, None]
+            S[half:] = S[half:, :, partners] * _MIRROR
+            M[half:] *= _MIRROR[:, None] * _MIRROR[1:]
+        M = M @ rotations[:, None]
         S = S @ rotation_from_camera(M).swapaxes(-1, -2)
-        P = (
-            S[..., :2]
-            if unit is None
-            else S[..., :2] / np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
-        )
+        P = S[..., :2]
+        if unit is not None:
+            P = P / np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
         residual = reprojection_error(W, P, visible)
-        trust = np.exp((residual.min(0) ** 2 - residual**2) / RESIDUAL_SCALE)
-        trust /= trust.sum(0)
-        M = (trust[..., None, None] * M).sum(0)
+        weight = np.exp((residual.min(0) ** 2 - residual**2) / RESIDUAL_SCALE)
+        weight /= weight.sum(0)
+        M = (weight[..., None, None] * M).sum(0)
         return (
-            (trust[..., None, None] * S).sum(0),
+            (weight[..., None, None] * S).sum(0),
             polar(M.swapaxes(1, 2)).swapaxes(1, 2),
-            (trust * residual).sum(0),
+            (weight * residual).sum(0),
         )
 
     def _reference_size(self, S: Float32) -> Float32:
-        """Return the size (n, 1, 1) of each shape that the reference length stands for."""
-        if self.known.reference is None:
+        """Return the length (n, 1, 1) of the reference in each shape, above 0."""
+        if self.constants.reference is None:
             size = np.sqrt((S * S).sum(2).mean(1))
         else:
-            a, b = self.known.reference
+            a, b = self.constants.reference
             size = np.linalg.norm(S[:, a] - S[:, b], axis=1)
-        held: Float32 = np.maximum(size, np.float32(1e-9))
-        return held[:, None, None]
+        positive: Float32 = np.maximum(size, np.float32(1e-9))
+        return positive[:, None, None]

@@ -1,4 +1,4 @@
-"""What a detector saw at one time, whichever way it was told."""
+"""What one message of a detector shows: keypoints, their confidence, and identities."""
 
 from __future__ import annotations
 
@@ -7,25 +7,31 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# No image is this large, and sums of squares stay far below the largest float32.
 MAX_COORDINATE = 1e9
-_CERTAIN, _MISSING = np.float32(1), np.float32(0)
+"""Pixels; a keypoint with a larger coordinate is missing.
+
+No image is this large, and sums of squares of such numbers stay far below the largest float32.
+"""
 MIN_POSITIVE = np.nextafter(np.float32(0), np.float32(1))
+"""The smallest positive float32: a keypoint of confidence 0 is missing at any threshold."""
+_CERTAIN, _MISSING = np.float32(1), np.float32(0)
 
 Identities = tuple[str | None, ...]
+"""Identity of each object; None for an object without one, () if no object has one."""
 
 
 class MessageError(ValueError):
-    """A message that cannot be read: says what was expected and what came."""
+    """A message that cannot be used; the text says what was expected and what was received."""
 
 
 class Observation(NamedTuple):
-    """What one message shows: n objects of q keypoints each, in the detector's order.
+    """The n objects of one message, each with q keypoints in the detector's order.
 
-    points: (n, q, 2) float32, x right and y down; (0, 0) where missing.
-    confidence: (n, q) float32, above 0 and at most 1; 0 where missing.
-    identities: n, as the detector gives them; None for an object to which it gives none; () where
-        it gives none at all.
+    Attributes:
+        points: (n, q, 2) float32, x right and y down, in pixels; (0, 0) where missing.
+        confidence: (n, q) float32 in (0, 1]; 0 where missing.
+        identities: n, as the detector gives them; None for an object without one, () if the
+            detector gives none at all.
     """
 
     points: NDArray[np.float32]
@@ -36,31 +42,44 @@ class Observation(NamedTuple):
 def to_observation(
     values: NDArray[np.floating], min_confidence: float = 0.0, identities: Identities = ()
 ) -> Observation:
-    """Return values (n, q, 2: x, y or 3: x, y, confidence) with missing keypoints marked.
+    """Return an observation in which unusable keypoints are marked as missing.
 
-    Values without a confidence are certain; a confidence above 1 counts as 1.
+    A keypoint is missing if it is at (0, 0), if its confidence is 0 or below `min_confidence`, if
+    a coordinate exceeds `MAX_COORDINATE`, or if one of its numbers is NaN or infinite.
+
+    Args:
+        values: (n, q, 3) x and y in pixels and confidence, or (n, q, 2) x and y, of confidence 1.
+            A confidence above 1 counts as 1.
+        min_confidence: in [0, 1], typically 0.1.
+        identities: of the n objects, or ().
     """
     if values.dtype != np.float32:
         with np.errstate(over="ignore", invalid="ignore"):
             values = values.astype(np.float32)
     planes = values.transpose(2, 0, 1)
-    # NaN compares false, so the first test drops it together with infinity.
-    seen = np.logical_and.reduce(np.abs(planes) < MAX_COORDINATE)
-    seen &= np.logical_or(planes[0], planes[1])
+    # NaN compares false, so this test rejects NaN as well as infinity.
+    visible = np.logical_and.reduce(np.abs(planes) < MAX_COORDINATE)
+    visible &= np.logical_or(planes[0], planes[1])
     if len(planes) == 3:
-        seen &= planes[2] >= max(np.float32(min_confidence), MIN_POSITIVE)
-        confidence = np.where(seen, np.minimum(planes[2], _CERTAIN), _MISSING)
+        visible &= planes[2] >= max(np.float32(min_confidence), MIN_POSITIVE)
+        confidence = np.where(visible, np.minimum(planes[2], _CERTAIN), _MISSING)
     else:
-        confidence = np.where(seen, _CERTAIN, _MISSING)
-    points = np.zeros((*seen.shape, 2), np.float32)
-    np.copyto(points, values[..., :2], where=seen[..., None])
+        confidence = np.where(visible, _CERTAIN, _MISSING)
+    points = np.zeros((*visible.shape, 2), np.float32)
+    np.copyto(points, values[..., :2], where=visible[..., None])
     return Observation(points, confidence, identities)
 
 
-def check_keypoints(count: int, keypoints: int, where: str) -> None:
-    """Raise MessageError naming both numbers when they differ."""
+def check_keypoints(count: int, keypoints: int, field: str) -> None:
+    """Raise MessageError unless a message has as many keypoints as the layout.
+
+    Args:
+        count: keypoints of the message.
+        keypoints: keypoints of the layout.
+        field: the field of the message that holds the count, for the error text.
+    """
     if count != keypoints:
         raise MessageError(
-            f"message has {count} keypoints ({where}); the keypoint layout has {keypoints}: "
+            f"message has {count} keypoints ({field}); the keypoint layout has {keypoints}: "
             "name the layout in which the detector gives them"
         )

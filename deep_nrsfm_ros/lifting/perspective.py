@@ -1,10 +1,13 @@
-"""Objects at their place before a camera whose intrinsics are known.
+"""Lifting before a perspective camera whose intrinsics are known.
 
-A weak-perspective camera sees along the optical axis. An object beside the axis is seen
-along another ray, and would come out turned by the angle between the two. So a virtual camera is
-turned towards each object, what it would see is lifted, and the result is turned back. The place
-follows from the rays: x + t_x = u (z + t_z) and y + t_y = v (z + t_z) are linear in t, which is in
-the unit of the reference length.
+A weak-perspective camera sees along the optical axis. An object beside the axis is seen along
+another ray, and its rotation would come out wrong by the angle between the two. Therefore each
+object gets a virtual camera that is rotated towards it; the view of that camera is lifted, and the
+result is rotated back. The position t of the object follows from the rays (u, v, 1) of its points:
+x + t_x = u (z + t_z) and y + t_y = v (z + t_z) are linear in t. Its unit is that of the reference
+length.
+
+Source: ours, not in the paper.
 """
 
 from __future__ import annotations
@@ -19,69 +22,91 @@ from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, mark_not_lifted
 from deep_nrsfm_ros.lifting.numpy_backend import Float32
 from deep_nrsfm_ros.nrsfm.geometry import Floats, weak_perspective
 
-_NEAREST = 0.1  # cosine of the widest angle between a point and its object's ray
+_MIN_COSINE = 0.1  # of the angle between the rays of a point and of its object
 
 
 class VirtualViews(NamedTuple):
-    """What virtual cameras see that are turned towards one of n objects each."""
+    """Views of n virtual cameras, each rotated towards one object.
 
-    points: Float32  # (n, p, 2) on the plane z = 1 of its camera; 0 where missing
-    confidence: Float32  # (n, p) 0 where missing, as well as where no ray leads to the pixel
-    turns: NDArray[np.float64]  # (n, 3, 3) from the camera to the virtual one: p_v = turn p
+    Attributes:
+        points: (n, p, 2) on the plane z = 1 of the virtual camera; 0 where missing.
+        confidence: (n, p) of the detector; 0 where missing or where no ray reaches the pixel.
+        rotations: (n, 3, 3) from the camera to the virtual camera, p_virtual = R p_camera.
+    """
+
+    points: Float32
+    confidence: Float32
+    rotations: NDArray[np.float64]
 
 
 def virtual_views(intrinsics: Intrinsics, points: Float32, confidence: Float32) -> VirtualViews:
-    """Turn a camera towards the centroid of the visible points of each object.
+    """Return the view of a virtual camera towards the mean ray of each object.
 
-    points: (n, p, 2) pixels. confidence: (n, p), 0 = missing.
+    Args:
+        intrinsics: of the camera.
+        points: (n, p, 2) pixels.
+        confidence: (n, p) in [0, 1], 0 = missing.
     """
     rays = intrinsics.rays(points)
     visible = (confidence > 0) & ~np.isnan(rays[..., 0])
     rays[~visible] = 0
     axis = np.ones((len(rays), 3))
     axis[:, :2] = rays.sum(1) / np.maximum(visible.sum(1), 1)[:, None]
-    turns = _towards(axis / np.linalg.norm(axis, axis=1, keepdims=True))
-    seen = rays @ turns[:, :, :2].swapaxes(1, 2) + turns[:, None, :, 2]
-    depth = seen[..., 2:]
-    visible &= depth[..., 0] > _NEAREST
+    rotations = _rotations_to_z(axis / np.linalg.norm(axis, axis=1, keepdims=True))
+    rotated = rays @ rotations[:, :, :2].swapaxes(1, 2) + rotations[:, None, :, 2]
+    depth = rotated[..., 2:]
+    visible &= depth[..., 0] > _MIN_COSINE
     mask = visible[..., None]
-    views = np.where(mask, seen[..., :2], 0) / np.where(mask, depth, 1)
-    return VirtualViews(
-        views.astype(np.float32), np.where(visible, confidence, np.float32(0)), turns
-    )
+    projected = np.where(mask, rotated[..., :2], 0) / np.where(mask, depth, 1)
+    visible_confidence = np.where(visible, confidence, np.float32(0))
+    return VirtualViews(projected.astype(np.float32), visible_confidence, rotations)
 
 
 def lift_perspective(
     lifter: Lifter, intrinsics: Intrinsics, points: Float32, confidence: Float32
 ) -> Lifted:
-    """Lift keypoints (n, p, 2) in pixels as `Lifter` does, with the shapes at their place.
+    """Lift keypoints to shapes at their positions in the camera's optical frame.
 
-    The optical frame's zero is the camera, not the shape's centre; rotations are to that frame.
-    W = scale S[..., :2] + translation holds as well as weak perspective can. Objects that come
-    out behind the camera are NaN.
+    The origin is the camera, not the shape's centre, and rotations lead to the optical frame.
+    Scale and translation fit W = scale S[..., :2] + translation by least squares. Objects whose
+    position comes out behind the camera are not lifted.
+
+    Args:
+        lifter: a model with its options.
+        intrinsics: of the camera.
+        points: (n, p, 2) pixels in the model's layout.
+        confidence: (n, p) in [0, 1], 0 = missing.
+
+    Raises:
+        ValueError: the shapes do not fit the model.
     """
     views = virtual_views(intrinsics, points, confidence)
     lifted = lifter(views.points, views.confidence, perspective=True)
     visible = views.confidence > 0
-    place = solve_translation(lifted.shapes, views.points, visible)
-    lost = ~(place[:, 2] > 0)
-    back = views.turns.astype(np.float32)
-    S = ((lifted.shapes + place[:, None]) @ back).astype(np.float32)
+    position = solve_translation(lifted.shapes, views.points, visible)
+    not_lifted = ~(position[:, 2] > 0)
+    to_virtual = views.rotations.astype(np.float32)
+    S = ((lifted.shapes + position[:, None]) @ to_virtual).astype(np.float32)
     scale, translation = weak_perspective(points, S[..., :2], visible)
-    placed = lifted._replace(
+    positioned = lifted._replace(
         shapes=S,
-        rotations=back.swapaxes(1, 2) @ lifted.rotations,
+        rotations=to_virtual.swapaxes(1, 2) @ lifted.rotations,
         scale=scale,
         translation=translation,
     )
-    return mark_not_lifted(placed, lost) if lost.any() else placed
+    return mark_not_lifted(positioned, not_lifted) if not_lifted.any() else positioned
 
 
 def solve_translation(S: Floats, rays: Floats, visible: NDArray[np.bool_]) -> Floats:
-    """Return the places t (n, 3) from which S + t is seen along the rays best.
+    """Return the translation t (n, 3) with which S + t projects best onto the rays.
 
-    Least squares, over the visible points, of x + t_x - u (z + t_z) and the same of y. S: (n, p, 3)
-    in camera axes, which look at the object. rays: (n, p, 2), (u, v) on the plane z = 1.
+    Minimises the squares of x + t_x - u (z + t_z) and of y + t_y - v (z + t_z) over the visible
+    points.
+
+    Args:
+        S: (n, p, 3) in the axes of the virtual camera.
+        rays: (n, p, 2) u and v on its plane z = 1.
+        visible: (n, p).
     """
     m = visible.astype(S.dtype)
     n = np.maximum(m.sum(1), 1)
@@ -90,18 +115,18 @@ def solve_translation(S: Floats, rays: Floats, visible: NDArray[np.bool_]) -> Fl
     mean = (r * m[..., None]).sum(1) / n[:, None]
     U, V = (rays - u[:, None]) * m[..., None], (r - mean[:, None]) * m[..., None]
     z = -(U * V).sum((1, 2)) / np.maximum((U * U).sum((1, 2)), 1e-12)
-    place: Floats = np.column_stack((mean + u * z[:, None], z))
-    return place
+    translation: Floats = np.column_stack((mean + u * z[:, None], z))
+    return translation
 
 
-def _towards(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the least rotations (n, 3, 3) that take unit vectors (n, 3), z > 0, to z."""
+def _rotations_to_z(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the smallest rotations (n, 3, 3) that take unit vectors (n, 3), z > 0, to z."""
     x, y, z = axis.T
-    share = 1 / (1 + z)
+    k = 1 / (1 + z)
     rows = (
-        (1 - x * x * share, -x * y * share, -x),
-        (-x * y * share, 1 - y * y * share, -y),
+        (1 - x * x * k, -x * y * k, -x),
+        (-x * y * k, 1 - y * y * k, -y),
         (x, y, z),
     )
-    turns: NDArray[np.float64] = np.moveaxis(np.array(rows), -1, 0)
-    return turns
+    rotations: NDArray[np.float64] = np.moveaxis(np.array(rows), -1, 0)
+    return rotations

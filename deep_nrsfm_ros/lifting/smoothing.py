@@ -1,9 +1,11 @@
-"""Smoother: objects that tremble less from one time to the next, and stay through short gaps.
+"""Smoothing over time: less jitter of shapes and rotations, and short gaps filled.
 
-The One-Euro filter (Casiez, Roussel and Vogel, CHI 2012): a first-order low-pass whose cutoff rises
-with the speed of what it follows, so that it holds still what rests and lags little behind what
-moves. Shapes are filtered in the axes of the object, and rotations by their steps on SO(3), so that
-the two still belong together; in the camera's axes the points alone would come out as steady.
+The One-Euro filter is a first-order low-pass whose cutoff frequency rises with the speed of its
+input: an object at rest is held still, a moving one is followed with little lag. Shapes are
+filtered in object axes and rotations by their steps on SO(3), so that both still agree. Filtering
+the points in camera axes would smooth them as much, but not the rotation.
+
+Source: Casiez, Roussel and Vogel, "1 Euro Filter", CHI 2012.
 """
 
 from __future__ import annotations
@@ -21,97 +23,108 @@ from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector, rotation_vector
 Floats = NDArray[Any]
 
 MAX_AGE = 1.0
-"""Seconds after which an object that was not lifted begins anew, if `max_gap` is not longer."""
-_SPEED_CUTOFF = 1.0  # Hz, of the speed; the paper's
+"""Seconds after which an object that was not lifted is filtered from its next frame on."""
+_SPEED_CUTOFF = 1.0  # Hz, of the low-pass of the speed, as in the paper
 
 
 @dataclass(frozen=True)
 class SmoothingOptions:
-    """Smoother."""
+    """Smoothing over time."""
 
     enabled: bool = option(
         False,
-        "filter shape and rotation over time, each object by its identity and the stamps of its "
-        "messages; lags by some 40 ms at walking speed",
+        "whether shapes and rotations are filtered over time (One-Euro filter), each object by its "
+        "identity and the stamps of its messages; the lag is about 40 ms at walking speed",
     )
     min_cutoff: float = option(
         0.2,
-        "cutoff in Hz for what rests: less trembles less and lags more",
+        "cutoff frequency in Hz for an object at rest; lower: less jitter and more lag; 0.2 "
+        "typical, 1 weak",
         low=0.001,
         high=1000.0,
     )
     beta: float = option(
         4.0,
-        "Hz by which the cutoff rises with the speed, in RMS radii of the object, or in radians, "
-        "a second: more lags less and trembles more",
+        "Hz by which the cutoff frequency rises per unit of speed, in RMS radii of the object or "
+        "radians per second; 0 = constant cutoff; higher: less lag and more jitter; 4 typical",
         low=0.0,
         high=1000.0,
     )
     max_gap: float = option(
         0.3,
-        "seconds for which an object that cannot be lifted, or is not in the message, is answered "
-        "by what it was last, with a confidence that falls to 0",
+        "longest gap in s that is filled: an object that cannot be lifted, or is missing from the "
+        "message, keeps its last shape and rotation while its confidence falls to 0; 0 = off",
         low=0.0,
         high=60.0,
     )
 
 
 class _OneEuro:
-    """One filter: what it follows it knows by differences alone, so rotations can be followed."""
+    """One-Euro filter of vectors or rotations; its input is the step between two values."""
 
     def __init__(self, options: SmoothingOptions, like: Floats) -> None:
-        """Rest."""
+        """Start with speed 0 in the shape of `like` (..., 3)."""
         self._options = options
         self._speed = np.zeros_like(like)
 
-    def share(self, step: Floats, seconds: float, size: float = 1.0) -> Floats:
-        """Return how much (..., 1) of the way to the newest value to go.
+    def alpha(self, step: Floats, seconds: float, size: float = 1.0) -> Floats:
+        """Return the smoothing factor alpha (..., 1) in (0, 1].
 
-        step: (..., 3) from the last raw value to the newest, in units of `size`. The paper takes
-        it from the filtered value; from the raw one the lag does not depend on the rate.
+        The paper takes the step from the filtered value; from the raw value, the lag does not
+        depend on the rate.
+
+        Args:
+            step: (..., 3) from the last raw value to the newest one.
+            seconds: time between the two.
+            size: unit of the step.
         """
-        self._speed += _smoothing(_SPEED_CUTOFF, seconds) * (step / seconds - self._speed)
+        self._speed += _alpha(_SPEED_CUTOFF, seconds) * (step / seconds - self._speed)
         speed = np.sqrt((self._speed * self._speed).sum(-1, keepdims=True)) / size
-        share: Floats = _smoothing(self._options.min_cutoff + self._options.beta * speed, seconds)
-        return share
+        alpha: Floats = _alpha(self._options.min_cutoff + self._options.beta * speed, seconds)
+        return alpha
 
 
-def _smoothing(cutoff: Any, seconds: float) -> Any:
-    """Return the share of the newest value in a low-pass of `cutoff` Hz."""
+def _alpha(cutoff: Any, seconds: float) -> Any:
+    """Return the weight of the newest value in a low-pass with `cutoff` in Hz."""
     return 1 - 1 / (1 + 2 * np.pi * cutoff * seconds)
 
 
 class _Track:
-    """One object over time: raw and filtered shape (p, 3) in its axes, centre (3,), rotation."""
+    """Filter state of one object: raw and smoothed shape (p, 3) in object axes, centre, rotation.
+
+    Attributes:
+        time: of the last frame in which the object was lifted, seconds.
+        lifted: the object (n = 1) as smoothed in that frame.
+    """
 
     def __init__(self, options: SmoothingOptions, lifted: Lifted, time: float) -> None:
-        """Begin with an object (n = 1) as it was lifted."""
+        """Start with a lifted object (n = 1)."""
         self.time = time
         self.lifted = lifted
-        self._raw = self._smooth = _parts(lifted)
+        self._raw = self._smoothed = _decompose(lifted)
         self._filters = [_OneEuro(options, part) for part in (*self._raw[:2], self._raw[1])]
 
-    def follow(self, lifted: Lifted, time: float) -> None:
-        """Take an object (n = 1) as it was lifted later."""
+    def update(self, lifted: Lifted, time: float) -> None:
+        """Filter the next frame of the object (n = 1)."""
         seconds, self.time = time - self.time, time
-        (S0, c0, R0), (S1, c1, R1) = self._raw, _parts(lifted)
-        S, c, R = self._smooth
+        (S0, c0, R0), (S1, c1, R1) = self._raw, _decompose(lifted)
+        S, c, R = self._smoothed
         size = float(np.sqrt((S1 * S1).sum(1).mean())) or 1.0
         shape, centre, rotation = self._filters
-        S = S + shape.share(S1 - S0, seconds, size) * (S1 - S)
-        c = c + centre.share(c1 - c0, seconds, size) * (c1 - c)
-        part = rotation.share(rotation_vector(R1 @ R0.T), seconds)
-        R = rotation_from_vector(part * rotation_vector(R1 @ R.T)) @ R
-        self._raw, self._smooth = (S1, c1, R1), (S, c, R)
+        S = S + shape.alpha(S1 - S0, seconds, size) * (S1 - S)
+        c = c + centre.alpha(c1 - c0, seconds, size) * (c1 - c)
+        alpha = rotation.alpha(rotation_vector(R1 @ R0.T), seconds)
+        R = rotation_from_vector(alpha * rotation_vector(R1 @ R.T)) @ R
+        self._raw, self._smoothed = (S1, c1, R1), (S, c, R)
         shapes = (S @ R.T + c)[None].astype(np.float32)
         self.lifted = lifted._replace(shapes=shapes, rotations=R[None].astype(np.float32))
 
-    def faded(self, share: float) -> Lifted:
-        """Return the object as it was last, with `share` of its confidence."""
-        return self.lifted._replace(confidence=self.lifted.confidence * np.float32(share))
+    def faded(self, factor: float) -> Lifted:
+        """Return the last smoothed object with its confidence multiplied by `factor`."""
+        return self.lifted._replace(confidence=self.lifted.confidence * np.float32(factor))
 
 
-def _parts(lifted: Lifted) -> tuple[Floats, Floats, Floats]:
+def _decompose(lifted: Lifted) -> tuple[Floats, Floats, Floats]:
     """Return shape (p, 3) in object axes, centre (3,) and rotation (3, 3) of one object."""
     S, R = lifted.shapes[0].astype(np.float64), lifted.rotations[0].astype(np.float64)
     centre = S.mean(0)
@@ -119,27 +132,32 @@ def _parts(lifted: Lifted) -> tuple[Floats, Floats, Floats]:
 
 
 class Smoother:
-    """Filters of all objects that are there, each known by its identity.
+    """Smooths all objects of one topic, each by its identity.
 
-    An object that is lifted again after more than `MAX_AGE` and `max_gap` begins anew. What comes
-    of an object late, or with the stamp of what came before, is answered as it was lifted and
-    changes nothing; a clock that goes back by more than `MAX_AGE` forgets everything.
+    The filter of an object starts anew when the object is lifted again after more than `MAX_AGE`
+    and `max_gap`. A frame of an object with the stamp of its last frame, or an earlier one, is
+    returned as lifted and does not change the filter. A clock that jumps back by more than
+    `MAX_AGE` deletes all filters.
     """
 
     def __init__(self, options: SmoothingOptions) -> None:
-        """Know nobody."""
+        """Start without objects."""
         self._options = options
-        self._memory = max(MAX_AGE, options.max_gap)
+        self._max_age = max(MAX_AGE, options.max_gap)
         self._tracks: dict[str, _Track] = {}
         self._now = -np.inf
 
     def __call__(
         self, lifted: Lifted, identities: tuple[str, ...], time: float
     ) -> tuple[Lifted, tuple[str, ...]]:
-        """Return the objects, steadied, and their identities.
+        """Return the smoothed objects and their identities.
 
-        lifted: n objects, at `time` in seconds of any clock. identities: n. Objects that are
-        bridged and not among them come last.
+        Objects whose gap is filled and that the message does not contain are appended.
+
+        Args:
+            lifted: n objects.
+            identities: n.
+            time: of the message, seconds of any clock.
         """
         if not self._options.enabled:
             return lifted, identities
@@ -147,39 +165,43 @@ class Smoother:
             self._tracks.clear()
             self._now = -np.inf
         self._now = max(time, self._now)
-        oldest = self._now - self._memory
-        self._tracks = {identity: t for identity, t in self._tracks.items() if t.time >= oldest}
+        oldest = self._now - self._max_age
+        self._tracks = {
+            identity: track for identity, track in self._tracks.items() if track.time >= oldest
+        }
         objects = [
-            self._follow(Lifted(*(part[i : i + 1] for part in lifted)), identity, time)
+            self._smooth(Lifted(*(part[i : i + 1] for part in lifted)), identity, time)
             for i, identity in enumerate(identities)
         ]
         absent = [
             identity
             for identity in self._tracks
-            if identity not in identities and self._left(identity, time)
+            if identity not in identities and self._gap_left(identity, time)
         ]
-        objects += [self._tracks[identity].faded(self._left(identity, time)) for identity in absent]
+        objects += [
+            self._tracks[identity].faded(self._gap_left(identity, time)) for identity in absent
+        ]
         if not objects:
             return lifted, identities
         together = Lifted(*(np.concatenate(parts) for parts in zip(*objects, strict=True)))
         return together, (*identities, *absent)
 
-    def _follow(self, lifted: Lifted, identity: str, time: float) -> Lifted:
-        """Return one object (n = 1), steadied or bridged."""
+    def _smooth(self, lifted: Lifted, identity: str, time: float) -> Lifted:
+        """Return one object (n = 1), smoothed, or its last state if it could not be lifted."""
         track = self._tracks.get(identity)
         if np.isnan(lifted.residual[0]):
-            left = self._left(identity, time)
+            left = self._gap_left(identity, time)
             return track.faded(left) if track and left else lifted
         if track is None:
             self._tracks[identity] = _Track(self._options, lifted, time)
             return lifted
         if time <= track.time:
             return lifted
-        track.follow(lifted, time)
+        track.update(lifted, time)
         return track.lifted
 
-    def _left(self, identity: str, time: float) -> float:
-        """Return the share of `max_gap` that is left of an object, 0 of one that is not known."""
+    def _gap_left(self, identity: str, time: float) -> float:
+        """Return the fraction of `max_gap` that remains for an object, 0 if it has no track."""
         track, max_gap = self._tracks.get(identity), self._options.max_gap
         if track is None or not max_gap or time < track.time:
             return 0.0

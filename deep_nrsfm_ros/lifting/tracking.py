@@ -1,4 +1,4 @@
-"""Who is who from one message to the next, where the detector does not say."""
+"""Identities of objects from one message to the next, where the detector gives none."""
 
 from __future__ import annotations
 
@@ -10,118 +10,127 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.lifting.observation import Observation
 
 MAX_AGE = 1.0
-"""Seconds after which an object that is not seen is forgotten."""
+"""Seconds after which a track without a detection is deleted."""
 
-_FARTHEST = 1.5  # moves from one message to the next, in sizes of the object
-_NAME = "object"
+_MAX_MOTION = 1.5  # from one detection to the next, in sizes of the object
+_PREFIX = "object"  # of the identities that the tracker gives: object1, object2, ...
 
 
 class _Tracks(NamedTuple):
-    """m objects as they were seen the last time, in arrays, so that all are compared at once."""
+    """The last detections of m objects, in arrays, so that all are compared at once."""
 
     identities: list[str]
-    points: NDArray[np.float32]  # (m, q, 2)
+    points: NDArray[np.float32]  # (m, q, 2) pixels
     visible: NDArray[np.float32]  # (m, q) 1 or 0
-    size: NDArray[np.float32]  # (m,) distance of the keypoints from their centre, RMS
+    size: NDArray[np.float32]  # (m,) RMS distance of the keypoints from their centre, pixels
     time: NDArray[np.float64]  # (m,) seconds
 
 
 class Tracker:
-    """Identities of the objects of one topic, each kept while the object is seen.
+    """Gives identities to the objects of one topic; an object keeps its identity.
 
-    An identity that the detector gives is kept. Other objects are matched by place, the nearest
-    first: an object is one that was seen within the last second if the keypoints that both
-    show have moved, on average, by less than 1.5 times its size (their distance from their centre,
-    RMS).
+    An identity that the detector gives is kept. Other objects are matched to the tracks, the
+    closest pair first. Two detections match if the keypoints visible in both have moved, on
+    average, by less than 1.5 times the size of the object, and less than `max_age` has passed. The
+    size is the RMS distance of the keypoints from their centre.
     """
 
-    def __init__(self, topic: str = "", memory: float = MAX_AGE) -> None:
-        """Forget objects that were not seen for `memory` seconds.
+    def __init__(self, topic: str = "", max_age: float = MAX_AGE) -> None:
+        """Start without tracks.
 
-        topic: tells this topic from others: the identity of an object that comes alone and without
-        one; that of any other is "topic/identity". "" if there are no others.
+        Args:
+            topic: prefix of the identities, "topic/identity", that separates this topic from
+                others; also the identity of a single object to which the detector gives none. "":
+                no prefix.
+            max_age: seconds after which a track without a detection is deleted.
         """
-        self._topic, self._memory = topic, memory
+        self._topic, self._max_age = topic, max_age
         self._tracks: _Tracks | None = None
         self._count = 0
 
-    def __call__(self, seen: Observation, now: float) -> tuple[str, ...]:
-        """Return the identities of the n objects seen at `now`, in seconds of any clock.
+    def __call__(self, detections: Observation, now: float) -> tuple[str, ...]:
+        """Return the identities of n detected objects; they differ from one another.
 
-        They differ from one another. An object without keypoints, and without an identity of the
-        detector, has none: "".
+        An object without visible keypoints and without an identity of the detector has identity "".
+
+        Args:
+            detections: n objects.
+            now: seconds of any clock.
         """
         if not self._topic:
-            return self._match(seen, now)
-        if len(seen.confidence) == 1 and not any(seen.identities):
+            return self._match(detections, now)
+        if len(detections.confidence) == 1 and not any(detections.identities):
             return (self._topic,)
         return tuple(
-            identity and f"{self._topic}/{identity}" for identity in self._match(seen, now)
+            identity and f"{self._topic}/{identity}" for identity in self._match(detections, now)
         )
 
-    def _match(self, seen: Observation, now: float) -> tuple[str, ...]:
-        """Return the identities, the topic's aside."""
-        identities = self._given(seen)
-        nameless = [
-            i for i, identity in enumerate(identities) if not identity and seen.confidence[i].any()
+    def _match(self, detections: Observation, now: float) -> tuple[str, ...]:
+        """Return the identities without the topic."""
+        identities = _unique(detections)
+        unmatched = [
+            i
+            for i, identity in enumerate(identities)
+            if not identity and detections.confidence[i].any()
         ]
-        if not nameless:
+        if not unmatched:
             return tuple(identities)
-        new = _tracks(seen, nameless, now)
+        new = _new_tracks(detections, unmatched, now)
         old = self._tracks
-        # Another model has other keypoints: there is nothing to compare.
+        # After a change of the model the keypoints are others and cannot be compared.
         if old is not None and old.points.shape[1:] == new.points.shape[1:]:
-            old = _part(old, (now >= old.time) & (now - old.time <= self._memory))
+            old = _select(old, (now >= old.time) & (now - old.time <= self._max_age))
             distance = _distance(new, old)
-            near = np.argwhere(distance < _FARTHEST)
-            taken = np.zeros(len(old.identities), bool)
-            for j, k in near[distance[tuple(near.T)].argsort()].tolist():
-                if not new.identities[j] and not taken[k]:
-                    new.identities[j], taken[k] = old.identities[k], True
-            old = _part(old, ~taken)
+            candidates = np.argwhere(distance < _MAX_MOTION)
+            matched = np.zeros(len(old.identities), bool)
+            for j, k in candidates[distance[tuple(candidates.T)].argsort()].tolist():
+                if not new.identities[j] and not matched[k]:
+                    new.identities[j], matched[k] = old.identities[k], True
+            old = _select(old, ~matched)
         else:
             old = None
-        for j, i in enumerate(nameless):
-            identities[i] = new.identities[j] = new.identities[j] or self._next(identities)
-        self._tracks = _joined(old, new) if old and old.identities else new
+        for j, i in enumerate(unmatched):
+            identities[i] = new.identities[j] = new.identities[j] or self._new_identity(identities)
+        self._tracks = _concatenate(old, new) if old and old.identities else new
         return tuple(identities)
 
-    def _given(self, seen: Observation) -> list[str]:
-        """Return the detector's identities, "" for none and for the second of two equal ones."""
-        identities = [identity or "" for identity in seen.identities] or [""] * len(seen.confidence)
-        return [
-            identity if identity not in identities[:i] else ""
-            for i, identity in enumerate(identities)
-        ]
-
-    def _next(self, used: list[str]) -> str:
+    def _new_identity(self, used: list[str]) -> str:
         """Return an identity that no object has had."""
         self._count += 1
-        identity = f"{_NAME}{self._count}"
-        return self._next(used) if identity in used else identity
+        identity = f"{_PREFIX}{self._count}"
+        return self._new_identity(used) if identity in used else identity
 
 
-def _tracks(seen: Observation, which: list[int], now: float) -> _Tracks:
-    """Return some of the objects, each with a keypoint at least, without identities."""
-    points, visible = seen.points[which], (seen.confidence[which] > 0).astype(np.float32)
+def _unique(detections: Observation) -> list[str]:
+    """Return the detector's identities, "" for none and for the second of two equal ones."""
+    identities = [identity or "" for identity in detections.identities]
+    identities = identities or [""] * len(detections.confidence)
+    return [
+        identity if identity not in identities[:i] else "" for i, identity in enumerate(identities)
+    ]
+
+
+def _new_tracks(detections: Observation, rows: list[int], now: float) -> _Tracks:
+    """Return tracks without identities of some objects, each with a visible keypoint."""
+    points, visible = detections.points[rows], (detections.confidence[rows] > 0).astype(np.float32)
     weight = visible[..., None] / visible.sum(1)[:, None, None]
-    spread = points - (points * weight).sum(1, keepdims=True)
-    size = np.sqrt((spread * spread * weight).sum((1, 2)))
-    return _Tracks([""] * len(which), points, visible, size, np.full(len(which), now))
+    offset = points - (points * weight).sum(1, keepdims=True)
+    size = np.sqrt((offset * offset * weight).sum((1, 2)))
+    return _Tracks([""] * len(rows), points, visible, size, np.full(len(rows), now))
 
 
-def _part(tracks: _Tracks, which: NDArray[np.bool_]) -> _Tracks:
-    """Return some of the tracks."""
+def _select(tracks: _Tracks, mask: NDArray[np.bool_]) -> _Tracks:
+    """Return the tracks where `mask` (m,) is true."""
     identities = [
         identity
-        for identity, chosen in zip(tracks.identities, which.tolist(), strict=True)
+        for identity, chosen in zip(tracks.identities, mask.tolist(), strict=True)
         if chosen
     ]
     _, points, visible, size, time = tracks
-    return _Tracks(identities, points[which], visible[which], size[which], time[which])
+    return _Tracks(identities, points[mask], visible[mask], size[mask], time[mask])
 
 
-def _joined(a: _Tracks, b: _Tracks) -> _Tracks:
+def _concatenate(a: _Tracks, b: _Tracks) -> _Tracks:
     """Return the tracks of both."""
     return _Tracks(
         a.identities + b.identities,
@@ -133,10 +142,10 @@ def _joined(a: _Tracks, b: _Tracks) -> _Tracks:
 
 
 def _distance(a: _Tracks, b: _Tracks) -> NDArray[np.float32]:
-    """Return (m, n) how far apart each two are, in their size; NaN if no keypoint is in both."""
+    """Return the mean motion (m, n) from a to b in object sizes; NaN without a common keypoint."""
     both = a.visible[:, None] * b.visible[None]
-    move = ((a.points[:, None] - b.points[None]) * both[..., None]).sum(2)
+    motion = ((a.points[:, None] - b.points[None]) * both[..., None]).sum(2)
     with np.errstate(invalid="ignore", divide="ignore"):
-        distance: NDArray[np.float32] = np.hypot(move[..., 0], move[..., 1]) / both.sum(2)
+        distance: NDArray[np.float32] = np.hypot(motion[..., 0], motion[..., 1]) / both.sum(2)
         distance /= np.maximum(np.maximum(a.size[:, None], b.size[None]), np.float32(1e-9))
     return distance

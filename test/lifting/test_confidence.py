@@ -12,10 +12,14 @@ EVEN = Calibration(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def chance(
-    seen: int = P, sure: float = 1.0, residual: float = 0.1, spread: float = 0.2, point: int = 0
+    visible: int = P,
+    detected: float = 1.0,
+    residual: float = 0.1,
+    spread: float = 0.2,
+    point: int = 0,
 ) -> float:
-    """Return the confidence of a point of an object of P, of which the first are seen."""
-    confidence = np.where(np.arange(P) < seen, sure, 0).astype(np.float32)[None]
+    """Return the confidence of a point of an object of P, of which the first are visible."""
+    confidence = np.where(np.arange(P) < visible, detected, 0).astype(np.float32)[None]
     spreads = np.full((1, P), spread, np.float32)
     found = keypoint_confidence(confidence, np.array([residual], np.float32), spreads)
     assert found.shape == (1, P) and found.dtype == np.float32
@@ -25,8 +29,8 @@ def chance(
 def test_what_is_worse_known_is_less_likely_near() -> None:
     assert chance(residual=0.0) > chance(residual=0.1) > chance(residual=0.5) > chance(residual=2)
     assert chance(spread=0.05) > chance(spread=0.2) > chance(spread=1) > chance(spread=1e6) >= 0
-    assert chance(seen=10) > chance(seen=7) > chance(seen=4)
-    assert chance(seen=9) > chance(seen=9, point=9)
+    assert chance(visible=10) > chance(visible=7) > chance(visible=4)
+    assert chance(visible=9) > chance(visible=9, point=9)
 
 
 def test_it_is_a_chance_whatever_comes() -> None:
@@ -56,13 +60,13 @@ def test_the_formula() -> None:
 
 
 def test_a_point_the_detector_doubts_is_between_seen_and_missing() -> None:
-    seen, missing = chance(seen=9, point=0), chance(seen=9, point=9)
+    visible, missing = chance(visible=9, point=0), chance(visible=9, point=9)
     by = np.ones((1, P), np.float32)
     by[0, 9], by[0, 0] = 0, 0.25
     found = keypoint_confidence(by, np.array([0.1], np.float32), np.full((1, P), 0.2))
-    assert found[0, 0] == pytest.approx(0.25 * seen + 0.75 * missing)
+    assert found[0, 0] == pytest.approx(0.25 * visible + 0.75 * missing)
 
 
 def test_what_is_shipped_was_fitted() -> None:
     assert CALIBRATED.spread < 0 and CALIBRATED.residual < 0 and CALIBRATED.missing < 0
-    assert CALIBRATED.share > 0
+    assert CALIBRATED.visible > 0

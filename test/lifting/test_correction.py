@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.lifting.correction import correct, error_covariance
+from deep_nrsfm_ros.lifting.correction import ErrorModel, correct, error_covariance
 from deep_nrsfm_ros.nrsfm.geometry import back_project, centre, random_cameras, rotation_from_camera
 
 some = settings(max_examples=25, deadline=None)
@@ -38,7 +38,7 @@ def test_it_is_the_conditional_mean_given_the_visible_points_up_to_a_translation
     r = (W - S @ M)[0, seen].ravel()
     H, r, R = D @ H, D @ r, noise**2 * D @ D.T
     E = covariance @ H.T @ np.linalg.solve(H @ covariance @ H.T + R, r)
-    found = correct(S, M, W, visible[None], covariance, np.array([noise]))
+    found = correct(S, M, W, visible[None], ErrorModel(covariance), np.array([noise]))
     np.testing.assert_allclose(centre(found - S)[0], centre(E.reshape(p, 3)), atol=2e-2)
 
 
@@ -50,7 +50,7 @@ def test_perspective_moves_each_point_onto_its_own_ray(p: int, seed: int) -> Non
     R = rotation_from_camera(M)[0]
     depth, rays = 20.0, rng.uniform(-0.3, 0.3, (p, 2))
     cameras = M[:, None] - R[2][:, None] * rays[None, :, None]
-    found = correct(S, cameras, depth * rays[None], np.ones((1, p), bool), covariance)
+    found = correct(S, cameras, depth * rays[None], np.ones((1, p), bool), ErrorModel(covariance))
     x, y, z = (found[0] @ R.T).T
     off = np.stack((x - rays[:, 0] * (z + depth), y - rays[:, 1] * (z + depth)), 1)
     np.testing.assert_allclose(off - off.mean(0), 0, atol=1e-2)
@@ -59,7 +59,7 @@ def test_perspective_moves_each_point_onto_its_own_ray(p: int, seed: int) -> Non
 def test_equal_errors_everywhere_are_back_projection() -> None:
     S, M, W, _ = problem(7, 0)
     W = centre(W)
-    found = correct(centre(S), M, W, np.ones((1, 7), bool), np.eye(21))
+    found = correct(centre(S), M, W, np.ones((1, 7), bool), ErrorModel(np.eye(21)))
     np.testing.assert_allclose(found, back_project(centre(S), M, W), atol=1e-3)
 
 
@@ -95,5 +95,5 @@ def test_depth_follows_what_is_seen(figure: Any) -> None:
     S = np.random.default_rng(0).standard_normal((1, p, 3))
     M = np.eye(3)[None, :, :2]
     W = (S + 0.3 * E) @ M
-    moved = correct(S, M, W, np.ones((1, p), bool), covariance) - S
+    moved = correct(S, M, W, np.ones((1, p), bool), ErrorModel(covariance)) - S
     np.testing.assert_allclose(moved[0, 0] - moved[0, 1:].mean(0), [0.3, 0, 0.3], atol=0.01)

@@ -1,4 +1,4 @@
-"""Objects come out at their place, turned as the camera sees them, wherever they stand."""
+"""Objects come out at their position, turned as the camera sees them, wherever they stand."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def pixels() -> np.ndarray:
     return np.random.default_rng(0).uniform(100, 500, (3, P, 2)).astype(np.float32)
 
 
-def turn_to(place: np.ndarray) -> np.ndarray:
-    """Return the least rotation (3, 3) that takes the optical axis to the ray through `place`."""
-    ray = place / np.linalg.norm(place)
+def turn_to(position: np.ndarray) -> np.ndarray:
+    """Return the least rotation (3, 3) of the optical axis to the ray through `position`."""
+    ray = position / np.linalg.norm(position)
     across = np.cross([0, 0, 1], ray)
     length = np.linalg.norm(across)
     vector = across * (np.arctan2(length, ray[2]) / length) if length else across
@@ -56,11 +56,11 @@ def test_an_object_comes_out_at_its_place_and_turned_with_its_ray(
     # So far away that perspective is weak, and an object that the lifter lifts to itself.
     flat = np.random.default_rng(1).uniform(-1, 1, (1, P, 2)).astype(np.float32)
     centred = lifter(flat, CERTAIN)
-    place = far * np.array([x, y, 1])
-    Q = turn_to(place)
-    shape = centred.shapes @ Q.T + place
+    position = far * np.array([x, y, 1])
+    Q = turn_to(position)
+    shape = centred.shapes @ Q.T + position
     lifted = lift_perspective(lifter, LENS, seen(shape), CERTAIN)
-    assert np.linalg.norm(lifted.shapes.mean(1) - place) < 0.02 * np.linalg.norm(place)
+    assert np.linalg.norm(lifted.shapes.mean(1) - position) < 0.02 * np.linalg.norm(position)
     size = np.abs(centred.shapes).max()
     form = lifted.shapes - lifted.shapes.mean(1, keepdims=True)
     np.testing.assert_allclose(form, centred.shapes @ Q.T, atol=0.05 * size)
@@ -100,9 +100,9 @@ def test_a_camera_turned_towards_the_object_sees_it_in_the_middle() -> None:
     points, confidence = seen(shape), np.ones((3, 8), np.float32)
     confidence[1, :2] = 0
     views = virtual_views(LENS, points, confidence)
-    orthonormal = views.turns @ views.turns.swapaxes(1, 2)
+    orthonormal = views.rotations @ views.rotations.swapaxes(1, 2)
     np.testing.assert_allclose(orthonormal, np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
-    inside = shape @ views.turns.swapaxes(1, 2)
+    inside = shape @ views.rotations.swapaxes(1, 2)
     flat = inside[..., :2] / inside[..., 2:]
     known = confidence > 0
     np.testing.assert_allclose(views.points[known], flat[known], atol=1e-5)

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.lifting.correction import bone_lengths, correct
+from deep_nrsfm_ros.lifting.correction import ErrorModel, bone_lengths, correct
 from deep_nrsfm_ros.nrsfm.bones import Bones, shares
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 
@@ -61,7 +61,7 @@ def test_the_correction_is_the_mean_given_keypoints_and_lengths(seed: int, noise
     covariance = 0.1 * B @ B.T / P + 0.01 * np.eye(3 * P)
     bones = bones_of(rng.standard_normal((P, 3)))
     all_seen, noises = np.ones((1, P), bool), np.array([noise])
-    by_keypoints = correct(S, M, W, all_seen, covariance, noises)
+    by_keypoints = correct(S, M, W, all_seen, ErrorModel(covariance), noises)
     # Information adds up: of the errors, of the keypoints but for a translation, of the lengths.
     H = np.kron(np.eye(P), M[0].T)
     free = np.eye(2 * P) - np.tile(np.eye(2), (P, P)) / P
@@ -72,7 +72,7 @@ def test_the_correction_is_the_mean_given_keypoints_and_lengths(seed: int, noise
     told = H.T @ free @ r / noise**2
     told += G.T @ np.linalg.solve(varies, wanted + G @ (by_keypoints - S).ravel())
     E = np.linalg.solve(known, told).reshape(P, 3)
-    found = correct(S, M, W, all_seen, covariance, noises, bones) - S
+    found = correct(S, M, W, all_seen, ErrorModel(covariance, bones), noises) - S
     np.testing.assert_allclose(found[0], E, atol=1e-2 * np.abs(E).max())
 
 
@@ -90,7 +90,7 @@ def test_lengths_tell_the_depth_that_the_network_has_flattened() -> None:
         for i in range(n):
             bones = spread and bones_of(truth[i], spread)
             one = (part[i : i + 1] for part in (flat, M, W, seen))
-            found.append(correct(*one, np.eye(3 * P), 0.01, bones or None)[0])
+            found.append(correct(*one, ErrorModel(np.eye(3 * P), bones or None), 0.01)[0])
         return np.abs(lengths(np.array(found)) / lengths(truth) - 1).max(1)
 
     without, rigid = wrong(None), wrong(0.01)
@@ -103,7 +103,7 @@ def test_points_in_one_place_have_no_direction_and_do_no_harm() -> None:
     S, M = np.zeros((1, P, 3)), random_cameras(1, np.random.default_rng(0))
     bones = bones_of(np.random.default_rng(0).standard_normal((P, 3)))
     W = np.zeros((1, P, 2))
-    found = correct(S, M, W, np.ones((1, P), bool), np.eye(3 * P), 0.0, bones)
+    found = correct(S, M, W, np.ones((1, P), bool), ErrorModel(np.eye(3 * P), bones))
     assert np.isfinite(found).all()
 
 
