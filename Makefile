@@ -92,7 +92,7 @@ audit:
 lock:
 	rm -rf build/lock && $(LOCK_PYTHON) -m venv build/lock
 	build/lock/bin/pip install --quiet --dry-run --ignore-installed \
-	    --report build/lock/report.json '.[test,benchmarks]' '$(LOCK_TORCH)'
+	    --report build/lock/report.json '.[train,ros,test,benchmarks]' '$(LOCK_TORCH)'
 	build/lock/bin/python -c 'import json; \
 	    found = [i["metadata"] for i in json.load(open("build/lock/report.json"))["install"]]; \
 	    pins = {m["name"]: m["version"].split("+")[0] for m in found}; \

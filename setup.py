@@ -71,8 +71,8 @@ setup(
             py_limited_api=True,
         )
     ],
-    # data_files, because `pip install` ignores setup.cfg's install_scripts and `ros2 run` needs
-    # the executables in lib/deep_nrsfm_ros.
+    entry_points={"console_scripts": [f"deep-nrsfm={NAME}.commands.cli:main"]},
+    # `ros2 run` looks for executables in lib/deep_nrsfm_ros, where no installer puts scripts.
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),
@@ -85,20 +85,25 @@ setup(
         (f"lib/{NAME}", glob("scripts/*")),
     ],
     zip_safe=False,
+    options={"bdist_wheel": {"py_limited_api": "cp311"}},  # what define_macros promises
     # The one place that declares what is needed; requirements.lock pins it for the Makefile.
     install_requires=[
         "numpy",  # the lifter's arithmetic
         "safetensors",  # model files: weights and metadata, never pickle
-        "torch>=2.2",  # training only; the node lifts without it
         "rosbags",  # reads and writes rosbag2 without a ROS installation
         "pyyaml",  # layout files, parameter files and bag metadata
         "jinja2",  # reports and recordings as pages: templates that escape whatever comes from data
         "tqdm",  # progress of training, evaluation and lifting
-        "ros-jazzy-rclpy",  # the node
-        "ros-jazzy-common-interfaces",  # the messages it hears and speaks
-        "ros-jazzy-rmw-fastrtps-cpp",  # the DDS under it
     ],
     extras_require={
+        "train": [
+            "torch>=2.2",  # training; lifting needs none
+        ],
+        "ros": [
+            "ros-jazzy-rclpy",  # the node, where no ROS installation is sourced
+            "ros-jazzy-common-interfaces",  # the messages it receives and sends
+            "ros-jazzy-rmw-fastrtps-cpp",  # the DDS under it
+        ],
         "test": [
             "pytest",  # runs the tests; colcon test needs its name here to run any
             "pytest-timeout",  # a process that never answers fails its test instead of hanging all

@@ -126,6 +126,16 @@ def test_the_kernel_is_built_for_the_stable_abi(installed_by_pip: Path) -> None:
     assert "Tag: cp311-abi3-" in wheel.read_text()
 
 
+def test_one_command_is_on_the_path(prefix: Path, tmp_path: Path) -> None:
+    here = next(prefix.glob("lib/python*/site-packages"))
+    path = f"{here}{os.pathsep}{sysconfig.get_path('purelib')}"  # the package, and what it needs
+    command = (sys.executable, prefix / "bin" / "deep-nrsfm")
+    shown = run(*command, "models", "--help", cwd=tmp_path, PYTHONPATH=path)
+    assert "usage: deep-nrsfm models" in shown
+    shown = run(*command, "--version", cwd=tmp_path, PYTHONPATH=path)
+    assert shown.split() == ["deep-nrsfm", deep_nrsfm_ros.__version__]
+
+
 def test_ament_index_knows_the_package(prefix: Path) -> None:
     assert (prefix / "share/ament_index/resource_index/packages" / NAME).is_file()
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.metadata
-import importlib.util
 import os
 import shutil
 import sys
@@ -17,11 +16,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from deep_nrsfm_ros.commands.program import program
+from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.extras import how_to_install, is_installed
 from deep_nrsfm_ros.training.limits import Limits
 
-NEEDED = ("numpy", "safetensors", "yaml", "rosbags", "rclpy", "sensor_msgs", "diagnostic_msgs")
-TO_TRAIN = ("torch", "jinja2", "tqdm")
+CORE = ("numpy", "safetensors", "yaml", "rosbags", "jinja2", "tqdm")
+TO_TRAIN = ("torch",)
+FOR_ROS = ("rclpy", "sensor_msgs", "diagnostic_msgs")
 RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 HIGHEST_DOMAIN = 101  # above it, DDS takes ports that Linux gives to others
 LEAST_SHM = 8e6  # bytes: each participant of Fast DDS takes a segment of about half a MB
@@ -41,14 +42,13 @@ class Finding(NamedTuple):
 
 
 def check_imports() -> Finding:
-    """Return the versions of what is needed."""
-    seen = [f"Python {sys.version.split()[0]}"]
+    """Return the versions of the packages that the programs import."""
+    versions = [f"Python {sys.version.split()[0]}"]
     missing: list[str] = []
-    lacking: list[str] = []
     distributions = importlib.metadata.packages_distributions()
-    for name in (*NEEDED, *TO_TRAIN):
-        if importlib.util.find_spec(name) is None:
-            (missing if name in NEEDED else lacking).append(name)
+    for name in (*CORE, *FOR_ROS, *TO_TRAIN):
+        if not is_installed(name):
+            missing.append(name)
             continue
         if name != "torch":  # takes seconds to import
             try:
@@ -56,18 +56,19 @@ def check_imports() -> Finding:
             except Exception as error:  # a library of the wrong kind fails in many ways
                 mend = "install it anew; are two ROS installations mixed?"
                 return Finding(f"{name} does not import: {error}", mend)
-        seen.extend(
+        versions.extend(
             f"{distribution} {importlib.metadata.version(distribution)}"
             for distribution in distributions.get(name, ())[:1]  # none where apt has installed it
         )
-    said = ", ".join(dict.fromkeys(seen))
-    if missing:
-        mend = f"pip install {' '.join(missing)}, or source the setup file of ROS 2"
-        return Finding(f"{', '.join(missing)} not found ({said})", mend)
-    if lacking:
-        mend = f"pip install {' '.join(lacking)}, if you want to train"
-        return Finding(f"{', '.join(lacking)} not found ({said})", mend, fatal=False)
-    return Finding(said)
+    seen = ", ".join(dict.fromkeys(versions))
+    if not missing:
+        return Finding(seen)
+    seen = f"{', '.join(missing)} not found ({seen})"
+    mends = [f"pip install {name}" for name in missing if name in CORE]
+    mends += [how_to_install("ros")] if set(missing) & set(FOR_ROS) else []
+    if not mends:
+        return Finding(seen, f"{how_to_install('train')}, if you want to train", fatal=False)
+    return Finding(seen, "; ".join(mends))
 
 
 def check_environment() -> Finding:
@@ -205,7 +206,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Examine this installation."""
     from deep_nrsfm_ros.model_files.folders import default_models_dir
 
-    parser = argparse.ArgumentParser(prog="doctor", description=__doc__)
+    parser = argparse.ArgumentParser(prog=program_name("doctor"), description=__doc__)
     parser.add_argument("--model", default="human", help="model to lift with (default: human)")
     parser.add_argument("--models-dir", type=Path, default=default_models_dir())
     parser.add_argument("--timeout", type=float, default=30.0, help="seconds for an answer")

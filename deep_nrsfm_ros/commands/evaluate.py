@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.commands.program import program
+from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import HEIGHT_18, protocol_split, read_trials, trials
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -44,7 +44,7 @@ tell, the default, and the default for keypoints without noise."""
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog="evaluate", description=__doc__)
+    parser = argparse.ArgumentParser(prog=program_name("evaluate"), description=__doc__)
     parser.add_argument("models", nargs="+", help="model files, or names of models")
     parser.add_argument(
         "--models-dir", type=Path, default=Path("models"), help="searched before the package's own"

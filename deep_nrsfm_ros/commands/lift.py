@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from deep_nrsfm_ros.commands.program import program
+from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.camera_file import read_camera_file
 from deep_nrsfm_ros.data.detections import Detections
@@ -28,7 +28,7 @@ from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog="lift", description=__doc__)
+    parser = argparse.ArgumentParser(prog=program_name("lift"), description=__doc__)
     parser.add_argument("input", type=Path, help=f"keypoints: {KINDS}")
     parser.add_argument(
         "--output",

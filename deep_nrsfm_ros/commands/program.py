@@ -1,4 +1,4 @@
-"""What all programs have in common."""
+"""What all programs have in common: their end when nobody reads on, and their name in usages."""
 
 from __future__ import annotations
 
@@ -6,24 +6,55 @@ import functools
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 Main = Callable[[Sequence[str] | None], None]
 
+_called_as = ""
+
 
 def program(main: Main) -> Callable[..., None]:
-    """Let a program end silently, as others do, when nobody reads on: `models | head`.
+    """Return the main function of a program, with the end that a shell expects of it.
 
-    Python would ignore SIGPIPE and raise BrokenPipeError wherever something is printed, at its
-    own end too.
+    When nobody reads its output any more (`models | head`), the program ends silently. Python
+    would ignore SIGPIPE and raise BrokenPipeError wherever something is printed, at its own end
+    too.
     """
 
     @functools.wraps(main)
     def run(argv: Sequence[str] | None = None) -> None:
-        before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        handler = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         try:
             main(argv)
         finally:
-            sys.stdout.flush()  # what is left would be flushed when the signal is ignored again
-            signal.signal(signal.SIGPIPE, before)
+            sys.stdout.flush()  # output in the buffer is written while SIGPIPE still ends us
+            signal.signal(signal.SIGPIPE, handler)
 
     return run
+
+
+def called_as(name: str) -> None:
+    """Set the name of the running program in usages: "deep-nrsfm lift"."""
+    global _called_as
+    _called_as = name
+
+
+def program_name(name: str) -> str:
+    """Return how the running program was called, for `prog` of its parser.
+
+    Args:
+        name: name of the program, "lift".
+
+    Returns:
+        "deep-nrsfm lift", "python -m deep_nrsfm_ros.commands.lift" or
+        "ros2 run deep_nrsfm_ros lift" by the way it was started; `name` in any other case, as in
+        a test.
+    """
+    if _called_as:
+        return _called_as
+    started = Path(sys.argv[0])
+    if started == Path(__file__).with_name(f"{name}.py"):
+        return f"python -m {__package__}.{name}"
+    if started.name == name and started.parent.name == "deep_nrsfm_ros":
+        return f"ros2 run deep_nrsfm_ros {name}"
+    return name

@@ -17,12 +17,13 @@ from deep_nrsfm_ros.commands.lift import (
     read_objects,
     warn,
 )
-from deep_nrsfm_ros.commands.program import program
+from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import override
 from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.keypoint_files import KINDS, is_bag
 from deep_nrsfm_ros.data.lifted_bags import has_lifted_messages, read_lifted_messages
 from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages
+from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -38,7 +39,7 @@ from deep_nrsfm_ros.reporting.serving import HOST, Broadcast, in_real_time, serv
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog="replay", description=__doc__)
+    parser = argparse.ArgumentParser(prog=program_name("replay"), description=__doc__)
     parser.add_argument(
         "input",
         type=Path,
@@ -111,13 +112,12 @@ def serve(page: str, port: int, work: Callable[[Broadcast, threading.Event], Non
 
 def watch(given: argparse.Namespace, model: Model, source: KeypointLayout) -> None:
     """Serve what the lifter that runs answers; raise ValueError where there is no ROS."""
-    try:
-        import rclpy  # only here: files need no ROS
-        from rclpy.executors import ExternalShutdownException
+    require_extra("ros", "replay without a BAG")
+    import rclpy  # only here: files need no ROS
+    from rclpy.executors import ExternalShutdownException
 
-        from deep_nrsfm_ros.node.lifter_client import LifterClient
-    except ImportError as error:
-        raise ValueError(f"no ROS here ({error}); name a BAG to look at") from None
+    from deep_nrsfm_ros.node.lifter_client import LifterClient
+
     inputs, stage = override(InputOptions(), given), Stage()
 
     def work(broadcast: Broadcast, stop: threading.Event) -> None:

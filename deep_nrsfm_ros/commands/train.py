@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib.util
 import json
 import os
 import signal
@@ -19,12 +18,13 @@ from pathlib import Path
 from safetensors import SafetensorError
 
 from deep_nrsfm_ros.commands.evaluate import read_split
-from deep_nrsfm_ros.commands.program import program
+from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.bags import most_keypoints, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.sufficiency import Sufficiency
+from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
@@ -58,7 +58,7 @@ NOT_ASKED = ("name", "output", "resume", "json_progress")
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog="train", description=__doc__)
+    parser = argparse.ArgumentParser(prog=program_name("train"), description=__doc__)
     data = parser.add_argument_group("Data (bags or motion capture)")
     data.add_argument("--bag", type=Path, action="append", default=[], help="bag; repeatable")
     data.add_argument("--topic", default="", help="keypoint topic (default: the only one)")
@@ -227,8 +227,7 @@ def run(given: argparse.Namespace, report: Reporter, should_stop: Callable[[], b
         keep_what_is_fixed(start, preset)
     limits = override(WHOLE if given.cmu else Limits(), given)
     check_room(given.output, limits.free_disk)
-    if importlib.util.find_spec("torch") is None:
-        raise ValueError("training needs torch, which is not installed: pip install torch")
+    require_extra("train", "training")
     curated, sufficiency = prepare(given, read_data(given, report), report.say)
     asked = {name: value for name, value in vars(given).items() if name not in NOT_ASKED}
     for options in (*preset, override(LayoutLossWeights(), given), limits, chosen_curation(given)):

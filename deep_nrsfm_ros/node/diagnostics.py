@@ -1,13 +1,14 @@
-"""What the lifter tells an operator: how it does, and what to mend. Knows nothing of ROS."""
+"""Diagnostics of the lifter: its health, counted and judged, and the message that reports it."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import NDArray
 
 OK, WARN, ERROR = range(3)
@@ -156,3 +157,16 @@ class Health:
         if self._empty and not self._seconds:
             return OK, "the detector sees no object"
         return OK, "lifting" if self._seconds else "waiting for keypoints"
+
+
+def status(
+    name: str, level: int, message: str, values: Mapping[str, Any], hardware_id: str = ""
+) -> DiagnosticStatus:
+    """Return a diagnostic status with its values as text."""
+    return DiagnosticStatus(
+        level=bytes([level]),
+        name=name,
+        message=message,
+        hardware_id=hardware_id,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+    )

@@ -47,7 +47,7 @@ from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameters, publishing
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
-from deep_nrsfm_ros.node.diagnostics import Health
+from deep_nrsfm_ros.node.diagnostics import Health, status
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.training_service import TrainingService
 from deep_nrsfm_ros.node.transforms import TransformBroadcaster
@@ -183,7 +183,7 @@ class LifterNode(Node):
         model = self._pipeline.model
         values |= {"model": model.name, "topic": ", ".join(self._listener.topics)}
         values |= {"heard": self._listener.heard, "camera": self._camera.status}
-        lifting = publishing.status(f"{self.get_name()}: lifting", level, message, values)
+        lifting = status(f"{self.get_name()}: lifting", level, message, values)
         self._diagnostics.publish(
             DiagnosticArray(
                 header=publishing.to_header(self._now()), status=[lifting, self._training.status]

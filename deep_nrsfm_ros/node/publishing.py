@@ -7,13 +7,12 @@ ROS has serialised serves for the next.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Transform, Vector3
 from numpy.typing import NDArray
 from rclpy.event_handler import PublisherEventCallbacks
@@ -158,16 +157,3 @@ def markers(
             marker.pose.position = Point(x=x, y=y)
         array_of_markers.markers += [bones, joints]
     return array_of_markers
-
-
-def status(
-    name: str, level: int, message: str, values: Mapping[str, Any], hardware_id: str = ""
-) -> DiagnosticStatus:
-    """Return a diagnostic status with its values as text."""
-    return DiagnosticStatus(
-        level=bytes([level]),
-        name=name,
-        message=message,
-        hardware_id=hardware_id,
-        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
-    )

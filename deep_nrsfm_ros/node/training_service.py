@@ -12,7 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
 from deep_nrsfm_ros.node import publishing
-from deep_nrsfm_ros.node.diagnostics import ERROR, OK
+from deep_nrsfm_ros.node.diagnostics import ERROR, OK, status
 from deep_nrsfm_ros.training.job import Progress, TrainingJob
 from deep_nrsfm_ros.training.record import find_records, look
 from deep_nrsfm_ros.training.request import TrainingOptions, TrainingRequest
@@ -162,5 +162,5 @@ class TrainingService:
         name = f"{self._node.get_name()}: training"
         values = {"state": progress.state, **progress.values, "last failure": self._last_failure}
         level = ERROR if failed else OK
-        self.status = publishing.status(name, level, progress.message, values)
+        self.status = status(name, level, progress.message, values)
         self._publisher.publish(self.status)

@@ -53,9 +53,10 @@ def test_what_is_missing_is_named_with_the_mend(
     monkeypatch.setattr(kernel, "AVAILABLE", False)
     found = doctor.check_model("human", tmp_path)
     assert found.word == "warn" and "C compiler" in found.mend
-    monkeypatch.setattr(doctor, "NEEDED", ("numpy", "no_rclpy_here"))
+    monkeypatch.setattr(doctor, "FOR_ROS", ("no_rclpy_here",))
     found = doctor.check_imports()
     assert found.word == "FAIL" and "no_rclpy_here" in found.seen
+    assert "pip install 'deep_nrsfm_ros[ros]' (or source" in found.mend
     (tmp_path / "mine.safetensors").write_bytes(b"x" * 100)
     for name in ("mine", "nobody"):
         found = doctor.check_model(name, tmp_path)

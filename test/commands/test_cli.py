@@ -1,0 +1,75 @@
+"""One command for all programs; each says how it was called."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from deep_nrsfm_ros import __version__
+from deep_nrsfm_ros.commands import cli, program
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+
+def run(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True)
+
+
+def test_help_lists_every_program_with_a_line() -> None:
+    done = run("-m", "deep_nrsfm_ros", "--help")
+    assert done.returncode == 0 and done.stdout.startswith("usage: python -m deep_nrsfm_ros ")
+    lines = [line.split() for line in done.stdout.splitlines()]
+    for name, text in cli.PROGRAMS.items():
+        assert [name, *text.split()] in lines
+
+
+def test_every_script_is_a_program() -> None:
+    assert {path.name for path in SCRIPTS.iterdir()} == set(cli.PROGRAMS)
+
+
+@pytest.mark.parametrize("name", cli.PROGRAMS)
+def test_a_program_says_how_it_was_called(name: str) -> None:
+    for words, called in {
+        ("-m", "deep_nrsfm_ros", name): f"python -m deep_nrsfm_ros {name}",
+        ("-m", f"deep_nrsfm_ros.commands.{name}"): f"python -m deep_nrsfm_ros.commands.{name}",
+        (str(SCRIPTS / name),): name,
+    }.items():
+        done = run(*words, "--help")
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith(f"usage: {called} ")
+
+
+def test_ros2_run_shows_in_the_usage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["/opt/lib/deep_nrsfm_ros/lift"])
+    assert program.program_name("lift") == "ros2 run deep_nrsfm_ros lift"
+
+
+def test_an_unknown_program_is_refused_with_the_nearest(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for word, hint in {"trian": "did you mean train?", "zzz": "choose one of lift, train,"}.items():
+        with pytest.raises(SystemExit) as end:
+            cli.main([word, "--help"])
+        assert end.value.code == 2
+        assert f"there is no command {word!r}; {hint}" in capsys.readouterr().err
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["--version"])
+    assert __version__ in capsys.readouterr().out
+
+
+def test_only_the_module_of_the_program_is_imported() -> None:
+    code = (
+        "import sys; from deep_nrsfm_ros.commands import cli\n"
+        "try: cli.main(['models', '--help'])\n"
+        "except SystemExit: pass\n"
+        "loaded = {m.rpartition('.')[2] for m in sys.modules if '.commands.' in m}\n"
+        "assert loaded == {'cli', 'program', 'models'}, loaded"
+    )
+    done = run("-c", code)
+    assert done.returncode == 0, done.stderr
