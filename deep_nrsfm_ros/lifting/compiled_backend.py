@@ -17,7 +17,7 @@ from deep_nrsfm_ros.lifting.confidence import CALIBRATED, RESIDUAL_OFFSET
 from deep_nrsfm_ros.lifting.correction import UNKNOWN_VARIANCE
 from deep_nrsfm_ros.lifting.numpy_backend import MIN_RELATIVE_DEPTH, RESIDUAL_SCALE, LifterConstants
 from deep_nrsfm_ros.nrsfm.bones import Bones
-from deep_nrsfm_ros.nrsfm.network import filling
+from deep_nrsfm_ros.nrsfm.network import completion_matrix
 
 
 class CompiledBackend:
@@ -53,7 +53,7 @@ class CompiledBackend:
         rows = _padded(covariance.reshape(p, 3, p, 3).swapaxes(2, 3), _kernel.DOUBLES)
         rows = _padded(rows.swapaxes(0, 3), _kernel.DOUBLES).swapaxes(0, 3)
         floats += [rows]
-        doubles = [filling(net), constants.test_time_rotations, constants.object_frame]
+        doubles = [completion_matrix(net), constants.test_time_rotations, constants.object_frame]
         doubles += [CALIBRATED, np.stack(bones[1:], 1), constants.noise, constants.reference_length]
         doubles += [
             UNKNOWN_VARIANCE * np.trace(covariance) / (3 * p),

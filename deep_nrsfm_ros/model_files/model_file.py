@@ -84,7 +84,7 @@ def save_model(path: Path, model: Model) -> None:
         "provenance": model.provenance,
         "quality": model.quality,
     }
-    weights = {k: np.ascontiguousarray(w, np.float32) for k, w in model.network.named()}
+    weights = {k: np.ascontiguousarray(w, np.float32) for k, w in model.network.named_weights()}
     weights["error_covariance"] = np.ascontiguousarray(model.error_covariance, np.float32)
     if len(model.bone_lengths):
         weights["bone_lengths"] = np.ascontiguousarray(model.bone_lengths, np.float32)
@@ -175,7 +175,7 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
         raise ValueError(f"bone_lengths are not all above {_SMALLEST:g}")
     return Model(
         str(header["name"]),
-        Network.from_named(architecture, weights),
+        Network.from_named_weights(architecture, weights),
         layout,
         normaliser,
         frame.astype(np.float32),

@@ -1,7 +1,14 @@
-"""The network: section "Deep Non-Rigid Structure from Motion" of the paper, top to bottom.
+"""The network: section 3 of the paper, from the block codes to the shape and the camera.
 
-Symbols are named in the legend of this package. Everything here is written on operations that
-NumPy and torch share: the trainer runs it on tensors, the lifter on arrays.
+Read from the top: `forward` = `encode` (2D keypoints to block codes), `recover` (block code to code
+and camera), `decode` (code to shape). What is ours, the whitening of the keypoints, follows.
+
+The package's docstring is the legend of the symbols. Every function uses only operations that NumPy
+and torch share: the trainer calls it with tensors, the lifter with arrays. Shapes on the lines omit
+the batch dimensions: (p, 2) stands for (..., p, 2).
+
+Source: Kong and Lucey, "Deep Non-Rigid Structure from Motion", ICCV 2019, arXiv 1902.10840. The
+docstrings name the paper's equations by their labels in its LaTeX source, e.g. eq:singleBISTA.
 """
 
 from __future__ import annotations
@@ -16,9 +23,9 @@ from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.nrsfm.geometry import Array, polar
 
 PAPER_WIDTHS = (125, 114, 104, 93, 83, 72, 62, 51, 41, 30, 20, 10)
-"""The paper's 12 dictionaries, linspace(125, 10, 12)."""
+"""Widths k_1 ... k_12 of the paper's 12 dictionaries: linspace(125, 10, 12)."""
 WIDE_WIDTHS = (256, 128, 64, 48)
-"""Four wide dictionaries: the default; they do not collapse under the cycle loss."""
+"""Default widths: four wide dictionaries, which do not collapse under the cycle loss."""
 
 
 @dataclass(frozen=True)
@@ -30,82 +37,102 @@ class Architecture:
     )
     threshold: str = option(
         "relu",
-        "block threshold: its ReLU relaxation, or the exact soft threshold of each block's norm",
+        "threshold of the block codes: relu = ReLU of each entry minus its block's threshold (the "
+        "paper's relaxation), block = exact soft threshold of each block's norm",
         choices=("relu", "block"),
     )
     recovery: str = option(
         "learned",
-        "code and camera from the last block code: learned linear maps, or the closed form",
+        "how code and camera are computed from the last block code: learned = two linear maps "
+        "(the paper), closed_form = its best rank-one factors",
         choices=("learned", "closed_form"),
     )
     camera: str = option(
         "orthonormal",
-        "camera of the network: its orthonormal factor, or free and held by the loss",
+        "camera of the network: orthonormal = M^T M = I by construction, free = any 3 x 2 matrix, "
+        "whose spectral norm the loss penalises",
         choices=("orthonormal", "free"),
     )
     whitening: float = option(
         1.0,
-        "exponent of the keypoints' whitening: 1 makes the network care as much for the small "
-        "ways in which the points vary as for the large ones, 0 is the paper's network",
+        "exponent of the whitening of the keypoints: 0 = off (the paper's network), 1 = full; "
+        "with 1 small variations of the shape count as much as large ones",
         low=0.0,
         high=1.0,
     )
     whitening_floor: float = option(
         1e-2,
-        "variance below which a direction counts as noise, relative to the largest",
+        "variance, relative to the largest, below which the whitening takes a direction for "
+        "noise; 0.01 typical",
         low=1e-8,
         high=1.0,
     )
 
     def __post_init__(self) -> None:
-        """Refuse a network without a dictionary."""
+        """Raise ValueError for a network without a dictionary."""
         if not self.widths:
             raise ValueError("widths is empty; give the width of at least one dictionary")
 
     @property
     def is_default_variant(self) -> bool:
-        """Tell whether it is of the kind that is written out by hand: its gradient, the kernel."""
-        usual = type(self)
-        ours = self.threshold, self.recovery, self.camera
-        return ours == (usual.threshold, usual.recovery, usual.camera)
+        """Return whether threshold, recovery and camera are the defaults, as the kernel needs."""
+        default = type(self)
+        variant = self.threshold, self.recovery, self.camera
+        return variant == (default.threshold, default.recovery, default.camera)
 
 
 @dataclass(frozen=True)
 class Network:
-    """Weights of the multi-layer block-sparse dictionary; shapes in the package's legend."""
+    """The weights of a network with n dictionaries for p keypoints.
+
+    Attributes:
+        architecture: widths k_1 ... k_n and variants.
+        D: dictionaries; D[0] (p, 3, k_1), D[i] (k_i, k_i+1). Encoder and decoder share them.
+        b: thresholds of the encoder; b[i] (k_i+1), one for each block.
+        b_: biases of the decoder; b_[0] (p, 3) of the shape, b_[i] (k_i) of the code psi_i.
+        code_head: (6 k_n, k_n), from the entries of Psi_n to psi_n.
+        camera_head: (k_n, 1), from the blocks of Psi_n to M^T.
+        L: (p, p) whitening, fixed before the training; see `whitening`.
+        L_inverse: (p, p) its inverse.
+    """
 
     architecture: Architecture
     D: tuple[Array, ...]
     b: tuple[Array, ...]
-    b_: tuple[Array, ...]  # b_[0] (p, 3) is the bias of S itself, b_[i] (k_i) that of psi_i
-    code_head: Array  # (6 k_n, k_n): psi_n from the entries of Psi_n
-    camera_head: Array  # (k_n, 1): M as a linear combination of the blocks of Psi_n
-    L: Array  # (p, p) whitening of the points, fixed before training; see `whitening`
-    L_inverse: Array  # (p, p)
+    b_: tuple[Array, ...]
+    code_head: Array
+    camera_head: Array
+    L: Array
+    L_inverse: Array
 
     @property
     def p(self) -> int:
         """Return the number of keypoints."""
         return int(self.D[0].shape[0])
 
-    def named(self) -> Iterator[tuple[str, Array]]:
-        """Yield every array under a stable name, e.g. ("D.1", ...)."""
+    def named_weights(self) -> Iterator[tuple[str, Array]]:
+        """Yield every weight with its name in files, e.g. ("D.1", D[1]) or ("L", L)."""
         for name, group in (("D", self.D), ("b", self.b), ("b_", self.b_)):
             yield from ((f"{name}.{i}", weight) for i, weight in enumerate(group))
         for name in _SINGLE:
             yield name, getattr(self, name)
 
-    def learned(self) -> Iterator[tuple[str, Array]]:
-        """Yield what training changes: everything but the whitening."""
-        return ((name, weight) for name, weight in self.named() if not name.startswith("L"))
+    def trainable_weights(self) -> Iterator[tuple[str, Array]]:
+        """Yield the weights that training changes: all but the whitening."""
+        return ((name, w) for name, w in self.named_weights() if not name.startswith("L"))
 
     def map(self, function: Callable[[Array], Array]) -> Network:
-        """Return the network with `function` applied to every weight, e.g. torch.from_numpy."""
-        return self.from_named(self.architecture, {k: function(w) for k, w in self.named()})
+        """Return a network with `function` applied to every weight, e.g. torch.from_numpy."""
+        weights = {name: function(w) for name, w in self.named_weights()}
+        return self.from_named_weights(self.architecture, weights)
 
     @classmethod
-    def from_named(cls, architecture: Architecture, weights: dict[str, Array]) -> Network:
-        """Rebuild a network from what `named` yields; raise KeyError for a missing weight."""
+    def from_named_weights(cls, architecture: Architecture, weights: dict[str, Array]) -> Network:
+        """Return the network of named weights, the inverse of `named_weights`.
+
+        Raises:
+            KeyError: a weight is missing.
+        """
         layers = range(len(architecture.widths))
         D, b, b_ = (tuple(weights[f"{k}.{i}"] for i in layers) for k in ("D", "b", "b_"))
         return cls(architecture, D, b, b_, *(weights[name] for name in _SINGLE))
@@ -114,8 +141,250 @@ class Network:
 _SINGLE = ("code_head", "camera_head", "L", "L_inverse")
 
 
+def forward(net: Network, W: Array) -> tuple[Array, Array]:
+    """Return shape and camera of 2D keypoints: the whole network.
+
+    Args:
+        net: the network's weights.
+        W: (..., p, 2) centred keypoints in units of the object, e.g. from `normalise`.
+
+    Returns:
+        S (..., p, 3) in the units of W, and M (..., 3, 2) with W ~ S M.
+
+    Source: eq:proj, W = S M.
+    """
+    Psi_n = encode(net, W)[-1]  # (2, 3, k_n)
+    psi_n, M = recover(net, Psi_n)  # (k_n), (3, 2)
+    S, _ = decode(net, psi_n)  # (p, 3)
+    return S, M
+
+
+def reconstruct(net: Network, W: Array) -> tuple[Array, Array]:
+    """Return `forward`, but always with an orthonormal camera.
+
+    The scale of a free camera becomes the scale of the shape.
+
+    Args:
+        net: the network's weights.
+        W: (..., p, 2) as for `forward`.
+
+    Returns:
+        S (..., p, 3), and M (..., 3, 2) with M^T M = I.
+    """
+    S, M = forward(net, W)
+    if net.architecture.camera == "orthonormal":
+        return S, M
+    size = ((M * M).sum((-2, -1))[..., None, None] / 2) ** 0.5  # (1, 1)
+    return S * size, polar(M.swapaxes(-1, -2)).swapaxes(-1, -2)
+
+
+def encode(net: Network, W: Array) -> list[Array]:
+    """Return the block codes of 2D keypoints: one step of block ISTA for each dictionary.
+
+    Psi_1 = h((D_1#)^T L W - b_1), Psi_i = h((D_i (x) I_3)^T Psi_i-1 - b_i).
+
+    Args:
+        net: the network's weights.
+        W: (..., p, 2) as for `forward`.
+
+    Returns:
+        Psi_1 ... Psi_n, of shape (..., 2, 3, k_i), as the legend of the package stores them.
+
+    Source: section "Block ISTA and DNNs solution", "Encoder"; eq:mlbsc_w.
+    """
+    h = _THRESHOLDS[net.architecture.threshold]
+    p, _, k_1 = net.D[0].shape
+    W = whiten(net, W)  # (p, 2)
+    D_sharp = net.D[0].reshape(p, 3 * k_1)  # (p, 3 k_1)
+    V = _product(W.swapaxes(-1, -2), D_sharp)  # (2, 3 k_1)
+    Psi = [h(V.reshape(*W.shape[:-2], 2, 3, k_1), net.b[0])]  # (2, 3, k_1)
+    for D, b in zip(net.D[1:], net.b[1:], strict=True):
+        Psi.append(h(_product(Psi[-1], D), b))  # (2, 3, k_i)
+    return Psi
+
+
+def recover(net: Network, Psi: Array) -> tuple[Array, Array]:
+    """Return code and camera of the last block code, Psi_n = psi_n (x) M.
+
+    Args:
+        net: the network's weights.
+        Psi: (..., 2, 3, k_n).
+
+    Returns:
+        psi_n (..., k_n), and M (..., 3, 2).
+
+    Source: section "Code and camera recovery"; the orthonormal M is that of "Loss function".
+    """
+    if net.architecture.recovery == "closed_form":
+        psi, M_T = _leading_factors(Psi)  # (k_n), (2, 3)
+    else:
+        psi = Psi.reshape(*Psi.shape[:-3], 6 * Psi.shape[-1]) @ net.code_head  # (k_n)
+        M_T = _product(Psi, net.camera_head)[..., 0]  # (2, 3)
+    if net.architecture.camera == "orthonormal":
+        M_T = polar(M_T)
+    return psi, M_T.swapaxes(-1, -2)
+
+
+def decode(net: Network, psi: Array) -> tuple[Array, list[Array]]:
+    """Return the shape of a code, through the encoder's dictionaries.
+
+    psi_i-1 = relu(D_i psi_i - b'_i-1), s = D_1 psi_1 - b'_0, S = L^-1 s reshaped to (p, 3).
+
+    Args:
+        net: the network's weights.
+        psi: (..., k_n) the last code.
+
+    Returns:
+        S (..., p, 3), and the codes psi_1 ... psi_n, of shape (..., k_i).
+
+    Source: section "Decoder"; eq:mlsc. The bias b'_0 is not in the paper but in the authors'
+    release: it is the mean shape, negative and whitened.
+    """
+    codes = [psi]
+    for D, b in zip(net.D[:0:-1], net.b_[:0:-1], strict=True):
+        codes.insert(0, _relu(codes[0] @ D.swapaxes(-1, -2) - b))  # (k_i-1)
+    p, _, k_1 = net.D[0].shape
+    s = codes[0] @ net.D[0].reshape(3 * p, k_1).swapaxes(-1, -2)  # (3 p)
+    S = s.reshape(*psi.shape[:-1], p, 3) - net.b_[0]  # (p, 3), whitened
+    return unwhiten(net, S), codes
+
+
+def _relu(X: Array) -> Array:
+    """Write max(X, 0) into X and return it; a new array would cost as much as the product."""
+    return np.maximum(X, 0, out=X) if isinstance(X, np.ndarray) else X.relu_()
+
+
+def _relu_threshold(V: Array, b: Array) -> Array:
+    """Write relu(V - b (x) 1_3x2) into V (..., 2, 3, k) and return it. Source: eq:singleBISTA."""
+    V -= b
+    return _relu(V)
+
+
+def _block_threshold(V: Array, b: Array) -> Array:
+    """Return h_b(||V_j||_F) / ||V_j||_F V_j for every block j of V (..., 2, 3, k).
+
+    Source: the exact proximal step, in the text before eq:singleBISTA.
+    """
+    norm = ((V * V).sum((-3, -2))[..., None, None, :] + 1e-12) ** 0.5  # (1, 1, k)
+    return V * (_relu(norm - b) / norm)
+
+
+_THRESHOLDS = {"relu": _relu_threshold, "block": _block_threshold}
+
+
+def _leading_factors(Psi: Array, iterations: int = 6) -> tuple[Array, Array]:
+    """Return psi (..., k) and M^T (..., 2, 3) of the best rank-one Psi = psi (x) M.
+
+    Power iteration on the 6 x k matrix of Psi. It starts at the sum of the blocks: for a
+    non-negative code that is the camera up to scale, which settles the sign as well.
+    """
+    X = Psi.reshape(*Psi.shape[:-3], 6, Psi.shape[-1])  # (6, k)
+    m = X.sum(-1)[..., None]  # (6, 1)
+    for _ in range(iterations):
+        m = X @ (X.swapaxes(-1, -2) @ m)
+        m = m / ((m * m).sum(-2)[..., None] + 1e-12) ** 0.5
+    # M^T M = I means ||M||_F^2 = 2, so the unit vector m is M / sqrt(2).
+    psi = (X.swapaxes(-1, -2) @ m)[..., 0] * 0.5**0.5  # (k)
+    return psi, (m * 2**0.5).reshape(*Psi.shape[:-3], 2, 3)
+
+
+def _product(X: Array, A: Array) -> Array:
+    """Return X A for X (..., k) and A (k, l): one product of all rows, which NumPy would split."""
+    return (X.reshape(-1, X.shape[-1]) @ A).reshape(*X.shape[:-1], A.shape[-1])
+
+
+# --- Whitening of the keypoints: ours, not in the paper ------------------------------------------
+
+
+def whitening(
+    moment: NDArray[np.float64], exponent: float, floor: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the whitening L of the keypoints and its inverse.
+
+    W = S M implies L W = (L S) M for any L, so that a network may learn the shapes L S. With
+    L = moment^(-exponent / 2) large movements of the limbs no longer hide small ones of toes and
+    nose, which tell the front of a body from its back. That keeps depth from being mirrored in
+    poses whose mirror image looks like another pose. L is scaled to keep the RMS of the points.
+
+    Args:
+        moment: (p, p) second moment E[W W^T] of the centred keypoints.
+        exponent: 0 = identity, 1 = full whitening.
+        floor: variances below this share of the largest count as this share; 0.01 typical.
+
+    Returns:
+        L and L^-1, both (p, p) and symmetric.
+    """
+    variance, U = np.linalg.eigh(moment)
+    root = np.maximum(variance, floor * variance[-1]) ** (-exponent / 2)
+    root *= np.sqrt(variance.clip(0).sum() / (root * root * variance.clip(0)).sum())
+    return ((U * root) @ U.T).astype(np.float32), ((U / root) @ U.T).astype(np.float32)
+
+
+def whiten(net: Network, X: Array) -> Array:
+    """Return L X for points X (..., p, d)."""
+    return _symmetric_product(net.L, X) if net.architecture.whitening else X
+
+
+def unwhiten(net: Network, X: Array) -> Array:
+    """Return L^-1 X for points X (..., p, d), the inverse of `whiten`."""
+    return _symmetric_product(net.L_inverse, X) if net.architecture.whitening else X
+
+
+def complete(net: Network, points: Array, mask: Array) -> tuple[Array, Array]:
+    """Fill in missing points where the network expects them.
+
+    The points X that are filled in minimise ||L C X||_F, where C subtracts the mean: the expected
+    points, given the visible ones, of a Gaussian with the second moment of the training data.
+    Zeros would not do, because L spreads every point over all others. A network without whitening
+    takes zeros and leaves its input unchanged.
+
+    Args:
+        net: the network's weights.
+        points: (n, p, d).
+        mask: (n, p, 1), 1 = visible, 0 = missing.
+
+    Returns:
+        Points (n, p, d) and mask (n, p, 1), which is 1 wherever a point is visible or filled in.
+    """
+    if not net.architecture.whitening or mask.all():
+        return points, mask
+    identity = net.L @ net.L_inverse  # in the library, type and place of the weights
+    rows = mask * identity + (1 - mask) * completion_matrix(net)  # (n, p, p)
+    return _solve(rows, mask * points), mask * 0 + 1
+
+
+def completion_matrix(net: Network) -> Array:
+    """Return the matrix P (p, p) of the condition (P X)_i = 0 for every missing point i.
+
+    P is the gradient of ||L C X||_F^2 / 2, with C chosen for each frame so that the
+    translation is optimal too. A small multiple of the identity makes the solution unique, so that
+    a frame without a visible point has one.
+    """
+    P = net.L @ net.L
+    sums = P.sum(-1)
+    P = P - sums[:, None] * sums / sums.sum()
+    return P + 1e-6 * P.trace() * (net.L @ net.L_inverse)
+
+
+def _solve(A: Array, B: Array) -> Array:
+    """Return A^-1 B, for arrays or for tensors."""
+    if isinstance(A, np.ndarray):
+        return np.linalg.solve(A, B)
+    from torch.linalg import solve
+
+    return solve(A, B)
+
+
+def _symmetric_product(A: Array, X: Array) -> Array:
+    """Return A X for a symmetric A (p, p), as (X^T A)^T: one product for the whole batch."""
+    return _product(X.swapaxes(-1, -2), A).swapaxes(-1, -2)
+
+
+# --- Initial weights and their quality -----------------------------------------------------------
+
+
 def weight_shapes(architecture: Architecture, p: int) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every array of a network for p keypoints."""
+    """Return name and shape of every weight of a network for p keypoints."""
     k = architecture.widths
     shapes: dict[str, tuple[int, ...]] = {}
     for i, width in enumerate(k):
@@ -133,11 +402,22 @@ def initialise(
     *,
     paper_initialisation: bool = False,
 ) -> Network:
-    """Return a float32 network of Glorot-uniform dictionaries and heads, not yet whitened.
+    """Return a network with random weights and without whitening (L = I).
 
-    Thresholds and biases start at zero. `paper_initialisation` starts as the authors' release: it
-    draws them too, which silences 20-40 % of the narrowest layer from the start, and its fans
-    are those of the convolutions ("Variation of implementation").
+    Dictionaries and heads are Glorot-uniform, thresholds and biases zero.
+
+    Args:
+        architecture: widths and variants.
+        p: number of keypoints, 4 or more.
+        rng: source of the random weights.
+        paper_initialisation: initialise as the authors' release. It draws thresholds and biases
+            too, which silences 20-40 % of the narrowest layer from the start, and takes the fans
+            of the equivalent convolutions.
+
+    Returns:
+        A network of float32 arrays.
+
+    Source: section "Variation of implementation" for the convolutions.
     """
     weights = {}
     for name, shape in weight_shapes(architecture, p).items():
@@ -145,16 +425,16 @@ def initialise(
         limit = 0.0 if name.startswith("b") and not paper_initialisation else (6 / fan) ** 0.5
         weights[name] = rng.uniform(-limit, limit, shape).astype(np.float32)
     weights |= {name: np.eye(p, dtype=np.float32) for name in ("L", "L_inverse")}
-    return Network.from_named(architecture, weights)
+    return Network.from_named_weights(architecture, weights)
 
 
 def _matrix_fan(shape: tuple[int, ...]) -> int:
-    """Return inputs + outputs of a weight as the matrix that it is applied as."""
+    """Return inputs + outputs of a weight, as the matrix that it is applied as."""
     return sum(shape) if len(shape) < 3 else 3 * shape[0] + shape[2]
 
 
 def _convolution_fan(name: str, shape: tuple[int, ...]) -> int:
-    """Return (input + output channels) x kernel size of a weight as a convolution kernel."""
+    """Return (input + output channels) x kernel size of a weight, as a convolution kernel."""
     if name == "D.0":
         return 3 * (shape[0] + shape[2])
     if name == "code_head":
@@ -162,175 +442,17 @@ def _convolution_fan(name: str, shape: tuple[int, ...]) -> int:
     return 2 * int(np.prod(shape)) if name.startswith("b") else sum(shape)
 
 
-def whitening(
-    moment: NDArray[np.float64], exponent: float, floor: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return L and its inverse (p, p) for the second moment E[W W^T] (p, p) of the points.
-
-    W = S M implies L W = (L S) M for any L, so a network may learn the shapes L S instead. With
-    L = moment^(-exponent / 2) the limbs no longer drown the toes and the nose, which tell the
-    front of a body from its back: that keeps depth from coming out mirrored in the poses whose
-    mirror image looks like another pose. Scaled to keep the RMS.
-    """
-    variance, U = np.linalg.eigh(moment)
-    root = np.maximum(variance, floor * variance[-1]) ** (-exponent / 2)
-    root *= np.sqrt(variance.clip(0).sum() / (root * root * variance.clip(0)).sum())
-    return ((U * root) @ U.T).astype(np.float32), ((U / root) @ U.T).astype(np.float32)
-
-
-def whiten(net: Network, X: Array) -> Array:
-    """Return L X for points X (..., p, d): differences as the network weighs them."""
-    return _symmetric_product(net.L, X) if net.architecture.whitening else X
-
-
-def unwhiten(net: Network, X: Array) -> Array:
-    """Return L^-1 X, the inverse of `whiten`."""
-    return _symmetric_product(net.L_inverse, X) if net.architecture.whitening else X
-
-
-def complete(net: Network, points: Array, mask: Array) -> tuple[Array, Array]:
-    """Fill the missing of points (n, p, d), mask (n, p, 1) 1 or 0; return points and mask.
-
-    They go where ||L C X||_F is least, C taking the mean off: where a Gaussian of the keypoints'
-    second moment expects them, given those seen. Zeros would not do, since L spreads every point
-    over all others. A network without whitening takes zeros, so all stays as it is.
-    """
-    if not net.architecture.whitening or mask.all():
-        return points, mask
-    rows = mask * (net.L @ net.L_inverse) + (1 - mask) * filling(net)
-    return _solve(rows, mask * points), mask * 0 + 1
-
-
-def filling(net: Network) -> Array:
-    """Return P (p, p), of which the rows of missing points, times all points, are to be zero."""
-    P = net.L @ net.L
-    sums = P.sum(-1)
-    # Least over the translation as well, which takes one direction out of P.
-    P = P - sums[:, None] * sums / sums.sum()
-    # So that a frame without a visible point has an answer too.
-    return P + 1e-6 * P.trace() * (net.L @ net.L_inverse)
-
-
-def _solve(A: Array, B: Array) -> Array:
-    """Return A^-1 B in the library that they are of."""
-    if isinstance(A, np.ndarray):
-        return np.linalg.solve(A, B)
-    from torch.linalg import solve
-
-    return solve(A, B)
-
-
-def _symmetric_product(A: Array, X: Array) -> Array:
-    """Return A X for a symmetric A (p, p), as X^T A: one matrix product for the whole batch."""
-    return _product(X.swapaxes(-1, -2), A).swapaxes(-1, -2)
-
-
-def _product(X: Array, A: Array) -> Array:
-    """Return X A for X (..., k): one product of all rows, where NumPy would make one a matrix."""
-    return (X.reshape(-1, X.shape[-1]) @ A).reshape(*X.shape[:-1], A.shape[-1])
-
-
-def forward(net: Network, W: Array) -> tuple[Array, Array]:
-    """Return shape S (..., p, 3) and camera M (..., 3, 2) of the keypoints W (..., p, 2)."""
-    psi, M = recover(net, encode(net, W)[-1])
-    return decode(net, psi)[0], M
-
-
-def reconstruct(net: Network, W: Array) -> tuple[Array, Array]:
-    """Return `forward` with an orthonormal M; S takes over the size of a free camera."""
-    S, M = forward(net, W)
-    if net.architecture.camera == "orthonormal":
-        return S, M
-    size = ((M * M).sum((-2, -1))[..., None, None] / 2) ** 0.5
-    return S * size, polar(M.swapaxes(-1, -2)).swapaxes(-1, -2)
-
-
-def encode(net: Network, W: Array) -> list[Array]:
-    """Return the block codes Psi_1 ... Psi_n (..., 2, 3, k_i): one block-ISTA step a layer.
-
-    "Encoder", on L W: Psi_1 = h((D_1#)^T W - b_1), Psi_i = h((D_i (x) I_3)^T Psi_i-1 - b_i).
-    """
-    threshold = _THRESHOLDS[net.architecture.threshold]
-    p, _, k = net.D[0].shape
-    W = whiten(net, W)
-    V = _product(W.swapaxes(-1, -2), net.D[0].reshape(p, 3 * k)).reshape(*W.shape[:-2], 2, 3, k)
-    Psi = [threshold(V, net.b[0])]
-    for D, b in zip(net.D[1:], net.b[1:], strict=True):
-        Psi.append(threshold(_product(Psi[-1], D), b))
-    return Psi
-
-
-def _relu(X: Array) -> Array:
-    """Put max(X, 0) in place of X, and return it: a second array would take as long to fill."""
-    return np.maximum(X, 0, out=X) if isinstance(X, np.ndarray) else X.relu_()
-
-
-def _relu_threshold(V: Array, b: Array) -> Array:
-    """Put relu(V - b (x) 1_3x2) in place of V: the paper's relaxation (eq. "singleBISTA")."""
-    V -= b
-    return _relu(V)
-
-
-def _block_threshold(V: Array, b: Array) -> Array:
-    """Return h_b(||V_j||_F) / ||V_j||_F V_j for each block j, the exact proximal step."""
-    norm = ((V * V).sum((-3, -2))[..., None, None, :] + 1e-12) ** 0.5
-    return V * (_relu(norm - b) / norm)
-
-
-_THRESHOLDS = {"relu": _relu_threshold, "block": _block_threshold}
-
-
-def recover(net: Network, Psi: Array) -> tuple[Array, Array]:
-    """Return code psi_n (..., k_n) and camera M (..., 3, 2): "Code and camera recovery"."""
-    if net.architecture.recovery == "closed_form":
-        psi, rows = _leading_factors(Psi)
-    else:
-        psi = Psi.reshape(*Psi.shape[:-3], 6 * Psi.shape[-1]) @ net.code_head
-        rows = _product(Psi, net.camera_head)[..., 0]
-    if net.architecture.camera == "orthonormal":
-        rows = polar(rows)
-    return psi, rows.swapaxes(-1, -2)
-
-
-def _leading_factors(Psi: Array, iterations: int = 6) -> tuple[Array, Array]:
-    """Return psi (..., k) and M^T (..., 2, 3) of the rank-one Psi = psi (x) M.
-
-    Power iteration on the k x 6 reshape. It starts at the sum of the blocks, which for a
-    non-negative code is the camera itself up to scale, and so settles the sign as well.
-    """
-    X = Psi.reshape(*Psi.shape[:-3], 6, Psi.shape[-1])
-    m = X.sum(-1)[..., None]
-    for _ in range(iterations):
-        m = X @ (X.swapaxes(-1, -2) @ m)
-        m = m / ((m * m).sum(-2)[..., None] + 1e-12) ** 0.5
-    # M^T M = I means ||M||_F^2 = 2: the unit factor m is M / sqrt(2).
-    psi = (X.swapaxes(-1, -2) @ m)[..., 0] * 0.5**0.5
-    return psi, (m * 2**0.5).reshape(*Psi.shape[:-3], 2, 3)
-
-
-def decode(net: Network, psi: Array) -> tuple[Array, list[Array]]:
-    """Return S (..., p, 3) and the codes psi_1 ... psi_n (..., k_i) from the last of them.
-
-    "Decoder", with the encoder's dictionaries: psi_i-1 = relu(D_i psi_i - b'_i-1),
-    s = D_1 psi_1 - b'_0. The last bias is not in the paper but in its authors' release; it is
-    the mean shape, negative and whitened.
-    """
-    codes = [psi]
-    for D, b in zip(net.D[:0:-1], net.b_[:0:-1], strict=True):
-        codes.insert(0, _relu(codes[0] @ D.swapaxes(-1, -2) - b))
-    p, _, k = net.D[0].shape
-    s = codes[0] @ net.D[0].reshape(3 * p, k).swapaxes(-1, -2)
-    S = s.reshape(*psi.shape[:-1], p, 3) - net.b_[0]
-    return unwhiten(net, S), codes
-
-
 def coherence(net: Network) -> float:
-    """Return the mutual coherence of the final dictionary: max |cos| between two atoms.
+    """Return the mutual coherence of the final dictionary: the largest |cosine| of two atoms.
 
-    "Coherence as guide" in the paper. Atoms of norm zero count as orthogonal to all.
+    Returns:
+        A number in [0, 1]; a low one indicates a good model. Atoms of norm zero count as
+        orthogonal to all others.
+
+    Source: section "Coherence as guide".
     """
-    D = np.asarray(net.D[-1], np.float64).reshape(-1, net.D[-1].shape[-1])
+    D = np.asarray(net.D[-1], np.float64).reshape(-1, net.D[-1].shape[-1])  # (k_n-1, k_n)
     D = D / np.maximum(np.linalg.norm(D, axis=0), 1e-12)
-    G = np.abs(D.T @ D)
+    G = np.abs(D.T @ D)  # (k_n, k_n)
     np.fill_diagonal(G, 0)
     return float(G.max())

@@ -25,7 +25,7 @@ _MOST_WEIGHTS = 2_000_000  # that are read anew for every few frames; torch is f
 def fits(objective: Objective, net: Network) -> bool:
     """Tell whether there is a kernel, and it knows this loss and this network."""
     known = supports(net) and net.L.device.type == "cpu" and net.L.dtype == torch.float32
-    small = sum(weight.numel() for _, weight in net.learned()) <= _MOST_WEIGHTS
+    small = sum(weight.numel() for _, weight in net.trainable_weights()) <= _MOST_WEIGHTS
     return known and small and objective.whitened and not objective.layout_loss
 
 

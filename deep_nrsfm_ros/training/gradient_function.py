@@ -49,7 +49,7 @@ class GradientFunction:
         with torch.inference_mode():
             task = self._objective.task(net, frames, known, generator)
             if self._compiled:
-                return self._compiled(joined(weight for _, weight in net.learned()), task)
+                return self._compiled(joined(weight for _, weight in net.trainable_weights()), task)
             return written_out(self._objective, net, task)
 
 
@@ -80,9 +80,9 @@ def _by_torch(
     generator: torch.Generator,
 ) -> tuple[Losses, Tensor]:
     """Return what a `GradientFunction` does, by torch's autograd."""
-    weights = {name: weight.detach() for name, weight in net.named()}
-    learned = [weights[name].requires_grad_() for name, _ in net.learned()]
-    net = Network.from_named(net.architecture, weights)
+    weights = {name: weight.detach() for name, weight in net.named_weights()}
+    learned = [weights[name].requires_grad_() for name, _ in net.trainable_weights()]
+    net = Network.from_named_weights(net.architecture, weights)
     losses = objective(net, frames, known, generator)
     bars = torch.autograd.grad(losses.total, learned, materialize_grads=True)
     return Losses(*(term.detach() for term in losses)), joined(bars)

@@ -68,7 +68,7 @@ class Trainer:
             initial = dataclasses.replace(initial, L=L, L_inverse=L_inverse)
         self.initial = initial.map(lambda w: torch.from_numpy(w).to(device))
         # All weights in one tensor: Adam costs a tenth of a step on one, a fifth on fifty.
-        self.weights = joined(w for _, w in self.initial.learned())
+        self.weights = joined(w for _, w in self.initial.trainable_weights())
         self.net = self._views()
         self.optimiser = torch.optim.Adam([self.weights], lr=recipe.learning_rate, fused=True)
         self.objective = Objective(normaliser, recipe, layout_loss=layout_loss)
@@ -81,11 +81,11 @@ class Trainer:
 
     def _views(self) -> Network:
         """Return the network; what is learned in it are views of `weights`."""
-        learned = dict(self.initial.learned())
+        learned = dict(self.initial.trainable_weights())
         parts = torch.split(self.weights, [w.numel() for w in learned.values()])
         views = (part.view(w.shape) for part, w in zip(parts, learned.values(), strict=True))
-        weights = dict(self.initial.named()) | dict(zip(learned, views, strict=True))
-        return Network.from_named(self.initial.architecture, weights)
+        weights = dict(self.initial.named_weights()) | dict(zip(learned, views, strict=True))
+        return Network.from_named_weights(self.initial.architecture, weights)
 
     @property
     def progress(self) -> float:

@@ -66,7 +66,7 @@ def count_steps(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], list[int]]:
 
 
 def same(a: Model, b: Model) -> bool:
-    pairs = zip(a.network.named(), b.network.named(), strict=True)
+    pairs = zip(a.network.named_weights(), b.network.named_weights(), strict=True)
     return all(np.array_equal(x, y) for (_, x), (_, y) in pairs)
 
 

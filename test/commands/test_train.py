@@ -198,7 +198,7 @@ def test_resume_goes_on_where_it_was_cancelled(
 ) -> None:
     words = [*arguments, "--steps", "12", "--seeds", "1"]
     assert in_process(*words) == 0
-    whole = dict(load_model(models / "mine.safetensors").network.named())
+    whole = dict(load_model(models / "mine.safetensors").network.named_weights())
     with monkeypatch.context() as cancelled:
         cancelled.setattr(train, "stop_on_signals", stop_after(1 + 5))  # once after reading
         assert in_process(*words) == 0
@@ -208,7 +208,7 @@ def test_resume_goes_on_where_it_was_cancelled(
     monkeypatch.setattr(Trainer, "advance", lambda t: (taken.append(t.step), advance(t)))
     assert in_process(*words, "--resume") == 0
     assert taken == list(range(5, 12))
-    for name, weight in load_model(models / "mine.safetensors").network.named():
+    for name, weight in load_model(models / "mine.safetensors").network.named_weights():
         np.testing.assert_array_equal(weight, whole[name])
     assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
 
@@ -367,7 +367,7 @@ def test_the_ground_truth_is_not_read(
         found.append(load_model(models / "mine.safetensors"))
     assert found[0].quality == found[1].quality
     np.testing.assert_array_equal(found[0].object_frame, found[1].object_frame)
-    pairs = zip(found[0].network.named(), found[1].network.named(), strict=True)
+    pairs = zip(found[0].network.named_weights(), found[1].network.named_weights(), strict=True)
     for (name, a), (_, b) in pairs:
         np.testing.assert_array_equal(a, b, err_msg=name)
 
@@ -439,7 +439,9 @@ def test_it_goes_on_from_another_model(
     same = load_model(models / "same.safetensors")
     assert same.layout == first.layout == HUMAN17
     assert same.provenance["from"]["model"] == "mine"
-    for (name, a), (_, b) in zip(same.network.named(), first.network.named(), strict=True):
+    for (name, a), (_, b) in zip(
+        same.network.named_weights(), first.network.named_weights(), strict=True
+    ):
         np.testing.assert_allclose(a, b, atol=1e-6, err_msg=name)
     capsys.readouterr()
     assert in_process(*still, "--name", "other", "--object", "coco17") == 0

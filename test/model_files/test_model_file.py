@@ -69,7 +69,9 @@ def test_round_trip(tmp_path: Path, layout: KeypointLayout, widths: tuple[int, .
         assert getattr(loaded, field) == getattr(saved, field)
     assert loaded.network.architecture == saved.network.architecture
     np.testing.assert_array_equal(loaded.object_frame, saved.object_frame)
-    for (name, a), (again, b) in zip(loaded.network.named(), saved.network.named(), strict=True):
+    for (name, a), (again, b) in zip(
+        loaded.network.named_weights(), saved.network.named_weights(), strict=True
+    ):
         assert name == again and a.dtype == b.dtype == np.float32
         np.testing.assert_array_equal(a, b)
     assert [f.name for f in (tmp_path / "models").iterdir()] == ["m.safetensors"]
@@ -120,7 +122,7 @@ def test_overwritten_bytes_raise_nothing_else(
     except ModelFileError as error:
         assert str(file) in str(error)
     else:
-        assert all(np.isfinite(w).all() for _, w in loaded.network.named())
+        assert all(np.isfinite(w).all() for _, w in loaded.network.named_weights())
 
 
 def model_bytes(file: Path) -> bytes:
@@ -243,7 +245,7 @@ def test_metadata_are_checked(file: Path) -> None:
     save_model(file, model())
     rewrite(file, lambda header, weights, metadata: header.clear())
     assert "damaged header" in refused(file)
-    weights = dict(model().network.named())
+    weights = dict(model().network.named_weights())
     save_file(weights, file)
     assert "deep_nrsfm_ros model 2" in refused(file)
     for text in ("", "{", "[]", "3", "[" * 100_000):

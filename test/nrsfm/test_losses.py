@@ -172,7 +172,7 @@ def test_the_gradient_reaches_every_weight(threshold: str, recovery: str) -> Non
     recipe = Recipe(noise=0.1, mask=0.3)
     Objective(Normaliser(), recipe)(net, frames, None, torch.Generator()).total.backward()
     heads = {"code_head", "camera_head"} if recovery == "closed_form" else set()
-    for name, weight in net.learned():
+    for name, weight in net.trainable_weights():
         if name in heads:
             assert weight.grad is None
         else:
@@ -205,5 +205,5 @@ def test_a_frame_with_nothing_to_see_gives_no_gradient(visible: int) -> None:
     losses = Objective(Normaliser(), PLAIN)(net, frames, None, torch.Generator())
     losses.total.backward()
     assert torch.isfinite(losses.total)
-    for _, weight in net.learned():
+    for _, weight in net.trainable_weights():
         assert weight.grad is None or not weight.grad.any()

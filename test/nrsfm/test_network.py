@@ -264,7 +264,7 @@ def test_initialise_makes_every_weight(
     architecture = Architecture(widths)
     rng = np.random.default_rng(0)
     weights = dict(
-        initialise(architecture, p, rng, paper_initialisation=paper_initialisation).named()
+        initialise(architecture, p, rng, paper_initialisation=paper_initialisation).named_weights()
     )
     assert {name: w.shape for name, w in weights.items()} == weight_shapes(architecture, p)
     for name, weight in weights.items():
@@ -276,7 +276,7 @@ def test_initialise_makes_every_weight(
     again = initialise(
         architecture, p, np.random.default_rng(0), paper_initialisation=paper_initialisation
     )
-    assert all(np.array_equal(w, weights[name]) for name, w in again.named())
+    assert all(np.array_equal(w, weights[name]) for name, w in again.named_weights())
 
 
 @pytest.mark.parametrize(
@@ -294,7 +294,7 @@ def test_glorot_takes_the_fans_of_what_a_weight_is_applied_as(
     weights = dict(
         initialise(
             Architecture((50, 40)), 30, rng, paper_initialisation=paper_initialisation
-        ).named()
+        ).named_weights()
     )
     for name, fan in fans.items():
         limit = (6 / fan) ** 0.5
@@ -304,12 +304,14 @@ def test_glorot_takes_the_fans_of_what_a_weight_is_applied_as(
 
 def test_a_network_survives_its_names() -> None:
     net = random_network(Architecture((4, 3)), 5)
-    again = Network.from_named(net.architecture, dict(net.named()))
-    assert all(a is b for (_, a), (_, b) in zip(net.named(), again.named(), strict=True))
-    weights = dict(net.named())
+    again = Network.from_named_weights(net.architecture, dict(net.named_weights()))
+    assert all(
+        a is b for (_, a), (_, b) in zip(net.named_weights(), again.named_weights(), strict=True)
+    )
+    weights = dict(net.named_weights())
     del weights["b_.1"]
     with pytest.raises(KeyError, match=r"b_\.1"):
-        Network.from_named(net.architecture, weights)
+        Network.from_named_weights(net.architecture, weights)
 
 
 def test_a_network_has_a_dictionary() -> None:
@@ -360,7 +362,10 @@ def test_whitening_of_centred_points_is_finite() -> None:
 
 def test_training_learns_everything_but_the_whitening() -> None:
     net = random_network(Architecture((4, 3)), 5)
-    assert {n for n, _ in net.named()} - {n for n, _ in net.learned()} == {"L", "L_inverse"}
+    assert {n for n, _ in net.named_weights()} - {n for n, _ in net.trainable_weights()} == {
+        "L",
+        "L_inverse",
+    }
 
 
 @some

@@ -87,7 +87,7 @@ def test_it_is_what_torch_finds(
     objective = Objective(Normaliser(), Recipe(cycle=cycle))
     torch.set_num_threads(at_once)
     assert fits(objective, net)
-    weights = gradient.joined(w for _, w in net.learned())
+    weights = gradient.joined(w for _, w in net.trainable_weights())
     losses, found = CompiledGradient(objective, net, frames[0])(weights, task)
     expected, exact = written_out(objective, *in_double(net, task))
     size = torch.linalg.svdvals((encode(net, task.x)[-1] @ net.camera_head)[..., 0])
@@ -137,7 +137,9 @@ def test_a_training_goes_the_same_way_without(
     monkeypatch.setattr(kernel, "AVAILABLE", False)
     theirs = trained()
     assert len(asked) == 6
-    moved = (theirs.weights - gradient.joined(w for _, w in theirs.initial.learned())).norm()
+    moved = (
+        theirs.weights - gradient.joined(w for _, w in theirs.initial.trainable_weights())
+    ).norm()
     assert (ours.weights - theirs.weights).norm() < 0.02 * moved
 
 
@@ -168,7 +170,7 @@ def test_torch_has_its_threads_again() -> None:
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
     net, objective = network((8, 4), 5, 1.0, 0), Objective(Normaliser(), Recipe())
-    weights = gradient.joined(w for _, w in net.learned())
+    weights = gradient.joined(w for _, w in net.trainable_weights())
     compiled_gradient, task = CompiledGradient(objective, net, 3), random_task(5, 3, 2, 0.0, 0)
     for given_weights, given_task in (
         (weights[1:], task),
@@ -200,9 +202,9 @@ def test_what_is_no_number_shows_and_is_gone_with_its_cause(
 ) -> None:
     net, objective = network((8, 4), 5, exponent, 0), Objective(Normaliser(), Recipe())
     gradient_of, task = CompiledGradient(objective, net, 3), random_task(5, 3, 2, 0.0, 0)
-    weights, nan = gradient.joined(w for _, w in net.learned()), float("nan")
+    weights, nan = gradient.joined(w for _, w in net.trainable_weights()), float("nan")
     before, grad = gradient_of(weights, task)
-    parts = {key: w * nan if key == name else w for key, w in net.learned()}
+    parts = {key: w * nan if key == name else w for key, w in net.trainable_weights()}
     seen = task._replace(x=task.x * nan, W=task.W * nan) if name == "input" else task
     losses, _ = gradient_of(gradient.joined(parts.values()), seen)
     assert losses.total.isnan()

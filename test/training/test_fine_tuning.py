@@ -62,7 +62,9 @@ def test_with_the_same_keypoints_it_starts_as_good_as_its_source(
     source: Model, figure: Any, stretched: np.ndarray
 ) -> None:
     start = tuned(source, figure.layout, stretched, steps=0)
-    for (name, weight), (_, old) in zip(start.net.named(), source.network.named(), strict=True):
+    for (name, weight), (_, old) in zip(
+        start.net.named_weights(), source.network.named_weights(), strict=True
+    ):
         np.testing.assert_array_equal(weight.numpy(), old, err_msg=name)
     on_new_data = Trainer(start.frames, start.preset, 0, source.network)
     assert start.measure() == on_new_data.measure()

@@ -26,9 +26,9 @@ def tensors(architecture: Architecture, p: int, seed: int) -> Network:
     net = initialise(architecture, p, rng, paper_initialisation=True)
     Q, _ = np.linalg.qr(rng.standard_normal((p, p)))
     L = torch.from_numpy((Q * rng.uniform(0.2, 2, p)) @ Q.T)
-    weights = {name: torch.from_numpy(w.astype(float)) for name, w in net.named()}
+    weights = {name: torch.from_numpy(w.astype(float)) for name, w in net.named_weights()}
     weights |= {"L": L, "L_inverse": torch.linalg.inv(L)}
-    return Network.from_named(architecture, weights)
+    return Network.from_named_weights(architecture, weights)
 
 
 def task(p: int, seed: int) -> tuple[Frames, torch.Tensor]:
@@ -45,7 +45,7 @@ def task(p: int, seed: int) -> tuple[Frames, torch.Tensor]:
 
 def parts(net: Network, gradient: torch.Tensor) -> list[torch.Tensor]:
     """Return the gradient by each weight, in its shape."""
-    weights = [weight for _, weight in net.learned()]
+    weights = [weight for _, weight in net.trainable_weights()]
     bars = gradient.split([weight.numel() for weight in weights])
     return [bar.view(weight.shape) for bar, weight in zip(bars, weights, strict=True)]
 
@@ -96,7 +96,7 @@ def test_it_is_the_gradient_that_torch_finds(
         torch.set_default_dtype(torch.float32)
     for ours, theirs in zip(losses, expected, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
-    bars = zip(net.learned(), parts(net, gradient), parts(net, by_torch), strict=True)
+    bars = zip(net.trainable_weights(), parts(net, gradient), parts(net, by_torch), strict=True)
     for (name, weight), ours, theirs in bars:
         assert ours.shape == weight.shape
         torch.testing.assert_close(ours, theirs, rtol=1e-7, atol=1e-7, msg=name)
@@ -113,7 +113,7 @@ def test_every_option_has_a_gradient() -> None:
         expected = objective(net, frames, known, torch.Generator())
         torch.testing.assert_close(losses.total, expected.total)
         heads = {"code_head", "camera_head"} if "closed_form" in options else set()
-        for (name, weight), bar in zip(net.learned(), parts(net, gradient), strict=True):
+        for (name, weight), bar in zip(net.trainable_weights(), parts(net, gradient), strict=True):
             assert bar.shape == weight.shape and bool(bar.any()) == (name not in heads), name
             assert not weight.requires_grad
 

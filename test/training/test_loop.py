@@ -52,7 +52,7 @@ def stop_after(steps: int) -> Any:
 
 
 def weights(trainer: Trainer) -> dict[str, np.ndarray]:
-    return {name: w.numpy().copy() for name, w in trainer.net.named()}
+    return {name: w.numpy().copy() for name, w in trainer.net.named_weights()}
 
 
 def assert_same(a: Trainer, b: Trainer) -> None:
