@@ -1,6 +1,6 @@
-"""The camera's intrinsics: from pixels to the rays on which the points lie, and back.
+"""Intrinsics of a camera: from pixels to rays and back.
 
-Lens models are those of sensor_msgs/CameraInfo, as OpenCV defines them.
+Source: the lens models of sensor_msgs/CameraInfo, as OpenCV defines them.
 """
 
 from __future__ import annotations
@@ -17,21 +17,26 @@ PLUMB_BOB = "plumb_bob"
 RATIONAL = "rational_polynomial"
 EQUIDISTANT = "equidistant"
 COEFFICIENTS = {PLUMB_BOB: (0, 4, 5), RATIONAL: (0, 4, 5, 8), EQUIDISTANT: (0, 4)}
-"""How many coefficients each lens model may have; the others are 0."""
+"""Numbers of coefficients that each lens model may have; those left out are 0."""
 
-_STEPS = 20  # of Newton's method; five do for a usual lens, a fisheye's border takes more
-_EXACT = 1e-9  # distance in the image plane below which a point counts as met
+_MAX_STEPS = 20  # of Newton's method; a usual lens takes 5, the border of a fisheye more
+_TOLERANCE = 1e-9  # last step in the plane z = 1, or in radians, of a search that has converged
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole with a lens.
+    """A pinhole camera with lens distortion.
 
-    focal: focal lengths (fx, fy) and principal: principal point (cx, cy), in pixels.
-    distortion: k1 k2 p1 p2 [k3 [k4 k5 k6]] of `plumb_bob` and `rational_polynomial`, k1 k2 k3 k4
-        of `equidistant` (fisheye).
-    lens: one of `COEFFICIENTS`.
-    Raises ValueError for another lens, and for numbers that no camera has.
+    Attributes:
+        focal: focal lengths (fx, fy) in pixels, above 0.
+        principal: principal point (cx, cy) in pixels.
+        distortion: k1 k2 p1 p2 [k3 [k4 k5 k6]] of `plumb_bob` and `rational_polynomial`,
+            k1 k2 k3 k4 of `equidistant` (fisheye); (): no distortion.
+        lens: one of `COEFFICIENTS`.
+
+    Raises:
+        ValueError: unknown lens, wrong number of coefficients, a number that is not finite, or a
+            focal length that is not above 0.
     """
 
     focal: tuple[float, float]
@@ -40,7 +45,7 @@ class Intrinsics:
     lens: str = PLUMB_BOB
 
     def __post_init__(self) -> None:
-        """Refuse what is no camera."""
+        """Check the numbers."""
         if self.lens not in COEFFICIENTS:
             raise ValueError(f"lens is {self.lens!r}; choose one of {', '.join(COEFFICIENTS)}")
         if len(self.distortion) not in COEFFICIENTS[self.lens]:
@@ -54,34 +59,43 @@ class Intrinsics:
             raise ValueError(f"focal length is {min(self.focal)}; it must be above 0 pixels")
 
     def rays(self, pixels: NDArray[np.floating]) -> Array:
-        """Return where the rays of pixels (..., 2) meet the plane z = 1 of the optical frame.
+        """Return the intersections (..., 2) of the pixels' rays with the plane z = 1.
 
-        (..., 2): x right, y down; NaN where no ray in front of the camera leads to the pixel.
+        The axes are those of the optical frame, x right and y down. NaN where no ray in front of
+        the camera reaches the pixel.
+
+        Args:
+            pixels: (..., 2).
         """
-        bent = (np.asarray(pixels, np.float64) - self.principal) / self.focal
+        distorted = (np.asarray(pixels, np.float64) - self.principal) / self.focal
         if self.lens != EQUIDISTANT and not any(self.distortion):
-            return bent
-        # With coefficients that no lens has the search may go to infinity, and ends in NaN.
+            return distorted
+        # With coefficients that no lens has, the search may diverge and end in NaN.
         with np.errstate(over="ignore", invalid="ignore"):
-            return (self._unbend_fisheye if self.lens == EQUIDISTANT else self._unbend)(bent)
+            undistort = self._undistort_fisheye if self.lens == EQUIDISTANT else self._undistort
+            return undistort(distorted)
 
     def pixels(self, rays: NDArray[np.floating]) -> Array:
-        """Return the pixels (..., 2) of rays through (x, y, 1): the inverse of `rays`."""
+        """Return the pixels (..., 2) of the rays through (x, y, 1); the inverse of `rays`.
+
+        Args:
+            rays: (..., 2) x and y on the plane z = 1.
+        """
         plane = np.asarray(rays, np.float64)
         if self.lens == EQUIDISTANT:
             radius = np.linalg.norm(plane, axis=-1, keepdims=True)
-            bent = plane * _ratio(self._angle(np.arctan(radius))[0], radius)
+            distorted = plane * _ratio(self._fisheye_distance(np.arctan(radius))[0], radius)
         else:
-            bent = self._bend(plane)[0] if any(self.distortion) else plane
-        pixels: Array = bent * self.focal + self.principal
+            distorted = self._distort(plane)[0] if any(self.distortion) else plane
+        pixels: Array = distorted * self.focal + self.principal
         return pixels
 
     def without_lens(self) -> Intrinsics:
-        """Return the pinhole alone."""
+        """Return the same camera without distortion."""
         return replace(self, distortion=(), lens=PLUMB_BOB)
 
-    def _bend(self, plane: Array) -> tuple[Array, Array]:
-        """Return plane (..., 2) as the lens bends it, and the derivative: xx, xy = yx, yy (..., 3).
+    def _distort(self, plane: Array) -> tuple[Array, Array]:
+        """Return distorted points (..., 2) and the derivative xx, xy = yx, yy (..., 3).
 
         x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + 2 p1 x y
         + p2 (r^2 + 2 x^2), and y with x and y, p1 and p2 exchanged.
@@ -89,11 +103,12 @@ class Intrinsics:
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
         x, y = plane[..., 0], plane[..., 1]
         r2 = x * x + y * y
-        above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = above / below
+        numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = numerator / denominator
         slope = k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))
-        slope = 2 * slope / below  # 2 d radial / d r^2
-        bent = (
+        slope = 2 * slope / denominator  # 2 d radial / d r^2
+        distorted = (
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
             y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
         )
@@ -102,28 +117,28 @@ class Intrinsics:
             x * y * slope + 2 * p1 * x + 2 * p2 * y,
             radial + y * y * slope + 6 * p1 * y + 2 * p2 * x,
         )
-        return np.stack(bent, -1), np.stack(derivative, -1)
+        return np.stack(distorted, -1), np.stack(derivative, -1)
 
-    def _unbend(self, bent: Array) -> Array:
-        """Return what `_bend` takes to bent (..., 2), by Newton's method from there."""
-        plane = bent
-        for _ in range(_STEPS):
-            reached, derivative = self._bend(plane)
+    def _undistort(self, distorted: Array) -> Array:
+        """Return the points (..., 2) that `_distort` takes to `distorted`, by Newton's method."""
+        plane = distorted
+        for _ in range(_MAX_STEPS):
+            reached, derivative = self._distort(plane)
             a, b, d = np.moveaxis(derivative, -1, 0)
             determinant = a * d - b * b
-            u, v = np.moveaxis(bent - reached, -1, 0)
-            # Where the lens folds the image over there is no ray; NaN goes through to the end.
+            u, v = np.moveaxis(distorted - reached, -1, 0)
+            # Where the lens folds the image there is no ray; NaN persists to the last step.
             determinant = np.where((determinant > 0) & (a + d > 0), determinant, np.nan)
             step = np.stack((d * u - b * v, a * v - b * u), -1) / determinant[..., None]
             plane = plane + step
-            if not (np.abs(step) > _EXACT).any():
+            if not (np.abs(step) > _TOLERANCE).any():
                 break
-        met = np.abs(step).max(-1, keepdims=True) <= _EXACT
-        unbent: Array = np.where(met, plane, np.nan)
-        return unbent
+        converged = np.abs(step).max(-1, keepdims=True) <= _TOLERANCE
+        undistorted: Array = np.where(converged, plane, np.nan)
+        return undistorted
 
-    def _angle(self, theta: Array) -> tuple[Array, Array]:
-        """Return the distance from the centre of a fisheye's image at angle theta, and its slope.
+    def _fisheye_distance(self, theta: Array) -> tuple[Array, Array]:
+        """Return the distance from a fisheye image's centre at angle theta, and its derivative.
 
         theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
         """
@@ -133,22 +148,22 @@ class Intrinsics:
         slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
         return distance, slope
 
-    def _unbend_fisheye(self, bent: Array) -> Array:
-        """Return where the rays of a fisheye's image (..., 2) meet the plane z = 1."""
-        radius = np.linalg.norm(bent, axis=-1, keepdims=True)
+    def _undistort_fisheye(self, distorted: Array) -> Array:
+        """Return the points (..., 2) of the plane z = 1 that a fisheye takes to `distorted`."""
+        radius = np.linalg.norm(distorted, axis=-1, keepdims=True)
         theta = radius
-        for _ in range(_STEPS):
-            distance, slope = self._angle(theta)
+        for _ in range(_MAX_STEPS):
+            distance, slope = self._fisheye_distance(theta)
             step = (radius - distance) / np.where(slope > 0, slope, np.nan)
             theta = theta + step
-            if not (np.abs(step) > _EXACT).any():
+            if not (np.abs(step) > _TOLERANCE).any():
                 break
-        seen = (np.abs(step) <= _EXACT) & (theta < np.pi / 2)
-        plane: Array = bent * _ratio(np.tan(np.where(seen, theta, np.nan)), radius)
+        converged = (np.abs(step) <= _TOLERANCE) & (theta < np.pi / 2)
+        plane: Array = distorted * _ratio(np.tan(np.where(converged, theta, np.nan)), radius)
         return plane
 
 
 def _ratio(a: Array, b: Array) -> Array:
-    """Return a / b, and 1 where both go to zero together."""
-    near = b < 1e-12
-    return np.where(near & ~np.isnan(a), 1.0, a / np.where(near, 1.0, b))
+    """Return a / b, and its limit 1 where both are near zero."""
+    is_zero = b < 1e-12
+    return np.where(is_zero & ~np.isnan(a), 1.0, a / np.where(is_zero, 1.0, b))

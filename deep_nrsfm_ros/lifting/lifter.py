@@ -1,4 +1,4 @@
-"""Lifting: 2D keypoints of n objects to 3D shapes and camera rotations, without torch."""
+"""Lift the 2D keypoints of n objects to 3D shapes and camera rotations; needs no torch."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
 from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.model_files.model_file import Model
 
-_BLOCK = 64  # objects lifted together by `lift_all`
+_BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
 
 
 @dataclass(frozen=True)
@@ -25,89 +25,123 @@ class LiftingOptions:
 
     correction: str = option(
         "bones",
-        "how the shape is moved after the network: by what the keypoints show, what the model has "
-        "learned of its own errors, depth included, and how long the bones of the layout are; by "
-        "the same without the bones; by back-projection, within the image plane; or not at all",
+        "how the lifted shape is corrected by the keypoints, depth included: bones = by the error "
+        "covariance that the model has learned and by the lengths of bones (most accurate); "
+        "learned = by the error covariance alone; back_projection = within the image plane; none",
         choices=("bones", "learned", "back_projection", "none"),
     )
     noise: float = option(
         0.02,
-        "noise of the keypoints, relative to the size of the object in the image: how far the "
-        "corrected shape may stay from them; 0 meets them exactly and magnifies their noise",
+        "standard deviation of the keypoints, relative to the size of the object in the image: how "
+        "far the corrected shape may stay from them; 0 = meets them exactly and amplifies their "
+        "noise, 0.02 typical, 0.1 strong",
         low=0.0,
         high=1.0,
     )
     refill: int = option(
-        2, "rounds of filling missing points with those of the lifted shape", low=0, high=50
+        2,
+        "rounds in which missing keypoints are filled with those of the lifted shape and the "
+        "object is lifted again; 0 = off, 2 typical; each round takes as long as the first lift, "
+        "and messages without missing keypoints need none",
+        low=0,
+        high=50,
     )
     test_time_rotations: int = option(
         3,
-        "turns of the input within the image plane of which the lifted shapes are averaged, each "
-        "by its residual: they are not lifted exactly alike, but those a quarter apart nearly are",
+        "in-plane rotations of the input, lifted and averaged by reprojection error (test-time "
+        "augmentation); 1 = off, 3 typical; time rises with the number",
         low=1,
         high=64,
     )
     mirror: bool = option(
         False,
-        "lift the mirror image as well and average, where the layout has a handedness and left_ "
-        "and right_ of some keypoints: a little more accurate on average, at twice the time and "
-        "with a mirrored frame now and then",
+        "whether the mirror image is lifted and averaged as well: slightly more accurate on "
+        "average, at twice the time and with an occasional mirrored frame; needs a layout with "
+        "handedness and with pairs of left_ and right_ keypoints",
     )
     min_visible: int = option(
-        4, "objects with fewer visible keypoints are not lifted", low=3, high=1000
+        4,
+        "fewest visible keypoints with which an object is lifted; 4 typical",
+        low=3,
+        high=1000,
     )
     reference_length: float = option(
         0.0,
-        "length of the layout's reference pair (of people: neck to mid-hip) in the output; about "
-        "0.5 makes the points of an adult metres. Layouts without one: RMS radius of the shape. "
-        "0: the length in metres that the model's layout file gave, or 1 if it gave none",
+        "length in the output of the layout's reference pair (of people: neck to mid-hip), or of "
+        "the RMS radius if the layout has no pair; 0.5 gives metres for an adult; 0 = the length "
+        "in metres from the model's layout file, or 1 if it has none",
         low=0.0,
         high=1e6,
     )
 
 
 class Lifted(NamedTuple):
-    """n lifted objects; NaN with confidence 0 where there is nothing to lift.
+    """n lifted objects with p keypoints each.
 
-    That is: too few visible points, or points on one line, which say nothing about the camera.
+    An object that cannot be lifted has confidence 0 and is NaN otherwise: it has too few visible
+    keypoints, or they lie on one line, which does not determine a camera.
+
+    Attributes:
+        shapes: (n, p, 3) camera axes (x right, y down, z forward), in units of the reference
+            length; centred, or at the object's position where the camera's intrinsics are known.
+        rotations: (n, 3, 3) from object to camera axes, p_camera = R p_object, det +1.
+        scale: (n,) pixels per unit of `shapes`.
+        translation: (n, 2) projection of the shape's origin in the image, in pixels.
+        residual: (n,) reprojection error of the network before the correction, relative to the
+            size of the keypoints; 0 = perfect, below 0.1 typical, above 0.3 poor.
+        confidence: (n, p) probability in [0, 1] that the point is close to its true position.
     """
 
-    shapes: Float32  # (n, p, 3) camera axes (x right, y down, z forward), centred, output units
-    rotations: Float32  # (n, 3, 3) object to camera: p_camera = R p_object, det +1
-    scale: Float32  # (n,) pixels per output unit
-    translation: Float32  # (n, 2) where the shape's centre is in the image
-    residual: Float32  # (n,) relative reprojection error of the network, before correction
-    confidence: Float32  # (n, p) chance that the point is near its true place, see `confidence`
+    shapes: Float32
+    rotations: Float32
+    scale: Float32
+    translation: Float32
+    residual: Float32
+    confidence: Float32
 
     @property
     def object_confidence(self) -> Float32:
-        """The share (n,) of each object's points to be expected near their true places."""
-        share: Float32 = self.confidence.mean(1)
-        return share
+        """The mean confidence (n,) of each object's points."""
+        mean: Float32 = self.confidence.mean(1)
+        return mean
 
 
 class Lifter:
-    """A model ready to lift."""
+    """Lifts 2D keypoints with a model; needs NumPy, not torch.
+
+    Attributes:
+        model: the model.
+        options: how it lifts.
+        constants: both in the form that a backend computes with.
+        backend: the kernel if it supports the network, else NumPy.
+    """
 
     def __init__(self, model: Model, options: LiftingOptions | None = None) -> None:
-        """Take the model with `options` (all defaults if None)."""
+        """Prepare a backend for the model.
+
+        Args:
+            model: weights, layout and error statistics.
+            options: None: all defaults.
+        """
         self.model = model
         self.options = options or LiftingOptions()
         self.constants = _constants(model, self.options)
-        self.backend = (
-            CompiledBackend(self.constants)
-            if supports(model.network)
-            else NumpyBackend(self.constants)
-        )
+        backend = CompiledBackend if supports(model.network) else NumpyBackend
+        self.backend = backend(self.constants)
 
     def __call__(
         self, points: Float32, confidence: Float32, *, perspective: bool = False
     ) -> Lifted:
-        """Lift keypoints (n, p, 2) of confidence (n, p), 0 = missing, in the model's layout.
+        """Lift the keypoints of n objects.
 
-        perspective: the points are where rays meet the plane z = 1 of a camera that looks at the
-        object (see `placement`), and the correction moves each along its own ray or across it.
-        Raises ValueError if the shapes do not fit the model.
+        Args:
+            points: (n, p, 2) in the model's layout, x right and y down, in pixels.
+            confidence: (n, p) in [0, 1], 0 = missing.
+            perspective: whether the points are on the plane z = 1 of a camera that looks at the
+                object (see `perspective.virtual_views`); the correction uses the ray of each point.
+
+        Raises:
+            ValueError: the shapes of the arrays do not fit the model.
         """
         p = len(self.model.layout)
         if points.shape[1:] != (p, 2) or confidence.shape != points.shape[:2]:
@@ -115,36 +149,37 @@ class Lifter:
                 f"points are {points.shape} and confidence {confidence.shape}; "
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
-        arrays, lost = self.backend(points, confidence, perspective)
+        arrays, not_lifted = self.backend(points, confidence, perspective)
         lifted = Lifted(*arrays)
-        return mark_not_lifted(lifted, lost) if lost.any() else lifted
+        return mark_not_lifted(lifted, not_lifted) if not_lifted.any() else lifted
 
 
 def _constants(model: Model, options: LiftingOptions) -> LifterConstants:
+    """Return model and options in the form that a backend computes with."""
     p = len(model.layout)
     angles = 2 * np.pi * np.arange(options.test_time_rotations) / options.test_time_rotations
     c, s = np.cos(angles), np.sin(angles)
     covariance = None
     if options.correction in ("bones", "learned"):
-        turn = np.kron(np.eye(p), model.object_frame)
-        covariance = turn.T @ model.error_covariance @ turn
+        to_object = np.kron(np.eye(p), model.object_frame)
+        covariance = to_object.T @ model.error_covariance @ to_object
     elif options.correction == "back_projection":
         covariance = np.eye(3 * p)
     pair = model.layout.reference
     return LifterConstants(
-        model.network,
-        model.normaliser,
-        model.object_frame,
-        np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy(),
-        model.layout.partners() if options.mirror else None,
-        covariance,
-        model.bones if options.correction == "bones" else None,
-        np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1)),
-        options.noise,
-        options.refill,
-        options.reference_length or model.layout.reference_length or 1.0,
-        pair and (model.layout.index(pair[0]), model.layout.index(pair[1])),
-        options.min_visible,
+        network=model.network,
+        normaliser=model.normaliser,
+        object_frame=model.object_frame,
+        test_time_rotations=np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy(),
+        partners=model.layout.partners() if options.mirror else None,
+        covariance=covariance,
+        bones=model.bones if options.correction == "bones" else None,
+        error_std=np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1)),
+        noise=options.noise,
+        refill=options.refill,
+        reference_length=options.reference_length or model.layout.reference_length or 1.0,
+        reference=pair and (model.layout.index(pair[0]), model.layout.index(pair[1])),
+        min_visible=options.min_visible,
     )
 
 
@@ -154,9 +189,13 @@ def lift_all(
     confidence: Float32,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Lifted:
-    """Lift any number of objects, a few at a time: many at once leave the processor's cache.
+    """Lift any number of objects, in slices of at most 64 to stay in cache.
 
-    on_progress: called with how many are done and how many there are.
+    Args:
+        lifter: a `Lifter`, or a function of the same two arrays.
+        points: (n, p, 2) as in `Lifter.__call__`.
+        confidence: (n, p) as in `Lifter.__call__`.
+        on_progress: called after each slice with the number of lifted objects and n.
     """
     parts = []
     for part in slices(len(points), _BLOCK) or [slice(0)]:
@@ -165,9 +204,9 @@ def lift_all(
     return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def mark_not_lifted(lifted: Lifted, where: NDArray[np.bool_]) -> Lifted:
-    """Return `lifted` with the chosen objects NaN and their confidence 0."""
+def mark_not_lifted(lifted: Lifted, not_lifted: NDArray[np.bool_]) -> Lifted:
+    """Set the chosen objects (n,) to NaN and their confidence to 0, in place; return `lifted`."""
     for array in lifted:
-        array[where] = np.nan
-    lifted.confidence[where] = 0
+        array[not_lifted] = np.nan
+    lifted.confidence[not_lifted] = 0
     return lifted

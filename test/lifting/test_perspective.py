@@ -118,7 +118,7 @@ def test_pixels_without_a_ray_are_missing() -> None:
     np.testing.assert_array_equal(views.confidence, [[1, 1, 0, 1]])
     assert np.isfinite(views.points).all()
     nothing = virtual_views(fisheye, points[:, 2:3], np.ones((1, 1), np.float32))
-    np.testing.assert_array_equal(nothing.turns, np.eye(3)[None])
+    np.testing.assert_array_equal(nothing.rotations, np.eye(3)[None])
 
 
 def test_what_cannot_be_lifted_is_nan_and_touches_nothing(
