@@ -1,7 +1,7 @@
-"""Options: typed dataclass fields that carry their own description and range.
+"""Options: fields of frozen dataclasses with a description and a range.
 
-One declaration serves every way in: the field is a Python default, a command-line option
-(`add_arguments`) and, in the node, a declared ROS parameter with descriptor (`node.parameters`).
+Each option is declared once. It is a Python default, a command-line option (`add_arguments`) and,
+in the node, a ROS parameter with a descriptor (`node.parameters`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,14 @@ Config = TypeVar("Config")
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """What an option means and allows; `low` and `high` are inclusive, None is unbounded.
+    """The description and the allowed values of an option.
 
-    A `read_only` option cannot change while a node runs.
+    Attributes:
+        description: one sentence with unit, meaning of the range and typical value.
+        low: least value, inclusive; None = unbounded.
+        high: largest value, inclusive; None = unbounded.
+        choices: the allowed values; empty = any.
+        read_only: the value cannot change while a node runs.
     """
 
     description: str
@@ -28,7 +33,12 @@ class Option:
     read_only: bool = False
 
     def check(self, name: str, value: Any) -> None:
-        """Raise ValueError that names the option, the value and what is allowed."""
+        """Raise ValueError if a value, or an element of a tuple, is not allowed.
+
+        Args:
+            name: name of the option, for the error message.
+            value: a value, or a tuple or list of them.
+        """
         values = value if isinstance(value, (tuple, list)) else (value,)
         for item in values:
             if self.choices and item not in self.choices:
@@ -39,7 +49,7 @@ class Option:
                 raise ValueError(f"{name} is {item!r}; it must be {self.allowed()}")
 
     def allowed(self) -> str:
-        """Return the range in words, e.g. "at least 0 and at most 1"."""
+        """Return the range in words, e.g. "at least 0 and at most 1"; "" if unbounded."""
         bounds = (("at least", self.low), ("at most", self.high))
         return " and ".join(f"{word} {bound:g}" for word, bound in bounds if bound is not None)
 
@@ -53,14 +63,14 @@ def option(
     choices: tuple[str, ...] = (),
     read_only: bool = False,
 ) -> Any:
-    """Return a dataclass field with its description, range and choices attached."""
+    """Return a dataclass field with an `Option` in its metadata; see there for the arguments."""
     return dataclasses.field(
         default=default, metadata={"option": Option(description, low, high, choices, read_only)}
     )
 
 
 def options(cls: type) -> list[tuple[dataclasses.Field[Any], Any, Option]]:
-    """Return (field, resolved type, option) for every field declared with `option`."""
+    """Return (field, its type, its option) for every field of `cls` declared with `option`."""
     hints = get_type_hints(cls)
     return [
         (field, hints[field.name], field.metadata["option"])
@@ -70,16 +80,20 @@ def options(cls: type) -> list[tuple[dataclasses.Field[Any], Any, Option]]:
 
 
 def check(config: Any) -> None:
-    """Raise ValueError for the first option of `config` outside its range."""
+    """Raise ValueError if an option of the dataclass `config` has a value that is not allowed."""
     for field, _, opt in options(type(config)):
         opt.check(field.name, getattr(config, field.name))
 
 
 def add_arguments(parser: argparse.ArgumentParser, cls: type, without: Sequence[str] = ()) -> None:
-    """Add `--name-of-field` to `parser` for every option of the dataclass `cls`.
+    """Add `--name-of-field` to a parser for every option of a dataclass.
 
-    without: fields that mean nothing to this program. What is not given leaves no trace in the
-    parsed arguments: see `override`.
+    An option that is not on the command line is absent from the parsed arguments; see `override`.
+
+    Args:
+        parser: gets a group titled by the first line of the docstring of `cls`.
+        cls: a dataclass with fields declared with `option`.
+        without: names of fields to leave out.
     """
     group = parser.add_argument_group((cls.__doc__ or cls.__name__).splitlines()[0].rstrip("."))
     for field, kind, opt in options(cls):
@@ -102,9 +116,17 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type, without: Sequence[
 
 
 def override(base: Config, arguments: argparse.Namespace) -> Config:
-    """Return the dataclass `base` with the options that were given; ranges checked."""
-    given = vars(arguments)
-    values = {f.name: given[f.name] for f, _, _ in options(type(base)) if f.name in given}
+    """Return the dataclass `base` with the options on the command line replaced.
+
+    Args:
+        base: values of the options that are not on the command line.
+        arguments: as parsed by a parser after `add_arguments`.
+
+    Raises:
+        ValueError: a value is not allowed.
+    """
+    parsed = vars(arguments)
+    values = {f.name: parsed[f.name] for f, _, _ in options(type(base)) if f.name in parsed}
     values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     config: Config = dataclasses.replace(base, **values)  # type: ignore[type-var]
     check(config)
@@ -112,7 +134,10 @@ def override(base: Config, arguments: argparse.Namespace) -> Config:
 
 
 def to_arguments(config: Any) -> list[str]:
-    """Return the command line that gives every option of `config`: the way back from `override`."""
+    """Return the command-line arguments that set every option of `config`.
+
+    The inverse of `override`: e.g. ["--steps", "3000", "--no-cycle"].
+    """
     words = []
     for field, kind, _ in options(type(config)):
         name, value = field.name.replace("_", "-"), getattr(config, field.name)

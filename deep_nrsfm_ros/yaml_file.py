@@ -1,4 +1,4 @@
-"""YAML that people write: read with every complaint they need, and no more than they meant."""
+"""YAML files that people write: layouts, field mappings, cameras. Read with helpful errors."""
 
 from __future__ import annotations
 
@@ -8,18 +8,27 @@ from typing import Any
 
 import yaml
 
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's is ten times faster
 _MAX_BYTES = 64 * 2**10
-_DEEPEST = 8
+_MAX_DEPTH = 8
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's is ten times faster
 
 
 def read_fields(path: Path, example: str) -> dict[Any, Any]:
-    """Return the fields of a file, its size and its form checked.
+    """Return the fields of a YAML file that holds one mapping.
 
-    example: a field as the file may have it. Raises ValueError that says what is wrong.
+    The file is at most 64 KiB, without aliases and nested at most 8 deep, so that a small hostile
+    file cannot take much memory. `---` at the end is allowed: `ros2 topic echo` writes it.
+
+    Args:
+        path: the file.
+        example: a field as the file may have it, for the error message, e.g. "name: hand".
+
+    Raises:
+        ValueError: the file cannot be read, or is not such a mapping. The message continues
+            "file PATH", e.g. "is not YAML: ...".
     """
     try:
-        if path.exists() and not path.is_file():  # reading a pipe would wait for ever
+        if path.exists() and not path.is_file():  # reading a pipe would block
             raise ValueError("is not a regular file")
         with path.open("rb") as file:
             text = file.read(_MAX_BYTES + 1)
@@ -27,23 +36,23 @@ def read_fields(path: Path, example: str) -> dict[Any, Any]:
         raise ValueError(f"cannot be read: {error.strerror or error}") from error
     if len(text) > _MAX_BYTES:
         raise ValueError(f"is larger than {_MAX_BYTES >> 10} KiB: not a description")
-    text = text.rstrip().removesuffix(b"\n---")  # so `ros2 topic echo` ends each message
+    text = text.rstrip().removesuffix(b"\n---")
     _check_nesting(text)
     try:
         root = yaml.compose(text, _Loader)
         fields = yaml.load(text, _Loader)
-    except Exception as error:  # PyYAML raises many kinds for what explicit tags say
+    except Exception as error:  # explicit tags make PyYAML raise exceptions of many types
         raise ValueError(f"is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(root, yaml.MappingNode) or not isinstance(fields, dict):
-        raise ValueError(f"is {words(fields)}; it must hold fields like '{example}'")
+        raise ValueError(f"is {brief_repr(fields)}; it must hold fields like '{example}'")
     ((name, times),) = Counter(str(key.value) for key, _ in root.value).most_common(1) or [("", 0)]
-    if times > 1:  # YAML itself would keep the last and forget the others
-        raise ValueError(f"has the field {words(name)} {times} times")
+    if times > 1:  # PyYAML would silently keep the last
+        raise ValueError(f"has the field {brief_repr(name)} {times} times")
     return fields
 
 
 def _check_nesting(text: bytes) -> None:
-    """Refuse what makes much out of little before it is made: aliases, deep nesting."""
+    """Raise ValueError for aliases and deep nesting, without building the document."""
     depth = 0
     try:
         for event in yaml.parse(text, _Loader):
@@ -51,14 +60,14 @@ def _check_nesting(text: bytes) -> None:
                 raise ValueError(f"has the alias *{event.anchor}; write out what it stands for")
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
-            if depth > _DEEPEST:
-                raise ValueError(f"is nested deeper than {_DEEPEST}: not a description")
+            if depth > _MAX_DEPTH:
+                raise ValueError(f"is nested deeper than {_MAX_DEPTH}: not a description")
     except yaml.YAMLError as error:
         raise ValueError(f"is not YAML: {' '.join(str(error).split())}") from error
 
 
-def words(value: Any) -> str:
-    """Return a value as a complaint shows it: short, whatever a file holds."""
+def brief_repr(value: Any) -> str:
+    """Return a value from a file as error messages show it, at most about 60 characters."""
     if isinstance(value, (list, dict)):
         return "a list" if isinstance(value, list) else "a mapping"
     text = "empty" if value is None else repr(value)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.presets import HUMAN17
-from deep_nrsfm_ros.nrsfm.bones import shares
+from deep_nrsfm_ros.nrsfm.bones import relative_lengths
 from deep_nrsfm_ros.nrsfm.geometry import centre
 
 Floats = NDArray[Any]
@@ -115,7 +115,7 @@ def _share(yes: NDArray[np.bool_]) -> float:
 def _spread(S: Floats, visible: NDArray[np.bool_]) -> float:
     edges = HUMAN17.edge_indices()
     a, b = np.array(edges).T
-    found = shares(S, edges)
+    found = relative_lengths(S, edges)
     seen = visible[:, a] & visible[:, b]
     found[~seen] = np.nan
     low, middle, high = np.nanpercentile(found[:, seen.any(0)], (16, 50, 84), axis=0)

@@ -8,7 +8,7 @@ from typing import Any
 
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.messages.camera_info import read_camera_info
-from deep_nrsfm_ros.yaml_file import read_fields, words
+from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 
 # The names that camera_calibration (ost.yaml) and camera_info_manager give to the matrices.
 _CALIBRATION = {
@@ -46,7 +46,9 @@ def _message(given: dict[Any, Any]) -> SimpleNamespace:
         value = fields.get(name, [])
         matrices[name] = value.get("data") if isinstance(value, dict) else value
         if not isinstance(matrices[name], list):
-            raise ValueError(f"{name} is {words(matrices[name])}; it must be a list of numbers")
+            raise ValueError(
+                f"{name} is {brief_repr(matrices[name])}; it must be a list of numbers"
+            )
     if not matrices["k"] and not matrices["p"]:
         raise ValueError(
             "has neither k nor camera_matrix; write one with `ros2 topic echo --once CAMERA_INFO`, "
@@ -54,7 +56,7 @@ def _message(given: dict[Any, Any]) -> SimpleNamespace:
         )
     roi = fields.get("roi") or {}
     if not isinstance(roi, dict):
-        raise ValueError(f"roi is {words(roi)}; it must hold fields like 'x_offset: 0'")
+        raise ValueError(f"roi is {brief_repr(roi)}; it must hold fields like 'x_offset: 0'")
     return SimpleNamespace(
         **matrices,
         distortion_model=fields.get("distortion_model", ""),

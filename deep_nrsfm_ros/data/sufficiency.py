@@ -169,8 +169,8 @@ def _doubts(frames: int, span: float, deformation: float) -> tuple[str, ...]:
         found.append(
             f"the views span only {span:.0f} degrees around their mean, so that depth rests on "
             "deformation alone and may come out mirrored; record the object from more sides, "
-            "start from a model that knows it (--from, train.from), or let the layout help (bones, "
-            "front)"
+            "start from a model that knows it (--from, train.from), or let the layout help "
+            "(bone_length_weight, handedness_weight)"
         )
     if deformation < _STIFF:
         found.append(

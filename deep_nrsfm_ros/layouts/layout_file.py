@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from deep_nrsfm_ros.layouts.layout import Edge, KeypointLayout, Tetrahedron
-from deep_nrsfm_ros.yaml_file import read_fields, words
+from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 
 LAYOUT_SUFFIXES = (".yaml", ".yml")
 FIELDS = (
@@ -49,7 +49,7 @@ class _Description:
         unknown = [name for name in fields if name not in FIELDS]
         if unknown:
             raise LayoutFileError(
-                f"has no field {words(unknown[0])}; the fields are {', '.join(FIELDS)}"
+                f"has no field {brief_repr(unknown[0])}; the fields are {', '.join(FIELDS)}"
             )
         # A template leaves fields without a value; they count as absent.
         self._fields = {name: value for name, value in fields.items() if value is not None}
@@ -91,7 +91,7 @@ class _Description:
         corners = self._mapping(where, value)
         if set(corners) != set(HANDEDNESS):
             raise LayoutFileError(
-                f"{where} names {', '.join(map(words, corners)) or 'nothing'}; "
+                f"{where} names {', '.join(map(brief_repr, corners)) or 'nothing'}; "
                 f"it must name {', '.join(HANDEDNESS)}"
             )
         left, right, up, front = (self._text(f"{where}.{c}", corners[c]) for c in HANDEDNESS)
@@ -109,7 +109,7 @@ class _Description:
         if length is None:
             return None
         if isinstance(length, bool) or not isinstance(length, (int, float)):
-            raise LayoutFileError(f"reference_length is {words(length)}; it must be in metres")
+            raise LayoutFileError(f"reference_length is {brief_repr(length)}; it must be in metres")
         return float(length)
 
     def _pair(self, where: str, value: Any) -> Edge:
@@ -124,16 +124,18 @@ class _Description:
 
     def _list(self, where: str, value: Any) -> list[Any]:
         if not isinstance(value, list):
-            raise LayoutFileError(f"{where} is {words(value)}; it must be a list")
+            raise LayoutFileError(f"{where} is {brief_repr(value)}; it must be a list")
         return value
 
     def _mapping(self, where: str, value: Any) -> dict[Any, Any]:
         if not isinstance(value, dict):
-            raise LayoutFileError(f"{where} is {words(value)}; it must be a mapping")
+            raise LayoutFileError(f"{where} is {brief_repr(value)}; it must be a mapping")
         return value
 
     def _text(self, where: str, value: Any) -> str:
         if isinstance(value, str) and value.strip():
             return value
         # YAML reads `on` and `no` as booleans and 1 as a number.
-        raise LayoutFileError(f"{where} is {words(value)}; it must be a name, in quotes if need be")
+        raise LayoutFileError(
+            f"{where} is {brief_repr(value)}; it must be a name, in quotes if need be"
+        )

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.batched import slices
-from deep_nrsfm_ros.nrsfm.bones import Bones, shares
+from deep_nrsfm_ros.nrsfm.bones import Bones, relative_lengths
 from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, random_cameras, rotation_from_camera
 
 Lift: TypeAlias = Callable[[Floats], tuple[Floats, Floats, Floats]]
@@ -169,7 +169,7 @@ def bone_lengths(
     errors = ErrorModel(covariance)
     T = centre(correct(*lift(W), all_visible, errors))
     T_again = correct(*lift(T @ random_cameras(len(T), rng)), all_visible, errors)
-    first, second = shares(T, pairs), shares(T_again, pairs)
+    first, second = relative_lengths(T, pairs), relative_lengths(T_again, pairs)
     lengths, variance = np.maximum(first.mean(0), _MIN_LENGTH), first.var(0)
     error = ((second - first) ** 2).mean(0)
     least = np.maximum(_MIN_OWN_DEVIATION**2 * variance, (_MIN_LENGTH_DEVIATION * lengths) ** 2)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from deep_nrsfm_ros.messages.field_mapping import NORMALISED, PIXELS, FieldMapping
-from deep_nrsfm_ros.yaml_file import read_fields, words
+from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 
 MAPPING_SUFFIXES = (".yaml", ".yml")
 
@@ -36,13 +36,13 @@ def _mapping(given: dict[Any, Any]) -> FieldMapping:
     fields = {field.name: field for field in dataclasses.fields(FieldMapping) if field.init}
     for name in given:
         if name not in fields:
-            raise ValueError(f"has no field {words(name)}; the fields are {', '.join(fields)}")
+            raise ValueError(f"has no field {brief_repr(name)}; the fields are {', '.join(fields)}")
     given = {name: value for name, value in given.items() if value is not None}
     for name in ("type", "keypoints"):
         if name not in given:
             raise ValueError(f"lacks the field {name!r}")
     if not (match := _TYPE.fullmatch(str(given["type"]))):
-        raise ValueError(f"type is {words(given['type'])}; it must be like my_msgs/People")
+        raise ValueError(f"type is {brief_repr(given['type'])}; it must be like my_msgs/People")
     names = given.get("names", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError("names must be a list of names, in quotes if need be")
@@ -51,13 +51,15 @@ def _mapping(given: dict[Any, Any]) -> FieldMapping:
     if names and "keypoint_id" not in given:
         raise ValueError("names are there, but no keypoint_id that is one of them")
     if given.get("units", PIXELS) not in (PIXELS, NORMALISED):
-        raise ValueError(f"units is {words(given['units'])}; it must be {PIXELS} or {NORMALISED}")
+        raise ValueError(
+            f"units is {brief_repr(given['units'])}; it must be {PIXELS} or {NORMALISED}"
+        )
     for name, kind in (("first_id", int), ("missing", (int, float))):
         value = given.get(name, 0)
         if isinstance(value, bool) or not isinstance(value, kind):
-            raise ValueError(f"{name} is {words(value)}; it must be a number")
+            raise ValueError(f"{name} is {brief_repr(value)}; it must be a number")
     for name in ("objects", "identity", "keypoints", "x", "y", "score", "keypoint_id"):
         path = given.get(name, "x")
         if not isinstance(path, str) or not _FIELD.fullmatch(path):
-            raise ValueError(f"{name} is {words(path)}; it must be a field, like position.x")
+            raise ValueError(f"{name} is {brief_repr(path)}; it must be a field, like position.x")
     return FieldMapping(**given | {"type": "/".join(match.groups()), "names": tuple(names)})

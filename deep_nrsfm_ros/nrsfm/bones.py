@@ -1,12 +1,13 @@
-"""Bones keep their lengths: what edges, and other rigid pairs, tell about depth.
+"""Bone lengths: edges of the layout, and other rigid pairs of keypoints, that keep their lengths.
 
-How long each edge is among all, and how much that varies, needs no 3D label: shapes of the training
-frames tell. They vary by more than the object does, as they come with errors; by how much more is
-seen where known shapes are lifted again. An edge that is no bone varies a lot, and says little.
+The lengths relative to their sum, and how much they vary, are estimated from the lifted shapes of
+the training frames, without 3D labels. Lifted shapes have errors, so that their lengths vary more
+than those of the object; how much more follows from lifting known shapes again. An edge that is not
+rigid varies a lot and gets little weight.
 
-A length l = ||x_i - x_j|| is linear about a shape X: l(X + E) ~ l(X) + g^T (E_i - E_j), with g the
-unit vector along the edge. So lengths are further observations for `correction`. Ours, not in the
-paper.
+A length l = ||x_i - x_j|| is linear near a shape X: l(X + E) ~ l(X) + g^T (E_i - E_j), where g is
+the unit vector along the edge. So lengths are further measurements for `lifting.correction`. This
+is ours, not in the paper.
 """
 
 from __future__ import annotations
@@ -21,35 +22,48 @@ from deep_nrsfm_ros.nrsfm.geometry import Floats
 
 
 class Bones(NamedTuple):
-    """What is known of b bones."""
+    """The lengths of b bones.
 
-    ends: NDArray[np.int32]  # (2, b) keypoints
-    lengths: NDArray[np.float64]  # (b,) shares of the sum of all
-    spread: NDArray[np.float64]  # (b,) their standard deviations
+    Attributes:
+        ends: (2, b) int32, the keypoints at the ends of each bone.
+        lengths: (b,) mean lengths, relative to the sum of all; 0.05 typical.
+        spread: (b,) standard deviations of the lengths, in the same unit.
+    """
+
+    ends: NDArray[np.int32]
+    lengths: NDArray[np.float64]
+    spread: NDArray[np.float64]
 
     def length_constraint(self, X: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return what shapes X (n, p, 3) lack of the lengths: G (n, b, 3p), (n, b), (n, b, b).
+        """Return the linearised bone-length constraint G e = r for a correction e of each shape.
 
-        That is: by how much each bone grows with the shape, should grow, and the covariance of
-        that. The size of the object, which fits the lengths best, may be another one.
+        The lengths are relative, so each shape is first given the size that fits them best.
+
+        Args:
+            X: (n, p, 3) shapes, in any unit.
+
+        Returns:
+            Jacobian G (n, b, 3 p) of the lengths, residual r (n, b) = expected - measured length in
+            the unit of X, and covariance (n, b, b) of the residual.
         """
         (i, j), L = self.ends, self.lengths
         n, p, _ = X.shape
-        edges = X[:, i] - X[:, j]
-        found = np.linalg.norm(edges, axis=2)
-        trust = (L / self.spread) ** 2
-        size = (found / L) @ trust / trust.sum()  # (n,)
+        edges = X[:, i] - X[:, j]  # (n, b, 3)
+        measured = np.linalg.norm(edges, axis=2)  # (n, b)
+        weight = (L / self.spread) ** 2
+        size = (measured / L) @ weight / weight.sum()  # (n,)
         G = np.zeros((n, len(L), p, 3))
-        towards = edges / np.maximum(found, 1e-9)[..., None]
-        G[:, range(len(L)), i] = towards
-        G[:, range(len(L)), j] = -towards
-        varies = np.diag(self.spread**2) + np.outer(L, L)
-        wanted = size[:, None] * L - found
-        return G.reshape(n, len(L), 3 * p), wanted, size[:, None, None] ** 2 * varies
+        directions = edges / np.maximum(measured, 1e-9)[..., None]
+        G[:, range(len(L)), i] = directions
+        G[:, range(len(L)), j] = -directions
+        # The outer product is the variance of the unknown size of the object.
+        covariance = np.diag(self.spread**2) + np.outer(L, L)
+        residual = size[:, None] * L - measured
+        return G.reshape(n, len(L), 3 * p), residual, size[:, None, None] ** 2 * covariance
 
 
-def shares(S: Floats, pairs: Sequence[tuple[int, int]]) -> Floats:
-    """Return the distances (n, b) of pairs of keypoints in shapes S (n, p, 3), by their sum."""
+def relative_lengths(S: Floats, pairs: Sequence[tuple[int, int]]) -> Floats:
+    """Return the distances (n, b) of b pairs of keypoints in shapes S (n, p, 3), by their sum."""
     i, j = np.array(pairs).T
     lengths: Floats = np.linalg.norm(S[:, i] - S[:, j], axis=2).astype(np.float64)
     lengths /= np.maximum(lengths.sum(1, keepdims=True), 1e-9)

@@ -1,6 +1,7 @@
-"""Cameras, alignment and weak perspective.
+"""Geometry: cameras, centring, alignment of shapes, weak perspective and rotations.
 
-Functions that say `Array` use only operations that NumPy and torch share and work on both.
+Functions with `Array` in their signature use only operations that NumPy and torch share, and take
+both. "Visible" is always a mask: True or 1 for a visible point, False or 0 for a missing one.
 """
 
 from __future__ import annotations
@@ -18,36 +19,42 @@ _TINY = 1e-12
 
 
 def polar(A: Array) -> Array:
-    """Return the orthonormal factor U V^T of A = U Sigma V^T, for A (..., 2, 3) of rank two.
+    """Return the orthonormal polar factor U V^T of A = U Sigma V^T.
 
-    "Loss function" in the paper: the singular values are set to one. Closed form (A A^T)^-1/2 A
-    with the root of a 2 x 2 matrix; its determinant comes from the cross product of the rows,
-    because a d - b^2 cancels when they are nearly parallel. A of rank one or less gives a
-    result that is finite but not orthonormal.
+    Closed form (A A^T)^-1/2 A with the root of a 2 x 2 matrix. Its determinant comes from the
+    cross product of the rows, because a d - b^2 cancels when the rows are nearly parallel.
+
+    Args:
+        A: (..., 2, 3) of rank two. For a lower rank the result is finite but not orthonormal.
+
+    Source: section "Loss function": the singular values of the camera are set to one.
     """
     trace = (A * A).sum((-2, -1))[..., None, None]
     c = _cross(A[..., 0, :], A[..., 1, :])
-    # Relative to the size of A, which in a deep narrow network is small.
+    # The floor is relative to the size of A, which is small in a deep narrow network.
     floor = _TINY * (trace * trace) + 1e-36
     s = ((c * c).sum(-1)[..., None, None] + floor) ** 0.5
     return ((trace + s) * A - A @ A.swapaxes(-1, -2) @ A) / (s * (trace + 2 * s) ** 0.5)
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product (..., 3) of two arrays, each library by its fastest way."""
+    """Return the cross product (..., 3) of two arrays or tensors."""
     if not isinstance(a, np.ndarray):
         from torch.linalg import cross
 
         return cross(a, b)
     c = np.empty(a.shape, a.dtype)
-    # np.cross takes four times as long.
+    # np.cross would take four times as long.
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         c[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
     return c
 
 
 def spectral_norm(A: Array) -> Array:
-    """Return the largest singular value (...) of A (..., 2, 3)."""
+    """Return the largest singular value (...) of A (..., 2, 3).
+
+    Source: section "Loss function": the penalty of a camera that is not orthonormal.
+    """
     G = A @ A.swapaxes(-1, -2)
     difference, off = G[..., 0, 0] - G[..., 1, 1], G[..., 0, 1]
     root = (difference * difference + 4 * off * off + _TINY) ** 0.5
@@ -61,7 +68,10 @@ def random_cameras(n: int, rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def rotation_from_camera(M: Floats) -> Floats:
-    """Return R (..., 3, 3), object to camera, of which M^T (..., 2, 3) is the first two rows."""
+    """Return the rotation R (..., 3, 3), object to camera, of an orthonormal M (..., 3, 2).
+
+    M^T is the first two rows of R; the third is their cross product.
+    """
     R = np.empty((*M.shape[:-2], 3, 3), M.dtype)
     R[..., :2, :] = M.swapaxes(-1, -2)
     R[..., 2, :] = _cross(R[..., 0, :], R[..., 1, :])
@@ -69,31 +79,76 @@ def rotation_from_camera(M: Floats) -> Floats:
 
 
 def centre(X: Floats) -> Floats:
-    """Return X (..., p, d) with its mean over the points removed."""
+    """Return points X (..., p, d) minus their mean."""
     centred: Floats = X - X.mean(-2, keepdims=True)
     return centred
 
 
-def back_project(S: Array, M: Array, W: Array, share: float = 1.0) -> Array:
-    """Move S (..., p, 3) within the image plane of M so that it projects onto W.
+def visible_count(mask: Array) -> Array:
+    """Return the number (..., 1, 1) of visible points of a mask (..., p, 1), but at least 1."""
+    return mask.sum(-2)[..., None, :].clip(1)
 
-    S + (W - S M) M^T satisfies W = S M exactly (M^T M = I). `share` < 1 goes part of the way.
+
+def visible_mean(X: Array, mask: Array) -> Array:
+    """Return the mean (..., 1, d) of the visible points of X (..., p, d), mask (..., p, 1)."""
+    return (X * mask).sum(-2)[..., None, :] / visible_count(mask)
+
+
+def centre_visible(X: Array, mask: Array) -> Array:
+    """Return X (..., p, d) minus the mean of its visible points; missing points become 0.
+
+    This is C X with C = diag(mask)(I - 1 mask^T / number of visible points), mask (..., p, 1).
     """
-    return S + share * ((W - S @ M) @ M.swapaxes(-1, -2))
+    return (X - visible_mean(X, mask)) * mask
+
+
+def rms_radius(X: Array, mask: Array) -> Array:
+    """Return the RMS distance (..., 1, 1) of visible points from the origin.
+
+    Args:
+        X: (..., p, d) centred points, 0 where missing; see `centre_visible`.
+        mask: (..., p, 1).
+    """
+    return ((X * X).sum((-2, -1))[..., None, None] / visible_count(mask)) ** 0.5
+
+
+def back_project(S: Array, M: Array, W: Array, fraction: float = 1.0) -> Array:
+    """Return the shape moved parallel to the image plane so that it projects onto W.
+
+    S + (W - S M) M^T satisfies eq:proj, W = S M, exactly, because M^T M = I.
+
+    Args:
+        S: (..., p, 3) shape.
+        M: (..., 3, 2) orthonormal camera.
+        W: (..., p, 2) keypoints in the units of S.
+        fraction: part of the way to go, 0 = none, 1 = all.
+    """
+    return S + fraction * ((W - S @ M) @ M.swapaxes(-1, -2))
 
 
 class Alignment(NamedTuple):
-    """Result of `align`: the moved shape and what moved it."""
+    """The result of `align`.
 
-    aligned: Floats  # (..., p, 3)
-    rotation: Floats  # (..., 3, 3), applied as X @ rotation
-    mirrored: NDArray[np.bool_]  # (...) True where det(rotation) = -1
+    Attributes:
+        aligned: (..., p, 3) the rotated shapes, X @ rotation.
+        rotation: (..., 3, 3) orthonormal.
+        mirrored: (...) True where det(rotation) = -1.
+    """
+
+    aligned: Floats
+    rotation: Floats
+    mirrored: NDArray[np.bool_]
 
 
 def align(X: Floats, Y: Floats, *, allow_reflection: bool = False) -> Alignment:
-    """Rotate each X (..., p, 3) onto its Y: argmin_Q ||X Q - Y||_F over SO(3), or O(3).
+    """Return each shape rotated onto its target: argmin_Q ||X Q - Y||_F, orthogonal Procrustes.
 
-    Orthogonal Procrustes; both are taken as centred and of comparable scale.
+    Args:
+        X: (..., p, 3) centred shapes.
+        Y: (..., p, 3) centred targets.
+        allow_reflection: minimise over rotations and reflections, O(3), not over SO(3).
+
+    Source: Kabsch (1976) for SO(3); Schoenemann (1966) for O(3).
     """
     U, _, Vt = np.linalg.svd(X.swapaxes(-1, -2) @ Y)
     sign = np.linalg.det(U @ Vt)
@@ -106,17 +161,26 @@ def align(X: Floats, Y: Floats, *, allow_reflection: bool = False) -> Alignment:
 
 
 class WeakPerspective(NamedTuple):
-    """Scale and translation of W = scale * P + translation."""
+    """The camera W = scale * P + translation.
 
-    scale: Floats  # (...)
-    translation: Floats  # (..., 2)
+    Attributes:
+        scale: (...) units of W per unit of P.
+        translation: (..., 2) in units of W.
+    """
+
+    scale: Floats
+    translation: Floats
 
 
 def weak_perspective(W: Floats, P: Floats, visible: NDArray[np.bool_]) -> WeakPerspective:
-    """Fit W (..., p, 2) = scale * P (..., p, 2) + translation over the visible points.
+    """Return scale and translation of the least-squares fit W = s P + t over the visible points.
 
-    Least squares with C = diag(visible)(I - 1 1^T / n): s = <C W, C P> / ||C P||^2 and
-    t = mean(W) - s mean(P).
+    With C as in `centre_visible`: s = <C W, C P> / ||C P||^2 and t = mean(W) - s mean(P).
+
+    Args:
+        W: (..., p, 2) keypoints, e.g. in pixels.
+        P: (..., p, 2) x and y of the shape in the camera's axes.
+        visible: (..., p) bool.
     """
     mean, moment = _moments((W, P), visible)
     scale = _fitted_scale(moment)
@@ -125,9 +189,17 @@ def weak_perspective(W: Floats, P: Floats, visible: NDArray[np.bool_]) -> WeakPe
 
 
 def reprojection_error(W: Floats, P: Floats, visible: NDArray[np.bool_]) -> Floats:
-    """Return ||C (W - s P)||_F / ||C W||_F (...) over the visible points, 0 being perfect.
+    """Return the relative reprojection error ||C (W - s P)||_F / ||C W||_F of each frame.
 
-    The best scale and translation between W (..., p, 2) and P (..., p, 2) are taken first.
+    Scale s and translation are those of `weak_perspective`.
+
+    Args:
+        W: (..., p, 2) keypoints, e.g. in pixels.
+        P: (..., p, 2) x and y of the shape in the camera's axes.
+        visible: (..., p) bool.
+
+    Returns:
+        (...) in [0, 1]: 0 = perfect, 0.05 typical, 0.2 bad.
     """
     _, moment = _moments((W, P), visible)
     spread = moment[..., 0, 0] + moment[..., 1, 1]
@@ -144,9 +216,14 @@ def _fitted_scale(moment: Floats) -> Floats:
 
 
 def on_one_line(W: Floats, visible: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell (...) where the visible points of W (..., p, 2) lie on one line, or on one spot.
+    """Return whether (...) the visible points lie on one line or coincide.
 
-    Their spread across it is less than a thousandth of that along it: no camera can be told.
+    That is where their spread across the line is less than a thousandth of the spread along it.
+    Such frames do not determine a camera.
+
+    Args:
+        W: (..., p, 2) keypoints, in any unit.
+        visible: (..., p) bool.
     """
     _, C = _moments((W,), visible)
     trace = C[..., 0, 0] + C[..., 1, 1]
@@ -156,10 +233,10 @@ def on_one_line(W: Floats, visible: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _moments(parts: tuple[Floats, ...], visible: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Return mean (..., d) and second central moments (..., d, d), as sums, of visible points.
+    """Return the mean (..., d) and summed central second moments (..., d, d) of visible points.
 
-    parts: arrays (..., p, 2) side by side, d coordinates in all. Matrix products sum faster than
-    sums over axes do; float64, since points far from the origin cancel.
+    `parts` are arrays (..., p, 2), d coordinates together. Matrix products are faster than sums
+    over axes. Everything is float64, because points far from the origin cancel.
     """
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     X = np.empty((*shape, 2 * len(parts)))
@@ -172,7 +249,7 @@ def _moments(parts: tuple[Floats, ...], visible: NDArray[np.bool_]) -> tuple[Flo
 
 
 def rotation_vector(R: Floats) -> Floats:
-    """Return axis times angle (3,), at most pi long, of one rotation matrix R (3, 3)."""
+    """Return axis times angle (3,) in radians, of length 0 to pi, of one rotation R (3, 3)."""
     q = quaternion(R)
     sine = float(np.sqrt(q[:3] @ q[:3]))
     vector: Floats = q[:3] * (2 * np.arctan2(sine, q[3]) / sine if sine > _TINY else 2.0)
@@ -180,11 +257,11 @@ def rotation_vector(R: Floats) -> Floats:
 
 
 def rotation_from_vector(v: Floats) -> Floats:
-    """Return the rotation matrix (3, 3) of axis times angle v (3,): the way back."""
+    """Return the rotation (3, 3) of axis times angle v (3,) in radians, by Rodrigues' formula."""
     angle = float(np.sqrt(v @ v))
     x, y, z = v
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    # sin(a) / a and (1 - cos(a)) / a^2, by sinc also where a is 0.
+    # sin(angle) / angle and (1 - cos(angle)) / angle^2; sinc is also exact at 0.
     a, b = np.sinc(angle / np.pi), np.sinc(angle / (2 * np.pi)) ** 2 / 2
     R: Floats = np.eye(3) + a * K + b * (K @ K)
     return R
@@ -192,9 +269,9 @@ def rotation_from_vector(v: Floats) -> Floats:
 
 def quaternion(R: Floats) -> Floats:
     """Return the unit quaternion (x, y, z, w), w >= 0, of one rotation matrix R (3, 3)."""
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()  # so few numbers cost less without NumPy
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()  # floats are faster than NumPy for so few numbers
     trace = a + e + i
-    # The largest of the four squares is the pivot: the others would lose digits near zero.
+    # The largest of the four components is computed first: the others would lose digits near 0.
     if trace >= max(a, e, i):
         q = h - f, c - g, d - b, 1 + trace
     elif a >= max(e, i):
@@ -207,7 +284,7 @@ def quaternion(R: Floats) -> Floats:
 
 
 def rotation_from_quaternion(q: Floats) -> Floats:
-    """Return the rotation matrix (3, 3) of a quaternion (x, y, z, w) of any length but 0."""
+    """Return the rotation matrix (3, 3) of a quaternion (x, y, z, w) of any length above 0."""
     x, y, z, w = q / np.linalg.norm(q)
     half = np.array(
         [

@@ -1,4 +1,4 @@
-"""Errors of reconstructed shapes against ground truth, the flattering and the plain ones."""
+"""Errors of reconstructed shapes against ground truth: the paper's and stricter ones."""
 
 from __future__ import annotations
 
@@ -13,17 +13,35 @@ Floats = NDArray[Any]
 
 
 class ShapeErrors(NamedTuple):
-    """Means over frames; shape errors are ratios ||S - S*||_F / ||S*||_F."""
+    """Mean errors over frames; 0 is perfect. Shape errors are ratios ||S - S*||_F / ||S*||_F.
 
-    shape: float  # the paper's: rescaled to the norm of the truth, aligned in O(3) frame by frame
-    point: float  # mean point distance of the same alignment, in units of the truth
-    proper: float  # rescaled, proper rotations only, one global reflection for the whole set
-    mirrored: float  # share of frames whose O(3) alignment disagrees with that reflection
-    unscaled: float  # as `proper`, without rescaling each frame
+    Attributes:
+        shape: the paper's shape error: each frame is rescaled to the norm of the truth and aligned
+            by a rotation or a reflection.
+        point: the paper's point error: mean distance of a point after that alignment, in the unit
+            of the truth.
+        proper: shape error after rescaling and alignment by a rotation. One reflection for all
+            frames together is allowed, since no image tells an object from its mirror image.
+        mirrored: share of frames, 0 to 0.5, whose best alignment is mirrored against the majority.
+        unscaled: like `proper`, without rescaling each frame.
+    """
+
+    shape: float
+    point: float
+    proper: float
+    mirrored: float
+    unscaled: float
 
 
 def shape_errors(S: Floats, truth: Floats) -> ShapeErrors:
-    """Compare shapes S (f, p, 3) with truth (f, p, 3), both up to rotation and translation."""
+    """Return the errors of shapes, each up to rotation and translation.
+
+    Args:
+        S: (f, p, 3) reconstructed shapes, in any unit.
+        truth: (f, p, 3) ground truth.
+
+    Source: section "NRSfM on CMU Motion Capture", tab:nrsfm, for `shape` and `point`.
+    """
     S, T = centre(S), centre(truth)
     size = np.linalg.norm(T, axis=(1, 2))
     ratio = (size / np.maximum(np.linalg.norm(S, axis=(1, 2)), 1e-12))[:, None, None]
@@ -46,7 +64,15 @@ def shape_errors(S: Floats, truth: Floats) -> ShapeErrors:
 
 
 def procrustes_distances(S: Floats, truth: Floats) -> Floats:
-    """Return point distances (f, p) after similarity alignment by a proper rotation."""
+    """Return the distances (f, p) of the points after the best similarity transform.
+
+    The transform has a scale, a rotation without reflection, and a translation. Distances are in
+    the unit of the truth (PA-MPJPE is their mean).
+
+    Args:
+        S: (f, p, 3) reconstructed shapes, in any unit.
+        truth: (f, p, 3) ground truth.
+    """
     S, T = centre(S), centre(truth)
     S = align(S, T).aligned
     scale = (S * T).sum((1, 2)) / np.maximum((S * S).sum((1, 2)), 1e-12)
@@ -55,33 +81,43 @@ def procrustes_distances(S: Floats, truth: Floats) -> Floats:
 
 
 class CameraErrors(NamedTuple):
-    """Errors of lifted shapes, means over frames and points but for the rotation."""
+    """Errors of lifted shapes in the camera's axes, against ground truth in mm.
 
-    aligned: float  # mm after the best similarity with a proper rotation
-    in_camera: float  # mm after the best scale and translation: the camera's view must fit too
-    rotation: float  # degrees between the two, median
-    mirrored: float  # share of frames that a reflection fits better
+    Attributes:
+        aligned: mean distance of a point in mm after the best similarity transform.
+        in_camera: mean distance in mm after the best scale and translation, without a rotation:
+            the viewing direction must be right too.
+        rotation: median angle in degrees between the lifted and the true shape.
+        mirrored: share of frames, 0 to 1, that a reflection aligns better than a rotation.
+    """
+
+    aligned: float
+    in_camera: float
+    rotation: float
+    mirrored: float
 
 
 def camera_errors(shapes: Floats, truth: Floats) -> CameraErrors:
-    """Compare shapes (f, p, 3) with truth (f, p, 3) in mm, both in the camera's frame.
+    """Return the errors of shapes in the camera's axes.
 
-    Frames of which the truth is not wholly known are left out.
+    Args:
+        shapes: (f, p, 3) lifted shapes, in any unit.
+        truth: (f, p, 3) ground truth in mm. Frames with a NaN are left out.
     """
     known = np.isfinite(truth).all((1, 2))
     S, T = centre(shapes[known].astype(float)), centre(truth[known])
     scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
-    apart = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
+    distances = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
     return CameraErrors(
         float(procrustes_distances(S, T).mean()),
-        float(apart.mean()),
+        float(distances.mean()),
         float(np.median(rotation_angles(align(S, T).rotation))),
         float(align(S, T, allow_reflection=True).mirrored.mean()),
     )
 
 
-def rotation_angles(turns: Floats) -> Floats:
-    """Return the angles (...) of rotations (..., 3, 3)."""
-    cosine = (np.trace(turns, axis1=-2, axis2=-1) - 1) / 2
+def rotation_angles(R: Floats) -> Floats:
+    """Return the angles (...) in degrees, 0 to 180, of rotation matrices R (..., 3, 3)."""
+    cosine = (np.trace(R, axis1=-2, axis2=-1) - 1) / 2
     angles: Floats = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     return angles

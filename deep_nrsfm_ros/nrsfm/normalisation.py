@@ -1,4 +1,4 @@
-"""From keypoints at any place and scale to the network's W, and back."""
+"""Normalisation: from keypoints in an image, at any place and scale, to W and back."""
 
 from __future__ import annotations
 
@@ -6,17 +6,25 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.nrsfm.geometry import Array
+from deep_nrsfm_ros.nrsfm.geometry import Array, rms_radius, visible_count, visible_mean
 from deep_nrsfm_ros.nrsfm.network import Network, complete
 
 
 class Normalised(NamedTuple):
-    """Keypoints as the network takes them, and what leads back to the image."""
+    """Normalised keypoints, and what is needed to undo the normalisation.
 
-    W: Array  # (n, p, 2) centred on the visible points, in units of `unit`; missing points are 0
-    gain: Array  # (n, 1, 1) p / visible points: the encoder sums over points, so it undoes gaps
-    unit: Array  # (n, 1, 1) length of one unit of W in the units of the input
-    origin: Array  # (n, 1, 2) where W's zero is in the input
+    Attributes:
+        W: (n, p, 2) centred on the visible points, in units of `unit`; missing points are 0.
+        gain: (n, 1, 1) p / number of visible points. The network's input is W * gain: the encoder
+            sums over the points, and the gain makes up for those that are missing.
+        unit: (n, 1, 1) length of one unit of W, in the units of the input.
+        origin: (n, 1, 2) mean of the visible points, in the units of the input.
+    """
+
+    W: Array
+    gain: Array
+    unit: Array
+    origin: Array
 
 
 @dataclass(frozen=True)
@@ -25,41 +33,46 @@ class Normaliser:
 
     scale: str = option(
         "rms",
-        "unit of the input: its own visible RMS radius (pixels, any distance), or the unit of the "
-        "data (metres; keeps the size of the object)",
+        "unit of the input: rms = twice the RMS radius of the visible keypoints, for pixels and "
+        "objects at any distance; none = the unit of the data, for metres, which keeps the size "
+        "of the object",
         choices=("rms", "none"),
     )
 
     def encode(self, points: Array, mask: Array) -> Normalised:
-        """Normalise points (n, p, 2) by their visible ones; mask (n, p, 1) is 1 or 0.
+        """Return the normalised keypoints: centred on the visible ones and scaled.
 
-        With C = diag(mask)(I - 1 1^T / visible) it returns W = C points / unit, which no
-        translation changes. Works on NumPy arrays and on tensors. A frame without a visible
-        point comes out as zeros.
+        Args:
+            points: (n, p, 2), x right and y down, in any unit.
+            mask: (n, p, 1), 1 = visible, 0 = missing.
+
+        Returns:
+            Arrays or tensors, as the arguments are. A frame without a visible point has W = 0.
         """
-        p = points.shape[-2]
-        visible = mask.sum(-2)[..., None, :].clip(1)
-        origin = (points * mask).sum(-2)[..., None, :] / visible
+        count, origin = visible_count(mask), visible_mean(points, mask)
         W = (points - origin) * mask
         if self.scale == "none":
-            unit = visible * 0 + 1
+            unit = count * 0 + 1
         else:
-            unit = ((W * W).sum((-2, -1))[..., None, None] / visible) ** 0.5 + 1e-9
-            # Half a unit of RMS radius: the size in metres of a person, for which the default
-            # learning rate was chosen.
-            unit = unit * 2
+            # A person has a radius of about 0.5 m. In units of twice the radius W has the size that
+            # it has in metres, for which the default learning rate was chosen.
+            unit = (rms_radius(W, mask) + 1e-9) * 2
             W = W / unit
-        return Normalised(W, p / visible, unit, origin)
+        return Normalised(W, points.shape[-2] / count, unit, origin)
 
     @staticmethod
     def decode(W: Array, normalised: Normalised) -> Array:
-        """Return the points (n, p, 2) of the image from W: the inverse of `encode`."""
+        """Return the points (n, p, 2) in the image of W (n, p, 2): the inverse of `encode`."""
         return W * normalised.unit + normalised.origin
 
 
 def normalise(net: Network, normaliser: Normaliser, points: Array, mask: Array) -> Normalised:
-    """Return points (n, p, 2) of mask (n, p, 1) as the network shall see them.
+    """Return the keypoints as the input of a network: completed, centred and scaled.
 
-    What is missing is filled as the network expects it, see `complete`; then all is normalised.
+    Args:
+        net: its whitening says where missing points are expected; see `complete`.
+        normaliser: how points are scaled.
+        points: (n, p, 2), x right and y down, in any unit.
+        mask: (n, p, 1), 1 = visible, 0 = missing.
     """
     return normaliser.encode(*complete(net, points, mask))

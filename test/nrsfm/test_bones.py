@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.lifting.correction import ErrorModel, bone_lengths, correct
-from deep_nrsfm_ros.nrsfm.bones import Bones, shares
+from deep_nrsfm_ros.nrsfm.bones import Bones, relative_lengths
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 
 some = settings(max_examples=25, deadline=None)
@@ -122,7 +122,7 @@ def test_rigid_edges_are_told_from_others_without_labels() -> None:
         return shapes + errors, U @ Vt, W
 
     found = bone_lengths(lift, shapes @ random_cameras(f, rng), EDGES, np.eye(3 * P), rng)
-    expected = shares(shapes, EDGES)
+    expected = relative_lengths(shapes, EDGES)
     np.testing.assert_allclose(found[:, 0], expected.mean(0), rtol=0.02)
     relative = found[:, 1] / found[:, 0]
     assert relative[3] > 2 * relative[:3].max() and relative.min() >= 0.0099
