@@ -63,7 +63,7 @@ def in_camera_axes(S: Floats, W: Floats) -> Floats:
 
 def in_object_axes(model: Model, dataset: Dataset, options: LiftingOptions) -> Floats:
     """Return the lifted shapes (f, p, 3) of all frames in the model's object frame."""
-    lifted = Lifter(model, options)(dataset.points, dataset.visible.astype(np.float32))
+    lifted = Lifter(model, options).lift(dataset.points, dataset.visible.astype(np.float32))
     return np.nan_to_num(lifted.scale[:, None, None] * lifted.shapes @ lifted.rotations)
 
 

@@ -115,7 +115,7 @@ def errors(lifter: Lifter, seen: Seen, *, intrinsics: bool) -> dict[str, float]:
     def placed(points: Floats, confidence: Floats) -> Lifted:
         return lift_perspective(lifter, CAMERA, points, confidence)
 
-    shapes = lift_all(placed if intrinsics else lifter, seen.points, seen.confidence).shapes
+    shapes = lift_all(placed if intrinsics else lifter.lift, seen.points, seen.confidence).shapes
     found = np.isfinite(shapes).all((1, 2))
     error = camera_errors(shapes[found][:, limbs], seen.truth[found])
     return {
@@ -156,7 +156,7 @@ def benchmark(lifters: Mapping[str, Lifter], data: Path) -> None:
     seen = [as_filmed(shapes, np.random.default_rng(1)) for shapes in held_out]
     rows: dict[str, dict[str, float]] = {}
     for name, lifter in lifters.items():
-        lifted = lift_all(lifter, points, confidence)
+        lifted = lift_all(lifter.lift, points, confidence)
         rows[name] = {"residual": float(np.nanmedian(lifted.residual))}
         for told, word in ((False, ""), (True, ", intrinsics")):
             each = [errors(lifter, one, intrinsics=told) for one in seen]

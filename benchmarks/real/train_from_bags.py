@@ -128,7 +128,7 @@ def video(session: Session) -> Table:
     }
     seen = read_bags([bag], TOPIC, BODY25, HUMAN17, min_confidence=0.1).dataset
     lifted = {
-        name: lift_all(Lifter(model), seen.points, seen.visible.astype(np.float32))
+        name: lift_all(Lifter(model).lift, seen.points, seen.visible.astype(np.float32))
         for name, model in models.items()
     }
     there = np.flatnonzero(~np.isnan([one.residual for one in lifted.values()]).any(0))
@@ -195,7 +195,7 @@ def machine(session: Session) -> Table:
         confidence = seen.visible.astype(np.float32)
         truth = centre(recording.truth)
         shapes = {
-            "this machine's model": lift_all(Lifter(model), seen.points, confidence).shapes,
+            "this machine's model": lift_all(Lifter(model).lift, seen.points, confidence).shapes,
             "the same, camera known": _at_place(model, seen.points, confidence),
         }
         labels = (name, str(len(seen)))

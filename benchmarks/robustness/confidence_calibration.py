@@ -173,7 +173,7 @@ def rated(
     lifter: Observed, points: Floats, confidence: Floats, truth: Floats, which: NDArray[np.int64]
 ) -> Rated:
     """Lift points (n, p, 2) and compare k of them with the truth (n, k, 3), in camera axes."""
-    lifted = lift_all(lifter, points, confidence)
+    lifted = lift_all(lifter.lift, points, confidence)
     kept = lifter.take()
     done = ~np.isnan(lifted.residual)
     S, T = centre(lifted.shapes[done][:, which].astype(float)), centre(truth[done])

@@ -92,7 +92,7 @@ def found(model: Model, scene: Scene, intrinsics: Intrinsics | None) -> dict[str
     lifter = Lifter(model, LiftingOptions(reference_length=scene.reference_length))
     certain = np.ones(scene.pixels.shape[:2], np.float32)
     if intrinsics is None:
-        shapes: NDArray[Any] = lift_all(lifter, scene.pixels, certain).shapes
+        shapes: NDArray[Any] = lift_all(lifter.lift, scene.pixels, certain).shapes
         places = {}
     else:
         parts = np.array_split(np.arange(len(certain)), len(certain) // 64 + 1)

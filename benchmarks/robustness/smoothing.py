@@ -71,7 +71,7 @@ def benchmark(session: Session) -> Table:
         bars("rotation deg", "points %", "shake %"),
     )
     for name, clip in clips(session).items():
-        lifted = lift_all(lifter, clip.points, clip.confidence)
+        lifted = lift_all(lifter.lift, clip.points, clip.confidence)
         for word, options in FILTERS.items():
             steady = steadied(lifted, clip.rate, options)
             table.add((name, word), figures(lifted, steady, clip))

@@ -129,7 +129,7 @@ def benchmark(given: Namespace) -> Iterator[Table]:
 
 
 def _call(lifter: Lifter, W: NDArray[np.float32], sure: NDArray[np.float32]) -> Call:
-    return lambda: lifter(W, sure)
+    return lambda: lifter.lift(W, sure)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -96,7 +96,7 @@ def reconstruct(lifter: Lifter, dataset: Dataset) -> NDArray[np.float32]:
 
     A frame that cannot be lifted comes out as a point, which is an error of 100 %.
     """
-    lifted = lift_all(lifter, dataset.points, dataset.visible.astype(np.float32))
+    lifted = lift_all(lifter.lift, dataset.points, dataset.visible.astype(np.float32))
     S: NDArray[np.float32] = np.nan_to_num(lifted.shapes * lifted.scale[:, None, None])
     return S
 

@@ -61,7 +61,7 @@ def figures(model: Model, view: View, session: Session, *, intrinsics: bool) -> 
     if intrinsics:
         lifted = lift_perspective(lifter, view.camera.intrinsics, points, confidence)
     else:
-        lifted = lifter(points, confidence)
+        lifted = lifter.lift(points, confidence)
     shapes = lifted.shapes[:, [model.layout.index(joint) for joint in JOINTS]]
     *errors, mirrored = camera_errors(shapes, view.truth)
     places = [np.nan, np.nan]

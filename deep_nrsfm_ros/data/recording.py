@@ -56,7 +56,7 @@ def lift_recording(
     """
     target = lifter.model.layout
     points, confidence = KeypointMap(source, target)(seen.points, seen.confidence)
-    lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter
+    lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter.lift
     return Recording(source, target, seen, lift_all(lift, points, confidence, on_progress))
 
 

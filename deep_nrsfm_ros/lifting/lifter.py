@@ -7,13 +7,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.kernel import supports
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
 from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
+from deep_nrsfm_ros.lifting.observation import from_arrays
+from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model
 
 _BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
@@ -112,36 +116,70 @@ class Lifter:
     Attributes:
         model: the model.
         options: how it lifts.
-        constants: both in the form that a backend computes with.
+        layout: keypoint layout of the points that a call takes.
+        constants: model and options in the form that a backend computes with.
         backend: the kernel if it supports the network, else NumPy.
     """
 
-    def __init__(self, model: Model, options: LiftingOptions | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        options: LiftingOptions | None = None,
+        *,
+        layout: KeypointLayout | str | None = None,
+    ) -> None:
         """Prepare a backend for the model.
 
         Args:
             model: weights, layout and error statistics.
             options: None: all defaults.
+            layout: the detector's layout of q keypoints, as an object or by the name of a preset
+                or a layout file ("coco17"); its keypoints are mapped to the model's by name.
+                None: the model's layout.
+
+        Raises:
+            ValueError: the layout does not exist, or shares fewer than 4 keypoints with the
+                model's.
         """
         self.model = model
         self.options = options or LiftingOptions()
+        if isinstance(layout, str):
+            layout = find_layout("layout", layout)
+        self.layout = layout or model.layout
+        self._to_model = KeypointMap(self.layout, model.layout)
         self.constants = _constants(model, self.options)
         backend = CompiledBackend if supports(model.network) else NumpyBackend
         self.backend = backend(self.constants)
 
-    def __call__(
-        self, points: Float32, confidence: Float32, *, perspective: bool = False
-    ) -> Lifted:
-        """Lift the keypoints of n objects.
+    def __call__(self, points: ArrayLike, confidence: ArrayLike | None = None) -> Lifted:
+        """Lift the keypoints of n objects, or of one.
 
         Args:
-            points: (n, p, 2) in the model's layout, x right and y down, in pixels.
-            confidence: (n, p) in [0, 1], 0 = missing.
+            points: (n, q, 2) or (q, 2) keypoints in the layout of this lifter, in pixels or any
+                other unit, x right and y down. A keypoint at (0, 0) or with a NaN is missing.
+            confidence: (n, q) or (q,), from 0, which is missing, to 1; a boolean array of
+                visibility serves too. None: all keypoints have confidence 1.
+
+        Returns:
+            The n objects; n is 1 for points (q, 2).
+
+        Raises:
+            ValueError: the arrays do not fit each other or the layout.
+        """
+        seen = from_arrays(points, confidence, self.layout)
+        return lift_all(self.lift, *self._to_model(seen.points, seen.confidence))
+
+    def lift(self, points: Float32, confidence: Float32, *, perspective: bool = False) -> Lifted:
+        """Lift an observation in the model's layout, without the checks of a call.
+
+        Args:
+            points: (n, p, 2) float32, finite.
+            confidence: (n, p) float32 in [0, 1]; 0 is missing.
             perspective: whether the points are on the plane z = 1 of a camera that looks at the
                 object (see `perspective.virtual_views`); the correction uses the ray of each point.
 
         Raises:
-            ValueError: the shapes of the arrays do not fit the model.
+            ValueError: the arrays do not fit each other or the model.
         """
         p = len(self.model.layout)
         if points.shape[1:] != (p, 2) or confidence.shape != points.shape[:2]:
@@ -184,7 +222,7 @@ def _constants(model: Model, options: LiftingOptions) -> LifterConstants:
 
 
 def lift_all(
-    lifter: Callable[[Float32, Float32], Lifted],
+    lift: Callable[[Float32, Float32], Lifted],
     points: Float32,
     confidence: Float32,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
@@ -192,14 +230,14 @@ def lift_all(
     """Lift any number of objects, in slices of at most 64 to stay in cache.
 
     Args:
-        lifter: a `Lifter`, or a function of the same two arrays.
-        points: (n, p, 2) as in `Lifter.__call__`.
-        confidence: (n, p) as in `Lifter.__call__`.
+        lift: `Lifter.lift`, or a function of the same two arrays.
+        points: (n, p, 2) as in `Lifter.lift`.
+        confidence: (n, p) as in `Lifter.lift`.
         on_progress: called after each slice with the number of lifted objects and n.
     """
     parts = []
     for part in slices(len(points), _BLOCK) or [slice(0)]:
-        parts.append(lifter(points[part], confidence[part]))
+        parts.append(lift(points[part], confidence[part]))
         on_progress(part.stop, len(points))
     return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 
 MAX_COORDINATE = 1e9
 """Pixels; a keypoint with a larger coordinate is missing.
@@ -68,6 +70,39 @@ def to_observation(
     points = np.zeros((*visible.shape, 2), np.float32)
     np.copyto(points, values[..., :2], where=visible[..., None])
     return Observation(points, confidence, identities)
+
+
+def from_arrays(
+    points: ArrayLike, confidence: ArrayLike | None, layout: KeypointLayout
+) -> Observation:
+    """Return an observation of arrays in any dtype, with missing keypoints as `to_observation`.
+
+    Args:
+        points: (n, q, 2), or (q, 2) of one object, x right and y down.
+        confidence: (n, q) or (q,), from 0 to 1, or booleans; None: all are 1.
+        layout: of the q keypoints.
+
+    Raises:
+        ValueError: the arrays do not fit each other or the layout.
+    """
+    xy, q = np.asarray(points), len(layout)
+    xy = xy[None] if xy.ndim == 2 else xy
+    if xy.ndim != 3 or xy.shape[1:] != (q, 2) or xy.dtype.kind not in "fiu":
+        raise ValueError(
+            f"points are {np.shape(points)} of {xy.dtype}; keypoint layout {layout.name!r} needs "
+            f"numbers of shape (n, {q}, 2) or ({q}, 2)"
+        )
+    xy = xy.astype(np.float64)
+    if confidence is None:
+        return to_observation(xy)
+    certainty = np.asarray(confidence)
+    if certainty.shape != np.shape(points)[:-1] or certainty.dtype.kind not in "fiub":
+        raise ValueError(
+            f"confidence is {certainty.shape} of {certainty.dtype}; points of {np.shape(points)} "
+            f"need numbers of shape {np.shape(points)[:-1]}"
+        )
+    certainty = certainty.reshape(xy.shape[:2]).astype(np.float64)
+    return to_observation(np.concatenate((xy, certainty[..., None]), -1))
 
 
 def check_keypoints(count: int, keypoints: int, field: str) -> None:

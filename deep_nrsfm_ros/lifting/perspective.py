@@ -81,7 +81,7 @@ def lift_perspective(
         ValueError: the shapes do not fit the model.
     """
     views = virtual_views(intrinsics, points, confidence)
-    lifted = lifter(views.points, views.confidence, perspective=True)
+    lifted = lifter.lift(views.points, views.confidence, perspective=True)
     visible = views.confidence > 0
     position = solve_translation(lifted.shapes, views.points, visible)
     not_lifted = ~(position[:, 2] > 0)

@@ -144,7 +144,7 @@ class Pipeline:
         if intrinsics:
             lifted = lift_perspective(self._lifter, intrinsics, points, confidence)
         else:
-            lifted = self._lifter(points, confidence)
+            lifted = self._lifter.lift(points, confidence)
         steady = self._steady.get(topic)
         if steady is None:
             steady = self._steady[topic] = Smoother(self._steadying)

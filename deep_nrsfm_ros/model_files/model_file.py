@@ -17,6 +17,7 @@ from safetensors.numpy import load, save_file
 
 from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, weight_shapes
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -100,8 +101,21 @@ def save_model(path: Path, model: Model) -> None:
         partial.unlink(missing_ok=True)
 
 
-def load_model(path: Path) -> Model:
-    """Read a model; raise ModelFileError that says what is wrong with the file."""
+def load_model(model: str | Path, models_dir: Path | None = None) -> Model:
+    """Return a model by its name or from its file.
+
+    Args:
+        model: name of a model ("human"), or path of a model file. A `Path` is always a file.
+        models_dir: folder of your own models, searched before those of the package. None: the
+            lifter's, `$ROS_HOME/deep_nrsfm_ros/models`.
+
+    Raises:
+        ModelFileError: there is no such model (the text lists those that exist), or its file is
+            damaged.
+    """
+    path = model
+    if not isinstance(path, Path):
+        path = find_model(path, model_folders(models_dir or default_models_dir()))
     content = _read(path)
     try:
         metadata, weights = _metadata(content), load(content)

@@ -61,7 +61,7 @@ def lift_sample(model: Model, dataset: Dataset, most: int = _SAMPLE) -> LiftedFr
     """Lift up to `most` frames, evenly spread; raise ValueError if none can be lifted."""
     frames = np.unique(np.linspace(0, len(dataset) - 1, min(most, len(dataset))).astype(int))
     chosen = dataset[frames]
-    lifted = lift_all(Lifter(model), chosen.points, chosen.visible.astype(np.float32))
+    lifted = lift_all(Lifter(model).lift, chosen.points, chosen.visible.astype(np.float32))
     sound = np.isfinite(lifted.shapes).all((1, 2)) & np.isfinite(lifted.residual)
     if not sound.any():
         raise ValueError(f"model {model.name!r} lifts none of the {len(frames)} frames looked at")
@@ -124,7 +124,7 @@ def label_free_errors(model: Model, dataset: Dataset, most: int = 128) -> LabelF
     frames, found = lift_sample(model, dataset, most)
     T = centre(found.shapes) @ _turns(len(frames))
     views, confidence = T[..., :2].astype(np.float32), np.ones(T.shape[:2], np.float32)
-    again = lift_all(Lifter(model), views, confidence)
+    again = lift_all(Lifter(model).lift, views, confidence)
     sound = np.isfinite(again.scale)
     after = again.shapes[sound] * again.scale[sound, None, None]
     return LabelFreeErrors(

@@ -147,9 +147,9 @@ def test_an_object_comes_out_the_same_in_any_company(
     points, confidence = objects(rng, n, len(layout), 0.2, perspective)
     confidence[rng.random(n) < 0.5] = 1  # some without gaps
     points[0, 0] = first
-    together = lifter(points, confidence, perspective=perspective)
+    together = lifter.lift(points, confidence, perspective=perspective)
     for i in range(n):
-        alone = lifter(points[i : i + 1], confidence[i : i + 1], perspective=perspective)
+        alone = lifter.lift(points[i : i + 1], confidence[i : i + 1], perspective=perspective)
         for ours, theirs in zip(alone, together, strict=True):
             np.testing.assert_array_equal(ours[0], theirs[i])
 

@@ -1,0 +1,79 @@
+"""Training from arrays: the whole of the command `train`, from points to a model, in one call."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from numpy.typing import ArrayLike
+
+from deep_nrsfm_ros.data.curation import curate
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
+from deep_nrsfm_ros.extras import require_extra
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.observation import from_arrays
+from deep_nrsfm_ros.model_files.find_layout import find_layout
+from deep_nrsfm_ros.model_files.model_file import Model, check_name
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
+
+if TYPE_CHECKING:  # it imports torch
+    from deep_nrsfm_ros.training.progress import Progress
+
+
+def train(
+    points: ArrayLike,
+    confidence: ArrayLike | None = None,
+    *,
+    layout: KeypointLayout | str,
+    name: str = "trained",
+    recipe: Recipe | None = None,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> Model:
+    """Train a model on 2D keypoints and return it; `save_model` writes it to a file.
+
+    The data are curated as the command `train` does it: frames with few keypoints, near-duplicates
+    and outliers are left out. Warnings about the data and the result are Python warnings.
+
+    Args:
+        points: (f, p, 2) keypoints of f frames, in any unit, x right and y down. A keypoint at
+            (0, 0) or with a NaN is missing.
+        confidence: (f, p) from 0, which is missing, to 1, or booleans of visibility. None: all
+            keypoints are visible.
+        layout: keypoint layout of the points, as an object or by the name of a preset or a layout
+            file ("coco17"); it is the model's too.
+        name: name of the model.
+        recipe: steps, seed and all else of the training; None stands for the defaults, 30000
+            steps, which take minutes. `Recipe(steps=3000, seed=1)` is a first look.
+        on_progress: called every few seconds, and at the end.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+        ValueError: the arrays do not fit each other or the layout, or a model cannot be learned
+            from them.
+    """
+    require_extra("train", "training")
+    from deep_nrsfm_ros.training.finish import finish
+    from deep_nrsfm_ros.training.loop import Callbacks
+    from deep_nrsfm_ros.training.loop import train as run
+
+    check_name("name", name)
+    if isinstance(layout, str):
+        layout = find_layout("layout", layout)
+    seen = from_arrays(points, confidence, layout)
+    curated = curate(Dataset(seen.points, seen.confidence > 0, layout, "arrays"))
+    sufficiency = assess_sufficiency(curated.dataset)
+    if sufficiency.refusal:
+        raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
+    for warning in (layout.warning, *curated.warnings, *sufficiency.warnings):
+        if warning:
+            warnings.warn(warning, stacklevel=2)
+    dataset = curated.dataset
+    preset = PRESETS["default"]._replace(recipe=recipe or Recipe())
+    callbacks = Callbacks(on_progress=on_progress)
+    trainer = run(dataset.points, dataset.visible, preset, callbacks=callbacks)
+    model = finish(trainer, name, layout, dataset.source)
+    model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
+    return model

@@ -1,0 +1,147 @@
+"""The front door: five lines lift, one call trains, and importing the package imports nothing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import deep_nrsfm_ros
+from deep_nrsfm_ros import KeypointLayout, Lifted, Lifter, Model, Recipe, load_model, train
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
+from deep_nrsfm_ros.model_files.model_file import ModelFileError, save_model
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def human() -> Model:
+    return load_model("human")
+
+
+def pixels(n: int, q: int) -> np.ndarray[Any, Any]:
+    return np.random.default_rng(0).uniform(50, 600, (n, q, 2))
+
+
+def same(a: Lifted, b: Lifted) -> None:
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_importing_the_package_imports_nothing() -> None:
+    code = (
+        "import sys; import deep_nrsfm_ros; deep_nrsfm_ros.__version__; dir(deep_nrsfm_ros)\n"
+        "heavy = {'torch', 'rclpy', 'numpy', 'yaml', 'rosbags'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+        "assert not [m for m in sys.modules if m.startswith('deep_nrsfm_ros.')]\n"
+        "from deep_nrsfm_ros import Lifter, load_model, train\n"
+        "heavy = {'torch', 'rclpy'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_public_name_is_there() -> None:
+    for name in deep_nrsfm_ros.__all__:
+        assert name in dir(deep_nrsfm_ros) and getattr(deep_nrsfm_ros, name) is not None
+    with pytest.raises(AttributeError, match="'lift'"):
+        _ = deep_nrsfm_ros.lift
+
+
+def test_the_lines_of_the_readme_run() -> None:
+    text = (ROOT / "README.md").read_text()
+    block = text.split("## Python\n")[1].split("\n## ")[0]
+    lines = [line[4:] for line in block.splitlines() if line.startswith("    ")]
+    variables: dict[str, Any] = {}
+    exec("\n".join(lines[: lines.index("") if "" in lines else None]), variables)
+    assert np.isfinite(variables["lifted"].shapes).all()
+
+
+def test_one_object_and_many_in_any_dtype(human: Model) -> None:
+    lifter, points = Lifter(human), pixels(100, 17)
+    many = lifter(points)
+    assert many.shapes.shape == (100, 17, 3) and np.isfinite(many.shapes).all()
+    same(lifter(points.astype(np.float32)), many)
+    same(lifter(points.tolist(), np.ones((100, 17), bool)), many)
+    np.testing.assert_allclose(lifter(points[3]).shapes[0], many.shapes[3], atol=1e-4)
+    assert lifter(points[3], np.ones(17)).rotations.shape == (1, 3, 3)
+    assert lifter(np.zeros((0, 17, 2))).shapes.shape == (0, 17, 3)
+
+
+def test_missing_keypoints_are_missing_however_they_are_marked(human: Model) -> None:
+    points, confidence = pixels(5, 17), np.ones((5, 17))
+    confidence[:, 3] = 0
+    expected = Lifter(human)(points, confidence)
+    for mark in (np.nan, 0.0, np.inf):
+        points[:, 3] = mark
+        same(Lifter(human)(points), expected)
+        same(Lifter(human)(points.astype(np.float32), np.ones((5, 17), np.float32)), expected)
+    confidence[:, 3] = np.nan
+    same(Lifter(human)(points, confidence), expected)
+
+
+def test_a_detectors_layout_is_mapped_by_name(human: Model) -> None:
+    points = pixels(4, 17)
+    mapped = KeypointMap(COCO17, HUMAN17)(points.astype(np.float32), np.ones((4, 17), np.float32))
+    expected = Lifter(human).lift(*mapped)
+    same(Lifter(human, layout="coco17")(points), expected)
+    same(Lifter(human, layout=COCO17)(points), expected)
+    with pytest.raises(ValueError, match="layout is 'coco18'; name a preset"):
+        Lifter(human, layout="coco18")
+
+
+@pytest.mark.parametrize(
+    ("points", "confidence", "complaint"),
+    [
+        (np.ones((2, 16, 2)), None, r"'human17' needs numbers of shape \(n, 17, 2\) or \(17, 2\)"),
+        (np.ones((2, 17, 3)), None, r"points are \(2, 17, 3\)"),
+        (np.ones(17), None, r"points are \(17,\)"),
+        (np.full((17, 2), "x"), None, "needs numbers"),
+        (np.ones((2, 17, 2)), np.ones(17), r"confidence is \(17,\) .* need .* \(2, 17\)"),
+        (np.ones((17, 2)), np.ones((1, 17)), r"confidence is \(1, 17\)"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(
+    human: Model, points: Any, confidence: Any, complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        Lifter(human)(points, confidence)
+
+
+def test_a_model_is_loaded_by_name_by_path_and_from_a_folder(human: Model, tmp_path: Path) -> None:
+    save_model(tmp_path / "mine.safetensors", human)
+    assert load_model(str(tmp_path / "mine.safetensors")).layout == human.layout
+    assert load_model(tmp_path / "mine.safetensors").layout == human.layout
+    assert load_model("mine", tmp_path).layout == human.layout
+    with pytest.raises(ModelFileError, match="no model 'nobody'; there are .*human"):
+        load_model("nobody")
+
+
+def test_an_array_becomes_a_model_that_lifts() -> None:
+    rng = np.random.default_rng(0)
+    shapes = rng.standard_normal((1, 8, 3)) + 0.3 * rng.standard_normal((400, 1, 1)) * (
+        rng.standard_normal((1, 8, 3))
+    )
+    rotations = np.linalg.qr(rng.standard_normal((400, 3, 3)))[0]
+    points = 100 * (shapes @ rotations)[..., :2] + 300
+    layout = KeypointLayout("thing", tuple("abcdefgh"))
+    progress: list[Any] = []
+    with pytest.warns(UserWarning, match="'thing' names no handedness"):
+        model = train(
+            points,
+            layout=layout,
+            name="thing",
+            recipe=Recipe(steps=30, seeds=1),
+            on_progress=progress.append,
+        )
+    assert model.name == "thing" and model.layout == layout and progress
+    assert np.isfinite(Lifter(model)(points[:3]).shapes).all()
+    visible = np.ones((400, 8), bool)
+    visible[:, 5:] = False
+    with pytest.raises(ValueError, match="cannot be learned"):
+        train(points[:5], visible[:5], layout=layout)
