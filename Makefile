@@ -3,6 +3,7 @@
 # make test        environment, lint, types and all tests
 # make lint        lint and types only
 # make reference   docs/reference/ from the code
+# make sanitize    the kernel's tests with a kernel that checks every access (ASan, UBSan)
 # make fuzz        100000 spoilt inputs of every kind; takes hours
 # make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
 # make benchmark-speed     speed against floors and other ways, side by side; DATA=DIR adds time_to_error
@@ -26,12 +27,21 @@ BENCHMARKS := paper.table1_cmu paper.mirrored_frames paper.ablation paper.table3
 SPEED := speed.latency_breakdown speed.forward_pass speed.bag_reading speed.latency \
     speed.latency_while_training speed.training_speed speed.training_scale
 
+SANITIZE_CC := gcc
+LIBASAN = $(shell $(SANITIZE_CC) -print-file-name=libasan.so)
+# Preloaded as well, since ASan looks for its exceptions when the process starts.
+LIBSTDCXX = $(shell $(SANITIZE_CC) -print-file-name=libstdc++.so.6)
+SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g
+SANITIZE_TESTS := test/kernel test/fuzz/test_kernel.py test/lifting/test_compiled_backend.py \
+    test/messages/test_serialised.py test/training/test_compiled_gradient.py
+SANITIZE_FUZZ ?= 1000
+
 PYTHON := .venv/bin/python
 READY := .venv/.ready
 # Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
 EXAMPLES_READY := .venv/.ready-examples
 
-.PHONY: demo demo-live test lint fuzz benchmark benchmark-speed audit lock clean reference
+.PHONY: demo demo-live test lint sanitize fuzz benchmark benchmark-speed audit lock clean reference
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
@@ -52,6 +62,20 @@ lint: $(READY)
 
 reference: $(READY)
 	$(PYTHON) -m docs.generate
+
+# Beside the kernel of .venv, not in its place. Python's allocator would hide what ASan looks for, and Python
+# itself leaks.
+sanitize: $(READY)
+ifeq ($(wildcard $(LIBASAN)),)
+	@echo "make sanitize: NOT RUN, since $(SANITIZE_CC) has no libasan.so"
+else
+	rm -rf build/sanitize
+	CC=$(SANITIZE_CC) CFLAGS="$(SANITIZERS)" LDFLAGS="$(SANITIZERS)" DEEP_NRSFM_REQUIRE_KERNEL=1 $(PYTHON) setup.py -q build \
+	    --build-base build/sanitize --build-lib build/sanitize/lib
+	LD_PRELOAD="$(LIBASAN) $(LIBSTDCXX)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONMALLOC=malloc \
+	    DEEP_NRSFM_REQUIRE_KERNEL=1 FUZZ=$(SANITIZE_FUZZ) $(PYTHON) -m pytest -q --capture sys -p no:cacheprovider \
+	    -o pythonpath="build/sanitize/lib ." --timeout 0 $(SANITIZE_TESTS)
+endif
 
 fuzz: $(READY)
 	FUZZ=100000 $(PYTHON) -m pytest test/fuzz

@@ -41,6 +41,7 @@ typedef struct {
 /* Limits of a plan, as those of a network in algebra.h. */
 #define MAX_ROTATIONS 1024
 #define MAX_BONES 65536
+#define MAX_REFILL 1000 /* rounds; so that no plan makes a lift endless */
 
 /* Check the numbers of a plan's header (length): counts, flags, widths and indices of keypoints. Returns what is
    wrong, NULL if nothing. */

@@ -25,7 +25,7 @@ const char *check_header(const int *h, ptrdiff_t length) {
     if (!in_range(h[2], 1, MAX_ROTATIONS)) return "the number of rotations is out of range";
     for (int i = 3; i < 7; i++)
         if (!in_range(h[i], 0, 1)) return "a flag is neither 0 nor 1";
-    if (h[7] < 0) return "the rounds of refilling are negative";
+    if (!in_range(h[7], 0, MAX_REFILL)) return "the number of refill rounds is out of range";
     if (!(h[8] == -1 && h[9] == -1) && !all_keypoints(h + 8, 2, p)) return "the reference is no pair of keypoints";
     if (h[10] < 0) return "min_visible is negative";
     if (!in_range(bones, 0, MAX_BONES)) return "the number of bones is out of range";
