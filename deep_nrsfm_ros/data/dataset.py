@@ -109,7 +109,7 @@ class DatasetBuilder:
     def _read(self) -> None:
         """Read the run."""
         if self._make and self._run:
-            self._wait(self._make.observation(self._run, self._min_confidence))
+            self._wait(self._make.read(self._run, self._min_confidence))
             self._run.clear()
 
     def _wait(self, observation: Observation) -> None:

@@ -1,4 +1,4 @@
-"""sensor_msgs/CameraInfo to intrinsics, by duck typing: nothing of ROS is imported."""
+"""Read the intrinsics from a sensor_msgs/CameraInfo, by duck typing: ROS is not imported."""
 
 from __future__ import annotations
 
@@ -9,11 +9,17 @@ from deep_nrsfm_ros.lifting.observation import MessageError
 
 
 def read_camera_info(message: Any, *, rectified: bool = False) -> Intrinsics:
-    """Return the intrinsics of the image that a CameraInfo belongs to.
+    """Return the intrinsics of the image that a CameraInfo describes.
 
-    rectified: of the rectified image (the matrix P, no distortion) rather than the raw one (K
-    and D). A region of interest and binning are taken into account.
-    Raises MessageError for an uncalibrated camera and for what no camera has.
+    A region of interest and binning are taken into account.
+
+    Args:
+        message: a CameraInfo of rclpy or rosbags.
+        rectified: True: of the rectified image (matrix P, no distortion); False: of the raw image
+            (K and D).
+
+    Raises:
+        MessageError: the camera is not calibrated, or its numbers are not those of a camera.
     """
     try:
         matrix = [float(value) for value in (message.p if rectified else message.k)]
@@ -35,10 +41,10 @@ def read_camera_info(message: Any, *, rectified: bool = False) -> Intrinsics:
             f"distortion_model is {lens!r}; expected one of {', '.join(COEFFICIENTS)}: rectify "
             "the image and set rectified"
         )
-    # OpenCV's later coefficients (thin prism, tilt) are mostly sent as zeros.
-    most = max(COEFFICIENTS[lens])
-    if not any(distortion[most:]):
-        distortion = distortion[:most]
+    # OpenCV's further coefficients (thin prism, tilt) are not modelled; most drivers send zeros.
+    count = max(COEFFICIENTS[lens])
+    if not any(distortion[count:]):
+        distortion = distortion[:count]
     focal = (matrix[0] / bin_x, matrix[columns + 1] / bin_y)
     principal = ((matrix[2] - left) / bin_x, (matrix[columns + 2] - top) / bin_y)
     try:

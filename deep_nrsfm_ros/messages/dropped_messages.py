@@ -1,4 +1,4 @@
-"""Messages that never came, told by the numbers that their publisher gives them."""
+"""Count of dropped messages, from the sequence numbers of a topic's publisher."""
 
 from __future__ import annotations
 
@@ -6,32 +6,33 @@ from collections.abc import Iterable
 
 
 class DroppedMessages:
-    """Counts the gaps in the numbers of the messages on a topic.
+    """Counts the messages of one topic that were sent and not received.
 
-    What a full queue or the network drops, DDS drops in silence. But every publisher numbers its
-    messages from 1. They do not tell which publisher they are of, so gaps count only while there
-    has been one.
+    A full queue or the network drops messages, and DDS does not report it. Every publisher numbers
+    its messages from 1, so a gap in the numbers counts the dropped ones. The numbers do not name
+    their publisher, so gaps count only while the topic has a single publisher.
     """
 
     def __init__(self) -> None:
-        """Begin with no message and no publisher."""
-        self._last: int | None = None
-        self._missed = 0
+        """Start without messages and publishers."""
+        self._last_number: int | None = None
+        self._dropped = 0
         self._publishers: frozenset[bytes] = frozenset()
 
     def received(self, number: int | None) -> None:
-        """Note the number of a message that came; None where the middleware tells none."""
-        if number is not None and self._last is not None:
-            self._missed += max(number - self._last - 1, 0)
-        self._last = number
+        """Record the sequence number of a received message; None: the middleware has none."""
+        if number is not None and self._last_number is not None:
+            self._dropped += max(number - self._last_number - 1, 0)
+        self._last_number = number
 
     def take_count(self, publishers: Iterable[bytes]) -> int:
-        """Return how many messages have not come since the last call, as far as can be told.
+        """Return the number of messages dropped since the last call; 0 with several publishers.
 
-        publishers: identities of those that are there now.
+        Args:
+            publishers: identifiers of the topic's present publishers.
         """
-        before, self._publishers = self._publishers, frozenset(publishers)
-        missed, self._missed = self._missed, 0
-        if not self._publishers:  # the next one counts anew
-            self._last = None
-        return missed if len(before | self._publishers) == 1 else 0
+        previous, self._publishers = self._publishers, frozenset(publishers)
+        dropped, self._dropped = self._dropped, 0
+        if not self._publishers:  # the next publisher numbers its messages from 1 again
+            self._last_number = None
+        return dropped if len(previous | self._publishers) == 1 else 0

@@ -1,8 +1,8 @@
-"""Serialised keypoint messages (CDR) to observations: the short way, where there is one.
+"""Read serialised keypoint messages (CDR), fast where their format has been read before.
 
-Nearly all PointCloud2 of a topic differ in stamp and data alone. The first one is decoded and
-checked as any message is; those that equal it in all else need neither: their keypoints are at the
-same bytes. Nothing of ROS is imported: whoever reads says how bytes are decoded.
+Nearly all PointCloud2 messages of a topic differ only in stamp and data. The first one is decoded
+and checked like any message. The keypoints of those that equal it elsewhere are at the same bytes,
+so they need neither. ROS is not imported: the caller supplies the decoder.
 """
 
 from __future__ import annotations
@@ -24,16 +24,22 @@ from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, InputType, read_observ
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.point_cloud import PointCloudFormat, point_cloud_format
 
-_LITTLE_ENDIAN = b"\x00\x01"  # how plain CDR of that order begins
+_LITTLE_ENDIAN = b"\x00\x01"  # the first bytes of plain little-endian CDR
 _STAMP = struct.Struct("<iI")
-_STAMP_AT = 4
+_STAMP_OFFSET = 4
 _LENGTH = struct.Struct("<I")
-_MOST_MAKES = 64  # that are remembered: a crowd has one for each number of people
-_LONGEST = 4096  # bytes before the data; a make with more is not worth remembering
+_MAX_FORMATS = 64  # that are kept: a crowd has one for each number of people
+_MAX_HEAD = 4096  # bytes before the data of a format that is kept
 
 
 class Header(NamedTuple):
-    """When and by which camera a message was taken: std_msgs/Header."""
+    """std_msgs/Header: time and camera of a message.
+
+    Attributes:
+        sec: seconds of the stamp.
+        nanosec: nanoseconds of the stamp.
+        frame_id: optical frame of the camera.
+    """
 
     sec: int = 0
     nanosec: int = 0
@@ -41,20 +47,26 @@ class Header(NamedTuple):
 
     @property
     def stamp(self) -> int:
-        """Return the stamp in ns."""
+        """The stamp in ns."""
         return self.sec * 1_000_000_000 + self.nanosec
 
     def write_stamp(self, raw: bytearray) -> None:
         """Write the stamp into a serialised message that begins with a header."""
-        _STAMP.pack_into(raw, _STAMP_AT, self.sec, self.nanosec)
+        _STAMP.pack_into(raw, _STAMP_OFFSET, self.sec, self.nanosec)
 
 
 class SerialisedFormat(NamedTuple):
-    """What serialised PointCloud2 of one make have in common: all but stamp, data and padding.
+    """The bytes that serialised PointCloud2 share: all but stamp, data and padding.
 
-    length: of the message in bytes. start, end: of its data. mask: whose bits are set where a byte
-    before the data counts. head: those bytes, by the mask, as one number. is_dense: the byte after
-    the data. frame_id: as the decoder reads it.
+    Attributes:
+        length: bytes of the message.
+        start: first byte of its data.
+        end: byte after its data.
+        mask: bits set for the bytes before the data that must be equal, as one number.
+        head: those bytes, as one number.
+        is_dense: the byte at `end`.
+        frame_id: of the header.
+        cloud: memory layout of the data.
     """
 
     length: int
@@ -67,37 +79,37 @@ class SerialisedFormat(NamedTuple):
     cloud: PointCloudFormat
 
     def matches(self, raw: bytes) -> bool:
-        """Tell whether a message is of this make."""
+        """Return whether a serialised message has this format."""
         return (
             len(raw) == self.length
-            and _number(raw[: self.start]) & self.mask == self.head
+            and _to_number(raw[: self.start]) & self.mask == self.head
             and raw[self.end] == self.is_dense
         )
 
     def header(self, raw: bytes) -> Header:
-        """Return the header of a message of this make."""
-        sec, nanosec = _STAMP.unpack_from(raw, _STAMP_AT)
+        """Return the header of a serialised message of this format."""
+        sec, nanosec = _STAMP.unpack_from(raw, _STAMP_OFFSET)
         return Header(sec, nanosec, self.frame_id)
 
-    def observation(self, raws: Sequence[bytes], min_confidence: float) -> Observation:
-        """Return the objects of messages of this make, one after the other."""
+    def read(self, raws: Sequence[bytes], min_confidence: float) -> Observation:
+        """Return the objects of serialised messages of this format, one after the other."""
         data = b"".join(raws)
         if kernel.AVAILABLE and self.cloud.is_float32:
-            return self._compiled(data, len(raws), min_confidence)
+            return self._read_compiled(data, len(raws), min_confidence)
         values = self.cloud.values(data, self.start, len(raws), self.length)
         return to_observation(values, min_confidence)
 
-    def _compiled(self, data: bytes, messages: int, min_confidence: float) -> Observation:
-        # Fifteen calls of NumPy cost three times as much, and more yet after a pause.
+    def _read_compiled(self, data: bytes, messages: int, min_confidence: float) -> Observation:
+        """Return what `read` returns, in one call of the kernel: a third of NumPy's time."""
         cloud, shape = self.cloud, (messages * self.cloud.height, self.cloud.width)
         points, confidence = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
-        x, y, *sure = (self.start + offset for offset in cloud.offsets)
+        x, y, *confidence_offset = (self.start + offset for offset in cloud.offsets)
         kernel._kernel.observe(
             data,
             (messages, self.length),
             (cloud.height, cloud.width),
             (cloud.row_step, cloud.point_step),
-            (x, y, *(sure or (-1,))),
+            (x, y, *(confidence_offset or (-1,))),
             MAX_COORDINATE,
             max(np.float32(min_confidence), MIN_POSITIVE),
             points,
@@ -107,101 +119,117 @@ class SerialisedFormat(NamedTuple):
 
 
 class MessageReader:
-    """Reads the serialised messages of one topic, and remembers the makes that it has met.
+    """Reads the serialised messages of one topic and keeps the formats that it has read.
 
-    What it returns and raises is what decoding and `read_observation` would, to the last bit.
+    It returns and raises what decoding and `read_observation` would, to the last bit.
+
+    Attributes:
+        input_type: type of the messages.
     """
 
     def __init__(self, input_type: InputType, decode: Callable[[bytes], Any]) -> None:
-        """Read messages of `input_type`; `decode` makes them of bytes, or raises."""
+        """Start without formats.
+
+        Args:
+            input_type: type of the messages.
+            decode: returns a message for its bytes, or raises.
+        """
         self.input_type, self._decode = input_type, decode
-        self._makes: list[SerialisedFormat] = []  # the last that came is the first
+        self._formats: list[SerialisedFormat] = []  # the latest first
 
     def __call__(
         self, raw: bytes, keypoints: int, min_confidence: float = 0.0, size: Size | None = None
     ) -> tuple[Header | None, Observation]:
-        """Return the header of a message, None if its type has none, and what it shows.
+        """Return the header of a message, None if its type has none, and its objects.
 
-        The other arguments, and what is raised, are those of `read_observation`; and whatever
-        `decode` raises.
+        Args:
+            raw: the serialised message.
+            keypoints: as in `read_observation`.
+            min_confidence: as in `read_observation`.
+            size: as in `read_observation`.
+
+        Raises:
+            MessageError: as `read_observation`; and what `decode` raises.
         """
-        make = self.find_format(raw, keypoints)
-        if make:
-            return make.header(raw), make.observation((raw,), min_confidence)
+        known = self.find_format(raw, keypoints)
+        if known:
+            return known.header(raw), known.read((raw,), min_confidence)
         message = self._decode(raw)
-        seen = read_observation(message, self.input_type, keypoints, min_confidence, size)
+        observation = read_observation(message, self.input_type, keypoints, min_confidence, size)
         header = read_header(message)
         if self.input_type == POINT_CLOUD and header:
-            self._remember(raw, message, header, point_cloud_format(message, keypoints))
-        return header, seen
+            self._add_format(raw, message, header, point_cloud_format(message, keypoints))
+        return header, observation
 
     def find_format(self, raw: bytes, keypoints: int) -> SerialisedFormat | None:
-        """Return the make of a message, None unless it was met and has so many keypoints."""
-        for i, make in enumerate(self._makes):
-            if make.matches(raw):
+        """Return the kept format of a message; None: it has none or another number of keypoints."""
+        for i, known in enumerate(self._formats):
+            if known.matches(raw):
                 if i:
-                    self._makes.insert(0, self._makes.pop(i))
-                return make if make.cloud.width == keypoints else None
+                    self._formats.insert(0, self._formats.pop(i))
+                return known if known.cloud.width == keypoints else None
         return None
 
-    def _remember(self, raw: bytes, message: Any, header: Header, cloud: PointCloudFormat) -> None:
-        """Remember the make of a message that was read, unless its bytes are not plain."""
+    def _add_format(
+        self, raw: bytes, message: Any, header: Header, cloud: PointCloudFormat
+    ) -> None:
+        """Keep the format of a message that has been read, unless its bytes are not plain CDR."""
         mask, data = _mask(raw), memoryview(message.data).cast("B")
         if mask is None:
             return
         start = len(mask)
-        end, bits = start + len(data), _number(mask)
+        end, bits = start + len(data), _to_number(mask)
         if end < len(raw) and raw[start:end] == data:
-            head = _number(raw[:start]) & bits
+            head = _to_number(raw[:start]) & bits
             frame_id = header.frame_id
-            make = SerialisedFormat(len(raw), start, end, bits, head, raw[end], frame_id, cloud)
-            self._makes.insert(0, make)
-            del self._makes[_MOST_MAKES:]
+            new = SerialisedFormat(len(raw), start, end, bits, head, raw[end], frame_id, cloud)
+            self._formats.insert(0, new)
+            del self._formats[_MAX_FORMATS:]
 
 
 def read_header(message: Any) -> Header | None:
-    """Return the header of a decoded message, None if it has none."""
+    """Return the header of a decoded message; None: it has no std_msgs/Header."""
     try:
         header = message.header
         return Header(int(header.stamp.sec), int(header.stamp.nanosec), str(header.frame_id))
-    except (AttributeError, TypeError, ValueError):  # a message may call something else so
+    except (AttributeError, TypeError, ValueError):  # a field `header` may be of another type
         return None
 
 
 def _mask(raw: bytes) -> bytes | None:
-    """Return, for each byte before the data of a PointCloud2, 255, or 0 for stamp and padding.
+    """Return 255 for each byte before the data of a PointCloud2, and 0 for stamp and padding.
 
-    None if the message is not in little-endian plain CDR, or has an uncommonly long head. What
-    fills the gaps between numbers is left to chance by those who write them.
+    None if the message is not plain little-endian CDR, or has more than `_MAX_HEAD` bytes before
+    the data. Writers leave the padding between numbers undefined, so it must not be compared.
     """
     mask = bytearray(b"\xff" * 4 + bytes(8))  # encapsulation, stamp
 
     def number() -> int:
-        mask.extend(bytes(-len(mask) % 4))  # aligned, to the encapsulation's end too
+        mask.extend(bytes(-len(mask) % 4))  # numbers are aligned to the end of the encapsulation
         (value,) = _LENGTH.unpack_from(raw, len(mask))
         mask.extend(b"\xff" * 4)
         return int(value)
 
-    def count(size: int) -> None:
-        if len(mask) + size > _LONGEST:
-            raise ValueError(f"more than {_LONGEST} bytes before the data")
+    def skip(size: int) -> None:
+        if len(mask) + size > _MAX_HEAD:
+            raise ValueError(f"more than {_MAX_HEAD} bytes before the data")
         mask.extend(b"\xff" * size)
 
     try:
-        count(number())  # frame_id
+        skip(number())  # frame_id
         number(), number()  # height, width
         for _ in range(number()):
-            count(number())  # name
+            skip(number())  # name
             number()  # offset
-            count(1)  # datatype
+            skip(1)  # datatype
             number()  # count
-        count(1)  # is_bigendian
+        skip(1)  # is_bigendian
         number(), number(), number()  # point_step, row_step, length of the data
     except (struct.error, ValueError):
         return None
     return bytes(mask) if raw.startswith(_LITTLE_ENDIAN) else None
 
 
-def _number(raw: bytes) -> int:
+def _to_number(raw: bytes) -> int:
     """Return bytes as one number, so that all are compared at once."""
     return int.from_bytes(raw, "little")

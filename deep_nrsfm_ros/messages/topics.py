@@ -1,4 +1,4 @@
-"""Names of topics, one `*` in which stands for any one part: `/humans/bodies/*/skeleton2d`."""
+"""Topic patterns: `*` stands for one part of a topic name, as in `/humans/bodies/*/skeleton2d`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ WILDCARD = "*"
 
 
 def match(pattern: str, topic: str) -> str | None:
-    """Return what the `*` in `pattern` stands for in `topic`, None if the topic does not fit.
+    """Return the part of `topic` that the `*` in `pattern` stands for; None: they do not match.
 
-    Several are joined by "/"; a pattern without any fits itself alone, and stands for "".
+    The parts of several `*` are joined by "/". A pattern without `*` matches only itself; the
+    result is then "".
     """
     expression = r"([^/]+)".join(map(re.escape, pattern.split(WILDCARD)))
-    found = re.fullmatch(expression, topic)
-    return None if found is None else "/".join(found.groups())
+    matched = re.fullmatch(expression, topic)
+    return None if matched is None else "/".join(matched.groups())

@@ -118,7 +118,7 @@ def test_the_second_message_of_a_make_is_not_decoded(
     ]
     make = reader.find_format(raws[0], Q)
     assert make
-    together = make.observation(raws, 0.0)
+    together = make.read(raws, 0.0)
     for i in range(2):
         np.testing.assert_array_equal(together[i], np.concatenate([seen[i] for seen in expected]))
 
@@ -192,7 +192,7 @@ def test_makes_that_take_turns_are_all_remembered_but_not_without_end() -> None:
     reader._decode = DECODERS["live"]
     for i in range(300):
         reader(plain(1, f"camera {i}"), Q)
-    assert len(reader._makes) == 64
+    assert len(reader._formats) == 64
     reader(plain(1, "a" * 5000), Q)  # long: not remembered
     assert not reader.find_format(plain(1, "a" * 5000), Q)
 
