@@ -1,5 +1,7 @@
 """The package as others meet it: installed by pip, built by colcon, started by launch files."""
 
+from __future__ import annotations
+
 import os
 import shutil
 import subprocess
@@ -22,7 +24,7 @@ EXECUTABLES = sorted(path.name for path in (ROOT / "scripts").iterdir())
 DOES_NOT_REACH_OTHER_PYTHONS = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH")
 
 
-def run(*command, cwd, **variables):
+def run(*command: str | Path, cwd: Path, **variables: object) -> str:
     """Return what `command` prints, run as from a fresh shell; fail with all of it if it fails."""
     kept = {k: v for k, v in os.environ.items() if k not in DOES_NOT_REACH_OTHER_PYTHONS}
     done = subprocess.run(
@@ -38,15 +40,14 @@ def run(*command, cwd, **variables):
     return done.stdout
 
 
-def colcon(verb, *arguments, workspace: Path):
+def colcon(verb: str, *arguments: str, workspace: Path) -> str:
     command = Path(sysconfig.get_path("scripts")) / "colcon"
-    return run(
-        *(sys.executable, command, "--log-base", workspace / "log", verb, *arguments), cwd=workspace
-    )
+    words: list[str | Path] = ["--log-base", workspace / "log", verb, *arguments]
+    return run(sys.executable, command, *words, cwd=workspace)
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory):
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A colcon workspace with a copy of this package that has one test, which passes."""
     workspace = tmp_path_factory.mktemp("workspace")
     source = workspace / "src" / NAME
@@ -70,7 +71,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="module")
-def installed_by_pip(workspace: Path, tmp_path_factory: pytest.TempPathFactory):
+def installed_by_pip(workspace: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The prefix of a fresh environment after `pip install .`; no network is used.
 
     The build tool comes from this environment, and requirements stay out.
@@ -87,15 +88,16 @@ def installed_by_pip(workspace: Path, tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="module")
-def built_by_colcon(workspace: Path):
+def built_by_colcon(workspace: Path) -> Path:
     """The prefix of the package after `colcon build`."""
     colcon("build", "--event-handlers", "console_direct+", workspace=workspace)
     return workspace / "install" / NAME
 
 
 @pytest.fixture(params=["installed_by_pip", "built_by_colcon"])
-def prefix(request: pytest.FixtureRequest):
-    return request.getfixturevalue(request.param)
+def prefix(request: pytest.FixtureRequest) -> Path:
+    path: Path = request.getfixturevalue(request.param)
+    return path
 
 
 def test_executables_are_where_ros2_run_looks(prefix: Path) -> None:

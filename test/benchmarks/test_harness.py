@@ -16,7 +16,7 @@ from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.model_files.model_file import Model
-from deep_nrsfm_ros.nrsfm.recipe import Preset
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training import loop as training
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.trainer import Trainer
@@ -78,10 +78,10 @@ def test_reads_the_protocols_split(session: Session) -> None:
 
 def test_preset_has_seed_steps_and_options(session: Session) -> None:
     assert session.preset("paper", 7, noise=0.1).recipe == dataclasses.replace(
-        harness.PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1
+        PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1
     )
     whole = dataclasses.replace(session, steps=None)
-    assert whole.preset("default", 0).recipe.steps == harness.PRESETS["default"].recipe.steps
+    assert whole.preset("default", 0).recipe.steps == PRESETS["default"].recipe.steps
 
 
 def test_snapshots_are_those_of_one_uninterrupted_training(

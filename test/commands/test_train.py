@@ -401,8 +401,8 @@ def test_a_layout_file_makes_a_model_in_metres(
     shapes = Lifter(model)(points[:, :5], confidence[:, :5]).shapes
     np.testing.assert_allclose(np.linalg.norm(shapes[:, 1] - shapes[:, 4], axis=1), 0.04, rtol=1e-4)
     # A layout that is no preset goes on by its model.
-    words = (*words[:2], "--object", str(models / "mine.safetensors"), *QUICK, "--name", "next")
-    assert in_process(*words, "--steps", "3", "--output", str(models)) == 0
+    again = (*words[:2], "--object", str(models / "mine.safetensors"), *QUICK, "--name", "next")
+    assert in_process(*again, "--steps", "3", "--output", str(models)) == 0
     assert load_model(models / "next.safetensors").layout == model.layout
 
 
@@ -434,8 +434,8 @@ def test_it_goes_on_from_another_model(
     assert time.strptime(first.provenance["date"], "%Y-%m-%d")
     # Weights that hardly move show where they come from.
     still = ("--bag", str(bag), "--keypoint-layout", "coco17", "--from", "mine", "--threads", "1")
-    still += ("--steps", "1", "--learning-rate", "1e-7", "--output", str(models))
-    assert in_process(*still, "--name", "same") == 0
+    slow = ("--steps", "1", "--learning-rate", "1e-7", "--output", str(models))
+    assert in_process(*still, *slow, "--name", "same") == 0
     same = load_model(models / "same.safetensors")
     assert same.layout == first.layout == HUMAN17
     assert same.provenance["from"]["model"] == "mine"
@@ -444,7 +444,7 @@ def test_it_goes_on_from_another_model(
     ):
         np.testing.assert_allclose(a, b, atol=1e-6, err_msg=name)
     capsys.readouterr()
-    assert in_process(*still, "--name", "other", "--object", "coco17") == 0
+    assert in_process(*still, *slow, "--name", "other", "--object", "coco17") == 0
     other = load_model(models / "other.safetensors")
     assert other.layout == COCO17
     np.testing.assert_array_equal(other.object_frame, first.object_frame)

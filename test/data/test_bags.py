@@ -1,8 +1,11 @@
 """Real bags in both storages: round trips, several at once, and everything that can be wrong."""
 
+from __future__ import annotations
+
 import sqlite3
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +32,9 @@ TOPIC = "/keypoints"
 WRITTEN = [POINT_CLOUD, MULTI_ARRAY, POLYGON]
 
 
-def detections(f: int, layout: KeypointLayout = BODY25, seed: int = 0) -> tuple[np.ndarray, ...]:
+def detections(
+    f: int, layout: KeypointLayout = BODY25, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return points (f, q, 2) and confidence (f, q), a fifth of them missing."""
     random = np.random.default_rng(seed)
     points = random.uniform(1, 1000, (f, len(layout), 2)).astype(np.float32)
@@ -275,7 +280,8 @@ def test_stamps_and_cameras_are_kept(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", TOPIC, frames(points, confidence, 10, "cam02", start=10**9))
     with Reader(tmp_path / "bag") as reader:
         for i, (connection, stamp, raw) in enumerate(reader.messages()):
-            header = STORE.deserialize_cdr(raw, connection.msgtype).header
+            message: Any = STORE.deserialize_cdr(raw, connection.msgtype)
+            header = message.header
             assert stamp == header.stamp.sec * 10**9 + header.stamp.nanosec == 10**9 + i * 10**8
             assert header.frame_id == "cam02"
         assert i == 2

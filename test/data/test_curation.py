@@ -57,6 +57,7 @@ def test_frames_with_few_visible_points_are_left_out() -> None:
     assert left.few_visible == 2 and len(left.dataset) == 58
     assert not {3, 7} & set(left.frames.tolist())
     assert "of 60 frames, left out 2 with too few visible keypoints" in left.summary
+    assert whole.shapes is not None
     np.testing.assert_array_equal(left.dataset.shapes, whole.shapes[left.frames])
 
 
@@ -75,8 +76,8 @@ def test_options_are_checked() -> None:
 def test_a_still_camera_on_still_objects_is_thinned(objects: int) -> None:
     rng = np.random.default_rng(1)
     poses = dataset(4 * objects)
-    points = poses.points.reshape(4, objects, P, 2)
-    points = np.repeat(points, 50, axis=0).reshape(-1, P, 2)  # objects take turns
+    in_turn = np.repeat(poses.points.reshape(4, objects, P, 2), 50, axis=0)
+    points: np.ndarray = in_turn.reshape(-1, P, 2)
     # It may come nearer, move across the image and jitter.
     size, place = rng.uniform(0.5, 2, (len(points), 1, 1)), rng.uniform(0, 300, (len(points), 1, 2))
     points = size * (points + 0.2 * rng.standard_normal(points.shape)) + place

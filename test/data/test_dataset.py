@@ -53,6 +53,7 @@ def test_frames_are_chosen_together(frames: Any, shapes: bool) -> None:
     np.testing.assert_array_equal(part.points, whole.points[frames])
     np.testing.assert_array_equal(part.visible, whole.visible[frames])
     if shapes:
+        assert whole.shapes is not None
         np.testing.assert_array_equal(part.shapes, whole.shapes[frames])
     else:
         assert part.shapes is None

@@ -271,6 +271,7 @@ def test_every_frame_is_seen_by_an_orthonormal_camera_fixed_by_the_seed(tmp_path
     assert dataset.layout is CMU31 and dataset.visible.all()
     assert "subject 07" in dataset.source and "subject 08" in dataset.source
     np.testing.assert_allclose(dataset.points.mean(1), 0, atol=1e-5)
+    assert dataset.shapes is not None
     np.testing.assert_allclose(dataset.shapes.mean(1), 0, atol=1e-5)
     for W, S in zip(dataset.points, dataset.shapes, strict=True):
         M, *_ = np.linalg.lstsq(S.astype(float), W.astype(float), rcond=None)
@@ -316,6 +317,7 @@ def test_the_paper_counts_9502_frames_of_subject_127() -> None:
     assert len(train) == 30 and len(held_out) == 8
     dataset = read_trials(train)
     assert len(dataset) == 9502
+    assert dataset.shapes is not None
     assert np.isfinite(dataset.points).all() and np.isfinite(dataset.shapes).all()
     height = dataset.shapes[0].max(0) - dataset.shapes[0].min(0)
     assert 1.2 < height[1] < 1.9  # metres, y up
@@ -325,4 +327,5 @@ def test_the_paper_counts_9502_frames_of_subject_127() -> None:
 @pytest.mark.parametrize("name", KEYPOINTS_OF)
 def test_real_people_are_right_handed(name: str) -> None:
     dataset = read_trials(trials(Path(str(DATA)) / "cmu", "02")[:3], preset(name))
+    assert dataset.shapes is not None
     assert ((votes(dataset.shapes, dataset.layout) > 0).mean(0) > 0.9).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -93,7 +94,9 @@ HOPELESS = {
 
 @pytest.mark.parametrize(("make", "complaint"), HOPELESS.values(), ids=HOPELESS)
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_what_cannot_work_is_refused_with_the_mend(make, complaint: str, noise: float) -> None:
+def test_what_cannot_work_is_refused_with_the_mend(
+    make: Callable[[], np.ndarray], complaint: str, noise: float
+) -> None:
     assert re.search(complaint, assess_sufficiency(dataset(noisy(make(), noise))).refusal)
 
 

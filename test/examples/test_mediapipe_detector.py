@@ -23,7 +23,8 @@ from std_msgs.msg import Header
 
 from deep_nrsfm_ros.data.pose2sim import JOINTS, extract_videos, read_session
 from deep_nrsfm_ros.layouts.presets import BODY25B, MEDIAPIPE33
-from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, MessageError, read_observation
+from deep_nrsfm_ros.lifting.observation import MessageError
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read_observation
 
 SIZE = (40, 60)  # height and width
 DEADLINE = 60.0
@@ -243,6 +244,7 @@ def test_the_real_one_sees_the_person(tmp_path: Path) -> None:
     assert sorted(videos) == ["cam01", "cam02", "cam03", "cam04"]
     _, image = next(images(str(videos["cam01"])))
     found = Detector()(image)
+    assert found is not None
     limbs = [MEDIAPIPE33.index(joint) for joint in JOINTS]
     view = read_session(wheel).views[0]
     other = view.points[0, [BODY25B.index(joint) for joint in JOINTS]]

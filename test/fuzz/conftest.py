@@ -127,7 +127,7 @@ class Spoiler(random.Random):
 def _places(value: Any) -> list[tuple[Any, Any]]:
     """Return every (container, key) inside a loose message."""
     if isinstance(value, SimpleNamespace):
-        own = [(value.__dict__, name) for name in value.__dict__]
+        own: list[tuple[Any, Any]] = [(value.__dict__, name) for name in value.__dict__]
     elif isinstance(value, list):
         own = [(value, i) for i in range(len(value))]
     elif isinstance(value, dict):

@@ -7,12 +7,14 @@ import io
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import apsw
 import numpy as np
 
 from deep_nrsfm_ros.data import bags
-from deep_nrsfm_ros.data.bags import BagError, frames, read_bags, write_bag
+from deep_nrsfm_ros.data.bag_files import BagError
+from deep_nrsfm_ros.data.bags import frames, read_bags, write_bag
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
 from deep_nrsfm_ros.layouts.layout_file import LayoutFileError, read_layout
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
@@ -151,7 +153,7 @@ def test_a_model_file_is_read_or_refused_and_what_is_read_lifts(
     fuzz("model file", one)
 
 
-def npz(**arrays: np.ndarray) -> bytes:
+def npz(**arrays: Any) -> bytes:
     file = io.BytesIO()
     np.savez(file, **arrays)
     return file.getvalue()
@@ -190,10 +192,9 @@ def test_a_keypoint_file_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: 
             said = json.loads(json.dumps(spoiler.choice((coco, people, openpose))))
             spoiler.spoil(said)
             try:
-                content = (json.dumps if kind == "json" else jsonl)(said)
+                content = json.dumps(said).encode() if kind == "json" else jsonl(said)
             except TypeError:  # nothing that JSON has
                 return "not written"
-            content = content if isinstance(content, bytes) else content.encode()
             content = spoiler.spoil_text(content, JSON) if spoiler.random() < 0.3 else content
             content = gzip.compress(content, 1) if kind.endswith("gz") else content
         if spoiler.random() < 0.3:

@@ -54,7 +54,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
     save_model(tmp_path / "thing.safetensors", bench.model)
     (tmp_path / "link.safetensors").symlink_to("/etc/passwd")
     inputs = InputOptions(model="thing", models_dir=str(tmp_path), bags_dir=str(tmp_path))
-    stub = SimpleNamespace(get_parameter_or=lambda name, default: default)
+    stub: Any = SimpleNamespace(get_parameter_or=lambda name, default: default)
     stub._fence = PathSandbox(tmp_path, tmp_path, ["thing"])
     stub._pipeline = Pipeline(bench.model, None, inputs, LiftingOptions(), SmoothingOptions())
     stub._prepare = lambda changes: LifterNode._prepare(stub, changes)
@@ -62,7 +62,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
     points = np.random.default_rng(0).uniform(50, 600, (1, p, 2))
     valid = bags._ENCODERS[POINT_CLOUD](next(frames(points, np.ones((1, p)))))
     expected = bench.lift(stub._pipeline, valid, POINT_CLOUD)
-    known = [(c, "") for c in (InputOptions, LiftingOptions)]
+    known: list[tuple[type[Any], str]] = [(c, "") for c in (InputOptions, LiftingOptions)]
     known += [(c, "train.") for c in (TrainingOptions, Recipe, Limits, Curation)]
     known += [(SmoothingOptions, "smoothing.")]
     defaults = [

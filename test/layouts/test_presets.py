@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -103,7 +104,7 @@ def tuples(value: object) -> object:
 
 @every_preset
 def test_a_preset_says_all_that_it_should(layout: KeypointLayout) -> None:
-    fields = {name: tuples(value) for name, value in EXPECTED[layout.name].items()}
+    fields: dict[str, Any] = {name: tuples(value) for name, value in EXPECTED[layout.name].items()}
     derived = EXPECTED[layout.name]["derived"].items()
     fields["derived"] = {name: tuple(parts) for name, parts in derived}
     assert layout == KeypointLayout(layout.name, **fields)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -170,7 +171,7 @@ def test_what_cannot_be_lifted_is_nan(shown: int) -> None:
 @pytest.mark.parametrize(
     "options", [("block",), ("relu", "closed_form"), ("relu", "learned", "free")]
 )
-def test_other_options_of_the_network_are_left_to_numpy(options: tuple[str, ...]) -> None:
+def test_other_options_of_the_network_are_left_to_numpy(options: tuple[Any, ...]) -> None:
     network = initialise(Architecture((12, 6), *options), 17, np.random.default_rng(0))
     random = dataclasses.replace(model(0, HUMAN17, (12, 6), 0.0, "rms"), network=network)
     assert isinstance(Lifter(random).backend, NumpyBackend)

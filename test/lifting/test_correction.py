@@ -36,8 +36,8 @@ def test_it_is_the_conditional_mean_given_the_visible_points_up_to_a_translation
     # Differences to the first visible point know of no translation.
     D = np.kron(np.c_[-np.ones(len(seen) - 1), np.eye(len(seen) - 1)], np.eye(2))
     r = (W - S @ M)[0, seen].ravel()
-    H, r, R = D @ H, D @ r, noise**2 * D @ D.T
-    E = covariance @ H.T @ np.linalg.solve(H @ covariance @ H.T + R, r)
+    A, r, R = D @ H, D @ r, noise**2 * D @ D.T
+    E = covariance @ A.T @ np.linalg.solve(A @ covariance @ A.T + R, r)
     found = correct(S, M, W, visible[None], ErrorModel(covariance), np.array([noise]))
     np.testing.assert_allclose(centre(found - S)[0], centre(E.reshape(p, 3)), atol=2e-2)
 

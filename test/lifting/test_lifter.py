@@ -23,8 +23,8 @@ from deep_nrsfm_ros.training.trainer import Trainer
 
 N = 12
 EVERY_MODEL = [
-    (Architecture((12, 6), *options), scale)
-    for *options, scale in itertools.product(
+    (Architecture((12, 6), threshold, recovery, camera), scale)
+    for threshold, recovery, camera, scale in itertools.product(
         ("relu", "block"), ("learned", "closed_form"), ("orthonormal", "free"), ("rms", "none")
     )
 ]
@@ -89,7 +89,8 @@ def test_rotations_are_proper_and_shapes_stand_in_camera_axes(
     architecture: Architecture, scale: str, mirrored: bool
 ) -> None:
     points, confidence = pixels(missing=0.3)
-    lifted = Lifter(random_model(architecture, scale, mirrored=mirrored))(points / 500, confidence)
+    lift = Lifter(random_model(architecture, scale, mirrored=mirrored))
+    lifted = lift((points / 500).astype("f4"), confidence)
     R = lifted.rotations
     np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.tile(np.eye(3), (N, 1, 1)), atol=1e-3)
     np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-3)
@@ -156,7 +157,10 @@ def test_place_and_size_in_the_image_do_not_change_the_shape(
     confidence = (np.random.default_rng(0).random((N, 12)) >= missing).astype(np.float32)
     confidence[:, :5] = 1
     lift = Lifter(figure_model)
-    here, there = lift(points, confidence), lift(200 * points + np.float32([800, 300]), confidence)
+    here, there = (
+        lift(points, confidence),
+        lift(200 * points + np.array([800, 300], np.float32), confidence),
+    )
     np.testing.assert_allclose(there.shapes, here.shapes, atol=2e-3)
     np.testing.assert_allclose(there.rotations, here.rotations, atol=2e-3)
     np.testing.assert_allclose(there.residual, here.residual, atol=1e-3)
@@ -209,9 +213,9 @@ def test_points_that_say_nothing_of_the_camera_are_not_lifted(
 ) -> None:
     points, confidence = pixels()
     along = points[0, :, :1] if kind == "one line" else 0
-    points[0] = np.float32([300, 200]) + along * np.float32([1, 0.5])
+    points[0] = np.array([300, 200], np.float32) + along * np.array([1, 0.5], np.float32)
     lift = Lifter(random_model(architecture, scale))
-    lifted = lift(points / 500, confidence)
+    lifted = lift((points / 500).astype("f4"), confidence)
     assert all(np.isnan(array[0]).all() for array in lifted[:-1])
     assert (lifted.confidence[0] == 0).all()
     assert all(np.isfinite(array[1:]).all() for array in lifted)

@@ -75,7 +75,7 @@ def test_what_comes_out_is_seen_where_the_keypoints_are(lifter: Lifter) -> None:
     pixels = (rng.uniform(0, 150, (20, P, 2)) + rng.uniform(0, 400, (20, 1, 2))).astype(np.float32)
     confidence = (rng.random((20, P)) > 0.2).astype(np.float32)
     lifted = lift_perspective(lifter, LENS, pixels, confidence)
-    ahead = (lifted.shapes[..., 2] > 0).all(1)  # a random model may put points anywhere
+    ahead = np.all(lifted.shapes[..., 2] > 0, axis=1)  # a random model may put points anywhere
     assert ahead.sum() > 10
     known = (confidence > 0) & ahead[:, None]
     np.testing.assert_allclose(seen(lifted.shapes)[known], pixels[known], atol=0.5)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.smoothing import MAX_AGE, Smoother, SmoothingOptions
@@ -21,8 +22,8 @@ RATE = 60.0
 
 def one(
     S: np.ndarray = SHAPE,
-    turn: Sequence[float] = (0, 0, 0),
-    place: Sequence[float] = (0, 0, 0),
+    turn: ArrayLike = (0, 0, 0),
+    place: ArrayLike = (0, 0, 0),
     sure: float = 0.8,
 ) -> Lifted:
     """Return an object of shape S in its own axes, turned and at its place."""
@@ -33,7 +34,8 @@ def one(
 
 def nothing() -> Lifted:
     parts = one(sure=0)
-    return Lifted(*(np.full_like(part, np.nan) for part in parts[:-1]), parts.confidence)
+    unknown = (np.full_like(part, np.nan) for part in parts[:-1])
+    return Lifted._make((*unknown, parts.confidence))
 
 
 def both(*objects: Lifted) -> Lifted:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -90,16 +91,16 @@ def test_short_and_long_way_end_alike(
     reader = MessageReader(POINT_CLOUD, DECODERS[origin])
     raws = [serialize_message(renewed(message, seed)) for seed in (1, 2, 3)]
     for _ in range(6):
-        raw = bytearray(spoilt.draw(st.sampled_from(raws[:3])))
-        places = st.integers(0, len(raw) - 1) | st.integers(0, min(180, len(raw) - 1))
+        changed = bytearray(spoilt.draw(st.sampled_from(raws[:3])))
+        places = st.integers(0, len(changed) - 1) | st.integers(0, min(180, len(changed) - 1))
         for at in spoilt.draw(st.lists(places, max_size=3)):
-            raw[at] = spoilt.draw(st.sampled_from([0, 1, 2, 4, 5, 127, 255]))
-        cut = spoilt.draw(st.just(len(raw)) | st.integers(0, len(raw)))
-        raws.append(bytes(raw[:cut]) + spoilt.draw(st.binary(max_size=4)))
+            changed[at] = spoilt.draw(st.sampled_from([0, 1, 2, 4, 5, 127, 255]))
+        cut = spoilt.draw(st.just(len(changed)) | st.integers(0, len(changed)))
+        raws.append(bytes(changed[:cut]) + spoilt.draw(st.binary(max_size=4)))
     for raw in raws:
         for q in (Q, Q + 1):
-            expected = outcome(lambda raw=raw, q=q: long_way(raw, origin, q, min_confidence))
-            assert outcome(lambda raw=raw, q=q: reader(raw, q, min_confidence)) == expected
+            expected = outcome(partial(long_way, raw, origin, q, min_confidence))
+            assert outcome(partial(reader, raw, q, min_confidence)) == expected
 
 
 @BOTH
@@ -113,8 +114,8 @@ def test_the_second_message_of_a_make_is_not_decoded(
     reader._decode = forbidden
     raws = [serialize_message(renewed(message, seed)) for seed in seeds]
     expected = [long_way(raw, origin, Q)[1] for raw in raws]
-    assert [outcome(lambda raw=raw: reader(raw, Q)) for raw in raws] == [
-        outcome(lambda raw=raw: long_way(raw, origin, Q)) for raw in raws
+    assert [outcome(partial(reader, raw, Q)) for raw in raws] == [
+        outcome(partial(long_way, raw, origin, Q)) for raw in raws
     ]
     make = reader.find_format(raws[0], Q)
     assert make

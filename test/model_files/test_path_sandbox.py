@@ -124,7 +124,7 @@ def test_nothing_is_written_through_a_link_that_leaves(sandbox: PathSandbox) -> 
 )).map("/".join)))  # fmt: skip
 def test_no_word_leads_outside(tmp_path_factory: pytest.TempPathFactory, word: str) -> None:
     root = tmp_path_factory.getbasetemp()
-    folders = [root / "m", root / "b"]
+    folders = root / "m", root / "b"
     sandbox = PathSandbox(*folders)
     inside = [os.path.realpath(folder) for folder in folders]
     for ask in (sandbox.bag, sandbox.layout, sandbox.model):

@@ -12,11 +12,12 @@ from deep_nrsfm_ros.training.job import TrainingJob
 if __name__ == "__main__":
     if "--ros-args" in sys.argv:
         itself = (sys.executable, __file__)
-        training_service.TrainingJob = functools.partial(TrainingJob, command=itself)
+        setattr(training_service, "TrainingJob", functools.partial(TrainingJob, command=itself))  # noqa: B010
         lifter.main()
     else:
         from deep_nrsfm_ros.commands.train import main
         from deep_nrsfm_ros.training import loop as training
 
-        training.Checkpointing = functools.partial(training.Checkpointing, seconds=0.2)
+        often = functools.partial(training.Checkpointing, seconds=0.2)
+        setattr(training, "Checkpointing", often)  # noqa: B010
         main()

@@ -129,7 +129,7 @@ def test_frames_that_cannot_be_sent_are_refused_at_the_start(
 def placed() -> Lifted:
     """Return two objects at their place, and one between them that was not lifted."""
     rng = np.random.default_rng(0)
-    shapes = rng.standard_normal((3, 5, 3)).astype(np.float32) + np.float32([1, 2, 30])
+    shapes = rng.standard_normal((3, 5, 3)).astype(np.float32) + np.array([1, 2, 30], np.float32)
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
     residual = np.array([0.1, np.nan, 0.1], np.float32)
     shapes[1] = np.nan

@@ -164,14 +164,15 @@ def test_parameter_changes_at_full_rate_cost_no_message(
     client.exchange(publisher, cloud(1))
     heard = client.heard["/lifter/points"]
     heard.clear()
-    wishes = [{"model": "joints"}, {"noise": 0.5}, {"model": "broken"}, {"test_time_rotations": 1},
-              {"model": "person"}, {"keypoint_layout": "coco17"}, {"min_confidence": 7.0},
-              {"test_time_rotations": 3}, {"noise": 0.02},
-              {"keypoint_layout": "model"}]  # fmt: skip
+    wishes: list[tuple[str, Any]] = [
+        *(("model", "joints"), ("noise", 0.5), ("model", "broken"), ("test_time_rotations", 1)),
+        *(("model", "person"), ("keypoint_layout", "coco17"), ("min_confidence", 7.0)),
+        *(("test_time_rotations", 3), ("noise", 0.02), ("keypoint_layout", "model")),
+    ]
     refused = 0
     for second in range(10 * MANY):
         publisher.publish(cloud(second))
-        refused += bool(client.set_parameters(**wishes[second % 10]))
+        refused += bool(client.set_parameters(**dict([wishes[second % 10]])))
     assert refused == 2 * MANY
     client.wait_for_health(
         lambda _, v: int(v["messages lifted"]) + int(v["messages rejected"]) >= 1 + 10 * MANY
@@ -206,7 +207,12 @@ def test_two_lifters_in_namespaces_keep_apart(start_lifter: StartLifter, connect
     for side in ("left", "right"):
         publisher = client.publisher(PointCloud2, topic=f"/{side}/keypoints")
         heard = client.heard[f"/{side}/lifter/points"]
-        client.wait(lambda p=publisher, h=heard: p.publish(cloud()) or h, "an answer")
+
+        def answered(publisher: Any = publisher, heard: list[Any] = heard) -> list[Any]:
+            publisher.publish(cloud())
+            return heard
+
+        client.wait(answered, "an answer")
         xyz = np.frombuffer(heard[0].data, np.float32).reshape(P, 4)[:, :3]
         sizes[side] = float(np.linalg.norm(xyz))
     assert sizes["right"] == pytest.approx(3 * sizes["left"], rel=1e-4)
@@ -226,7 +232,7 @@ def test_simulated_time_may_stand_still_and_jump(
         time_message = Clock()
         time_message.clock.sec = second
 
-        def told(wanted=second, now=time_message) -> bool:
+        def told(wanted: int = second, now: Clock = time_message) -> bool:
             clock.publish(now)
             publisher.publish(message)
             heard = client.heard["/lifter/points"]

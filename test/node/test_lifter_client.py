@@ -76,7 +76,9 @@ def test_keypoints_and_answers_are_joined(
 
 
 @pytest.mark.parametrize("wrong", ["fields", "width"])
-def test_odd_points_are_complained_of(domain: int, wrong: str) -> None:
+def test_odd_points_are_complained_of(
+    domain: int, wrong: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     shown: list[Recording] = []
@@ -84,7 +86,7 @@ def test_odd_points_are_complained_of(domain: int, wrong: str) -> None:
         "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
     )
     complaints: list[str] = []
-    watcher._complain = complaints.append  # type: ignore[method-assign]
+    monkeypatch.setattr(watcher, "_complain", complaints.append)
     odd = message(1)
     if wrong == "fields":
         odd.fields = odd.fields[:2]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 from test.node.conftest import Connect, StartLifter
@@ -44,7 +46,7 @@ def test_the_lifter_may_do_what_it_does_and_no_more(
     lifter["publish"] -= set() if tf else {"/tf"}
     for kind, ask in asked.items():
 
-        def same(kind=kind, ask=ask) -> bool:
+        def same(kind: str = kind, ask: Callable[..., list[Any]] = ask) -> bool:
             return {name for name, _ in ask("lifter", "/")} == lifter[kind]
 
         client.wait(same, f"{kind}: {lifter[kind]}, and is {ask('lifter', '/')}")

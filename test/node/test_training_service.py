@@ -43,7 +43,7 @@ def assert_ends(pid: int) -> None:
 
 
 @pytest.fixture
-def lifter(start_lifter: StartLifter):
+def lifter(start_lifter: StartLifter) -> LifterProcess:
     return start_lifter(STAND_IN, input_type="std_msgs/Float32MultiArray")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from array import array
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,8 +55,8 @@ def test_paths_outside_are_refused_and_the_lifter_goes_on(
         assert "put it there, or start the lifter with -p bags_dir:=FOLDER" in refused.message
         assert client.set_parameters(**{f"train__{name}": default}) == ""
     for name in ("bags_dir", "models_dir", "train__max_minutes", "train__max_frames"):
-        value = 1000 if name.endswith("frames") else 1.0 if name.endswith("minutes") else "/"
-        assert "read-only" in client.set_parameters(**{name: value})
+        other: Any = 1000 if name.endswith("frames") else 1.0 if name.endswith("minutes") else "/"
+        assert "read-only" in client.set_parameters(**{name: other})
     assert client.exchange(publisher, keypoints()).data == before
     assert lifter.process.poll() is None
 

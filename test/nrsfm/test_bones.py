@@ -89,8 +89,8 @@ def test_lengths_tell_the_depth_that_the_network_has_flattened() -> None:
         found = []
         for i in range(n):
             bones = spread and bones_of(truth[i], spread)
-            one = (part[i : i + 1] for part in (flat, M, W, seen))
-            found.append(correct(*one, ErrorModel(np.eye(3 * P), bones or None), 0.01)[0])
+            one, errors = slice(i, i + 1), ErrorModel(np.eye(3 * P), bones or None)
+            found.append(correct(flat[one], M[one], W[one], seen[one], errors, 0.01)[0])
         return np.abs(lengths(np.array(found)) / lengths(truth) - 1).max(1)
 
     without, rigid = wrong(None), wrong(0.01)

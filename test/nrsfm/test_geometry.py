@@ -65,7 +65,7 @@ def test_polar_without_rank_is_finite_and_so_is_its_gradient(A: np.ndarray) -> N
     assert np.isfinite(polar(A)).all()
     tensor = torch.tensor(A, dtype=torch.float32, requires_grad=True)
     polar(tensor).sum().backward()
-    assert torch.isfinite(tensor.grad).all()
+    assert tensor.grad is not None and torch.isfinite(tensor.grad).all()
 
 
 @some

@@ -79,8 +79,8 @@ def test_layouts_without_handedness_keep_their_axes_and_have_no_volume() -> None
 
 def test_every_order_of_the_four_has_the_sign_of_its_permutation() -> None:
     for order in itertools.permutations(range(4)):
-        names = tuple(FOUR[i] for i in order)
-        layout = KeypointLayout("person", NAMES, handedness=(names,))
+        a, b, c, d = (FOUR[i] for i in order)
+        layout = KeypointLayout("person", NAMES, handedness=((a, b, c, d),))
         sign = np.linalg.det(np.eye(4)[list(order)])
         assert np.sign(votes(STANDING[None], layout)[0]) == sign
 

@@ -184,7 +184,7 @@ def test_noise_and_hidden_points_spoil_the_input_not_the_target(trained: Any, fi
     points = torch.from_numpy(figure.points[:f])
     frames = Frames(points, torch.ones(f, points.shape[1], 1))
 
-    def reprojection(**augmentation: float) -> float:
+    def reprojection(**augmentation: Any) -> float:
         recipe = Recipe(cycle=0.0, **augmentation)
         return Objective(Normaliser(), recipe)(
             net, frames, None, torch.Generator()

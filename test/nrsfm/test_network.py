@@ -226,7 +226,8 @@ def turned_in_plane(architecture: Architecture, seed: int) -> tuple[float, float
     W, Q = rng.standard_normal((7, 2)), np.linalg.qr(rng.standard_normal((2, 2)))[0]
     (S, M), (turned_S, turned_M) = forward(net, W), forward(net, W @ Q)
     assume(np.linalg.norm(S) > 1e-3)  # random weights may silence the last layer
-    return np.linalg.norm(turned_S - S) / np.linalg.norm(S), np.linalg.norm(turned_M - M @ Q)
+    shape_change = np.linalg.norm(turned_S - S) / np.linalg.norm(S)
+    return float(shape_change), float(np.linalg.norm(turned_M - M @ Q))
 
 
 @some

@@ -55,7 +55,7 @@ def recording_of(f: int = 30, layout: KeypointLayout = HUMAN17, offset: float = 
         shapes,
         R.astype(np.float32),
         np.full(f, 200, np.float32),
-        np.tile(np.float32([640, 360]), (f, 1)),
+        np.tile(np.array([640, 360], np.float32), (f, 1)),
         np.full(f, 0.1, np.float32),
         sure.copy(),
     )

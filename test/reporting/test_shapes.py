@@ -33,7 +33,9 @@ def lifted(S: np.ndarray, seed: int = 0) -> Lifted:
     """Return object shapes S (f, p, 3) as a perfect lifter would."""
     R = rotation_from_camera(random_cameras(len(S), np.random.default_rng(seed)))
     ones = np.ones(len(S), np.float32)
-    return Lifted(S @ R.swapaxes(1, 2), R, ones, np.zeros((len(S), 2)), 0 * ones, ones[:, None])
+    return Lifted(
+        S @ R.swapaxes(1, 2), R, ones, np.zeros((len(S), 2), np.float32), 0 * ones, ones[:, None]
+    )
 
 
 def frames(f: int, p: int) -> Dataset:
@@ -108,7 +110,10 @@ def test_figures_do_not_depend_on_chance_or_unit() -> None:
 def test_depth_is_doubted_where_keypoints_contradict_each_other() -> None:
     seen = frames(40, P)
     names = seen.layout.keypoints
-    four, inside_out = (names[0], names[1], names[2], names[3]), (names[1], *names[0:4:2], names[3])
+    four, inside_out = (
+        (names[0], names[1], names[2], names[3]),
+        (names[1], names[0], names[2], names[3]),
+    )
     told = [
         handedness_warning(model(KeypointLayout("thing", names, handedness=handedness)), seen)
         for handedness in ((four,), (inside_out,), (four, inside_out), ())

@@ -77,7 +77,8 @@ def test_two_processes_agree_with_one(figure: Any, found: list[dict[str, torch.T
     first, second = found
     torch.testing.assert_close(first["weights"], second["weights"], rtol=0, atol=0)
     np.testing.assert_allclose(first["errors"], alone.measure(), rtol=TOLERANCE)
-    assert (first["frames"], first["reports"], second["reports"]) == (len(visible), 1, 0)
+    counts = (first["frames"], first["reports"], second["reports"])
+    assert tuple(map(int, counts)) == (len(visible), 1, 0)
 
 
 def test_all_stop_when_one_wants_to_and_all_go_on(found: list[dict[str, torch.Tensor]]) -> None:
@@ -104,7 +105,12 @@ def test_shares_add_up() -> None:
     frames = torch.arange(10)
     assert sorted(torch.cat([team.shard(frames) for team in teams]).tolist()) == list(range(10))
     with pytest.raises(ValueError, match="3 processes are more than"):
-        train(np.eye(4, 2)[None], np.ones((1, 4), bool), PRESET, Setup(group=teams[0]))
+        train(
+            np.eye(4, 2, dtype=np.float32)[None],
+            np.ones((1, 4), bool),
+            PRESET,
+            Setup(group=teams[0]),
+        )
 
 
 def test_other_launchers_do_not_make_a_team(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,7 +31,9 @@ def source(trained: Trainer, figure: Any) -> Model:
 @pytest.fixture(scope="module")
 def stretched(figure: Any) -> np.ndarray:
     """Points (1000, 12, 2) of a figure of other proportions than the model was trained on."""
-    return ((figure.shapes[:1000] * np.float32([1.4, 1, 0.7])) @ figure.cameras[:1000]).astype("f4")
+    return (
+        (figure.shapes[:1000] * np.array([1.4, 1, 0.7], np.float32)) @ figure.cameras[:1000]
+    ).astype("f4")
 
 
 def tuned(source: Model, layout: KeypointLayout, points: np.ndarray, steps: int = 100) -> Trainer:

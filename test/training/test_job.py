@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -42,7 +43,7 @@ class Listener:
         return heard
 
 
-def start(behaviour: str, **settings: float) -> tuple[TrainingJob, Listener]:
+def start(behaviour: str, **settings: Any) -> tuple[TrainingJob, Listener]:
     listener = Listener()
     return TrainingJob(["--name", behaviour], listener, command=STAND_IN, **settings), listener
 

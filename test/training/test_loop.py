@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
-from deep_nrsfm_ros.training import loop as training
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
@@ -285,7 +285,7 @@ def test_data_without_anything_to_learn_from_are_refused(figure: Any) -> None:
         (np.full_like(points, 7.1), visible),
     ):
         with pytest.raises(ValueError, match=rf"none of the {len(nothing[0])} frames"):
-            train(*nothing, SMALL)
+            train(nothing[0], nothing[1], SMALL)
 
 
 def test_frames_without_extent_are_left_out(figure: Any) -> None:
@@ -314,7 +314,7 @@ def second_a_step(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         rates.append(trainer.optimiser.param_groups[0]["lr"])
 
     monkeypatch.setattr(Trainer, "advance", timed)
-    monkeypatch.setattr(training.time, "monotonic", lambda: float(len(rates)))
+    monkeypatch.setattr(time, "monotonic", lambda: float(len(rates)))
     return rates
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from deep_nrsfm_ros.training.record import keep_record
 from deep_nrsfm_ros.training.request import TrainingOptions, TrainingRequest, layouts
 
 
-def request(recipe: Recipe | None = None, **options: object) -> TrainingRequest:
+def request(recipe: Recipe | None = None, **options: Any) -> TrainingRequest:
     return TrainingRequest(
         dataclasses.replace(TrainingOptions(), **options),
         recipe or Recipe(),
@@ -113,7 +114,7 @@ MODEL = Path("present.safetensors")
     ],
 )
 def test_layouts_are_what_was_said_or_what_the_lifter_hears_and_has(
-    options: dict[str, str], heard: str, start: str, expected: tuple[str, str]
+    options: dict[str, Any], heard: str, start: str, expected: tuple[str, str]
 ) -> None:
     assert layouts(TrainingOptions(**options), heard, MODEL, start) == expected
 
@@ -137,7 +138,7 @@ def test_layouts_and_start_are_checked_before_anything_starts(tmp_path: Path) ->
     coco = save(tmp_path / "coco.safetensors", COCO17)
     points = save(tmp_path / "points.safetensors", KeypointLayout.numbered(5))
     assert dataclasses.replace(wanted, start=str(coco)).check() == ""
-    for changes, complaint in (
+    mistakes: tuple[tuple[dict[str, Any], str], ...] = (
         ({"target_layout": "horse"}, "train.object is 'horse'; name a preset"),
         ({"source_layout": "horse"}, "train.keypoint_layout is 'horse'; name a preset"),
         ({"target_layout": "cmu31"}, "share 0 keypoints"),
@@ -145,7 +146,8 @@ def test_layouts_and_start_are_checked_before_anything_starts(tmp_path: Path) ->
         ({"target_layout": "numbered"}, "empty train.keypoint_layout"),
         ({"start": str(points)}, "knows 0 of the 17 keypoints"),
         ({"start": str(tmp_path / "gone.safetensors")}, "cannot read model"),
-    ):
+    )
+    for changes, complaint in mistakes:
         with pytest.raises(ValueError, match=complaint):
             dataclasses.replace(wanted, **changes).check()
 

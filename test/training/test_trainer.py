@@ -15,7 +15,7 @@ from deep_nrsfm_ros.training.trainer import learning_rate, second_moment
 
 @pytest.mark.parametrize("scale", ["rms", "none"])
 def test_second_moment_is_over_the_frames_that_show_both_points(figure: Any, scale: str) -> None:
-    points = figure.points[:200] + np.float32([3, 4])
+    points = figure.points[:200] + np.array([3, 4], np.float32)
     visible = np.random.default_rng(0).random((200, 12)) < 0.7
     visible[:, :2], visible[:, 2], visible[:100, 3] = True, np.arange(200) >= 100, True
     visible[100:, 3] = False  # points 2 and 3 are never seen together

@@ -1,3 +1,6 @@
+from __future__ import annotations
+
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -8,6 +11,7 @@ from benchmarks.baselines.methods import BATCH, block_matrix, em_ppca, in_batche
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 
+Method = Callable[[np.ndarray], np.ndarray]
 MODES = 2
 DEFORMING = {
     "block matrix": partial(block_matrix, K=MODES + 1),  # the mean shape counts
@@ -20,7 +24,7 @@ class Seen(NamedTuple):
     points: np.ndarray  # (f, 20, 2)
 
 
-def seen(deformation, frames=150, noise=0.0, seed: int = 0):
+def seen(deformation: float, frames: int = 150, noise: float = 0.0, seed: int = 0) -> Seen:
     """An object of 20 points, its codes Gaussian, each frame from a random camera."""
     rng = np.random.default_rng(seed)
     mean, modes = rng.standard_normal((20, 3)), rng.standard_normal((MODES, 20, 3))
@@ -31,7 +35,7 @@ def seen(deformation, frames=150, noise=0.0, seed: int = 0):
 
 
 @pytest.fixture(scope="module")
-def deforming():
+def deforming() -> Seen:
     return seen(0.3)
 
 
@@ -41,7 +45,7 @@ def test_rigid_factorisation_is_exact_on_a_rigid_object(seed: int) -> None:
     assert shape_errors(rigid(points), shapes).unscaled < 1e-6
 
 
-def test_rigid_factorisation_gives_every_frame_the_same_shape(deforming) -> None:
+def test_rigid_factorisation_gives_every_frame_the_same_shape(deforming: Seen) -> None:
     S = rigid(deforming.points)
     assert S.shape == deforming.shapes.shape
     assert np.ptp(S, axis=0).max() == 0
@@ -49,27 +53,31 @@ def test_rigid_factorisation_gives_every_frame_the_same_shape(deforming) -> None
 
 
 @pytest.mark.parametrize("method", DEFORMING.values(), ids=DEFORMING.keys())
-def test_methods_for_deforming_objects_recover_one_that_is_of_their_rank(method, deforming) -> None:
+def test_methods_for_deforming_objects_recover_one_that_is_of_their_rank(
+    method: Method, deforming: Seen
+) -> None:
     errors = shape_errors(method(deforming.points), deforming.shapes)
     assert errors.unscaled < 0.01
     assert errors.mirrored == 0
 
 
 @pytest.mark.parametrize("method", DEFORMING.values(), ids=DEFORMING.keys())
-def test_methods_for_deforming_objects_bear_noise(method) -> None:
+def test_methods_for_deforming_objects_bear_noise(method: Method) -> None:
     shapes, points = seen(0.3, noise=0.05)
     assert shape_errors(method(points), shapes).proper < 0.12
 
 
 @pytest.mark.parametrize("method", DEFORMING.values(), ids=DEFORMING.keys())
-def test_methods_for_deforming_objects_take_a_rank_beyond_that_of_the_images(method) -> None:
+def test_methods_for_deforming_objects_take_a_rank_beyond_that_of_the_images(
+    method: partial[np.ndarray],
+) -> None:
     shapes, points = seen(0.0, frames=30)
     errors = shape_errors(method.func(points, 20), shapes)
     assert errors.shape < 0.01
 
 
 @pytest.mark.parametrize("method", [rigid, *DEFORMING.values()], ids=["rigid", *DEFORMING])
-def test_one_object_frame_serves_all_frames(method, deforming) -> None:
+def test_one_object_frame_serves_all_frames(method: Method, deforming: Seen) -> None:
     # One camera for each frame must explain it: the mean over frames is near the mean shape.
     mean = deforming.shapes.mean(0)
     S = method(deforming.points).mean(0)
@@ -77,7 +85,7 @@ def test_one_object_frame_serves_all_frames(method, deforming) -> None:
 
 
 @pytest.mark.parametrize("method", [rigid, *DEFORMING.values()], ids=["rigid", *DEFORMING])
-def test_the_order_of_the_frames_does_not_matter(method, deforming) -> None:
+def test_the_order_of_the_frames_does_not_matter(method: Method, deforming: Seen) -> None:
     order = np.random.default_rng(1).permutation(len(deforming.points))
     S, shuffled = method(deforming.points), method(deforming.points[order])
     assert shape_errors(shuffled, S[order]).shape < 1e-3
@@ -87,7 +95,7 @@ def test_batches_cover_every_frame_once_and_say_which() -> None:
     points = np.random.default_rng(0).standard_normal((2 * BATCH + 100, 4, 2))
     sizes = []
 
-    def flat(W):
+    def flat(W: np.ndarray) -> np.ndarray:
         sizes.append(len(W))
         return np.concatenate([W, np.zeros((*W.shape[:2], 1))], -1)
 

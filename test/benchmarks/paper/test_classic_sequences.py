@@ -15,31 +15,31 @@ from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_
 FRAMES, POINTS = 40, 12
 
 
-def rows(X):
+def rows(X: np.ndarray) -> np.ndarray:
     """(f, p, d) as a matrix with d rows a frame."""
     return X.swapaxes(1, 2).reshape(-1, X.shape[1])
 
 
 @pytest.fixture
-def shapes():
+def shapes() -> np.ndarray:
     rng = np.random.default_rng(0)
     mean, mode = rng.standard_normal((2, POINTS, 3))
     return centre(mean + 0.3 * rng.standard_normal((FRAMES, 1, 1)) * mode)
 
 
 @pytest.fixture
-def cameras():
+def cameras() -> np.ndarray:
     return random_cameras(FRAMES, np.random.default_rng(1)).astype(float)
 
 
 @pytest.fixture
-def turned(shapes, cameras):
+def turned(shapes: np.ndarray, cameras: np.ndarray) -> np.ndarray:
     """The shapes in the axes of the cameras."""
     return shapes @ rotation_from_camera(cameras).swapaxes(1, 2)
 
 
 @pytest.fixture
-def data(tmp_path: Path, shapes, cameras, turned):
+def data(tmp_path: Path, shapes: np.ndarray, cameras: np.ndarray, turned: np.ndarray) -> Path:
     """A folder of two sequences of the same object."""
     folder = tmp_path / "data" / "nrsfm"
     folder.mkdir(parents=True)
@@ -49,27 +49,29 @@ def data(tmp_path: Path, shapes, cameras, turned):
     return folder.parent
 
 
-def test_error_counts_in_standard_deviations_of_the_truth(shapes) -> None:
+def test_error_counts_in_standard_deviations_of_the_truth(shapes: np.ndarray) -> None:
     larger = 1.1 * shapes  # no rotation mends it
     expected = 0.1 * np.linalg.norm(shapes, axis=2).mean() / shapes.std(1).mean()
     assert normalised_error(larger, shapes) == pytest.approx(expected)
     assert normalised_error(10 * larger, 10 * shapes) == pytest.approx(expected)
 
 
-def test_error_forgives_one_reflection(shapes) -> None:
+def test_error_forgives_one_reflection(shapes: np.ndarray) -> None:
     turn = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
     turn *= -np.sign(np.linalg.det(turn))
     assert normalised_error(shapes @ turn, shapes) < 1e-9
 
 
-def test_error_frame_by_frame_forgives_what_the_other_does_not(shapes, turned) -> None:
+def test_error_frame_by_frame_forgives_what_the_other_does_not(
+    shapes: np.ndarray, turned: np.ndarray
+) -> None:
     assert normalised_error(turned, shapes) > 0.1
     assert normalised_error(turned, shapes, by_frame=True) < 1e-6
 
 
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_shapes_are_taken_to_the_axes_of_their_images_up_to_depth(
-    shapes, cameras, turned, mirror
+    shapes: np.ndarray, cameras: np.ndarray, turned: np.ndarray, mirror: int
 ) -> None:
     found = in_camera_axes(shapes @ np.diag([1, 1, mirror]), shapes @ cameras)
     np.testing.assert_allclose(found[..., :2], turned[..., :2], atol=1e-6)
@@ -77,7 +79,7 @@ def test_shapes_are_taken_to_the_axes_of_their_images_up_to_depth(
 
 
 def test_command_compares_all_methods_on_each_sequence(
-    data, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(classic_sequences, "RANKS", (2,))
     output = tmp_path / "output"
@@ -99,7 +101,7 @@ def test_command_compares_all_methods_on_each_sequence(
 
 
 def test_command_says_which_sequence_it_cannot_read(
-    data, capsys: pytest.CaptureFixture[str]
+    data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["--data", str(data), "--subjects", "yoga"])

@@ -16,7 +16,7 @@ from deep_nrsfm_ros.commands.evaluate import LIFTING
 
 
 @pytest.fixture
-def data(tmp_path: Path):
+def data(tmp_path: Path) -> Path:
     """A folder of 30 faces of 10 points."""
     rng = np.random.default_rng(0)
     faces = rng.standard_normal((10, 3)) + 0.1 * rng.standard_normal((30, 10, 3))
@@ -27,13 +27,13 @@ def data(tmp_path: Path):
 
 
 @pytest.fixture
-def session(data, tmp_path: Path):
+def session(data: Path, tmp_path: Path) -> Session:
     return Session(data, tmp_path / "output", (), (0,), 20, 1)
 
 
 @pytest.mark.parametrize("category", [FACES, *CATEGORIES])
 def test_each_object_is_seen_by_cameras_of_its_own(
-    session, category, monkeypatch: pytest.MonkeyPatch
+    session: Session, category: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(table2_categories, "OBJECTS", 30)
     dataset = images(session, category)
@@ -51,7 +51,7 @@ def test_each_object_is_seen_by_cameras_of_its_own(
 
 
 def test_command_compares_all_methods_on_each_category(
-    data, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batches, "RANKS", (3,))
     monkeypatch.setattr(table2_categories, "OBJECTS", 30)
@@ -73,7 +73,9 @@ def test_command_compares_all_methods_on_each_category(
         assert 0 < float(row["shape %"]) < 100
 
 
-def test_command_lists_the_categories_there_are(data, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_lists_the_categories_there_are(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as stopped:
         main(["--data", str(data), "--subjects", "wardrobe"])
     assert stopped.value.code == 2

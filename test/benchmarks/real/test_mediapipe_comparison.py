@@ -67,7 +67,9 @@ def test_a_perfect_mediapipe_makes_no_error(
     assert (output / "mediapipe_comparison.png").stat().st_size > 1000
     rows = list(csv.DictReader((output / "mediapipe_comparison.csv").open()))
     cameras = ["cam01", "cam02", "cam03", "cam04", "mean"]
-    found = {(row["trial"], row["system"]): [] for row in rows}
+    found: dict[tuple[str, str], list[dict[str, str]]] = {
+        (row["trial"], row["system"]): [] for row in rows
+    }
     for row in rows:
         found[row["trial"], row["system"]].append(row)
     assert all([row["camera"] for row in group] == cameras for group in found.values())

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.data import synthetic_excavator as excavator
 from benchmarks.real import train_from_bags
 from deep_nrsfm_ros.data.bags import read_bags
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
@@ -43,7 +44,7 @@ def test_the_video_becomes_a_bag_of_all_people_in_it(tmp_path: Path) -> None:
 
 def test_a_bag_that_was_cut_off_is_written_anew(tmp_path: Path) -> None:
     session = train_from_bags.Session(tmp_path, tmp_path, None, 1)
-    recording = train_from_bags.excavator.record(5, 0)
+    recording = excavator.record(5, 0)
     (tmp_path / "machine").mkdir()
     (tmp_path / "machine" / "machine.db3").write_bytes(b"half")
     bag = session.bag("machine", lambda: train_from_bags._work(recording))

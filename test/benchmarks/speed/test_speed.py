@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import os
 import random
+import time
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -30,6 +31,7 @@ from benchmarks.speed import (
     timing as speed,
 )
 from benchmarks.table import Table
+from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import initialise
@@ -127,7 +129,7 @@ def test_the_relay_answers_everything(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_time_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
-    monkeypatch.setattr(latency_breakdown.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
     watch = latency_breakdown.Stopwatch()
 
     def spend(seconds: float) -> None:
@@ -196,8 +198,7 @@ def test_bag_reading_gives_the_share_of_rosbags(tmp_path: Path) -> None:
 
 def test_both_readers_read_every_message(tmp_path: Path) -> None:
     points = np.random.default_rng(0).uniform(1, 9, (7, 31, 2))
-    frames = bag_reading.frames(points, np.ones((7, 31)))
-    bag_reading.write_bag(tmp_path / "bag", bag_reading.TOPIC, frames)
+    write_bag(tmp_path / "bag", bag_reading.TOPIC, frames(points, np.ones((7, 31))))
     assert [read() for read in bag_reading.readers(tmp_path / "bag").values()] == [7, 7]
 
 
