@@ -20,9 +20,10 @@ from test.fuzz.conftest import NUMBERS, SIZES, WORDS, Fuzz, Spoiler
 
 pytestmark = pytest.mark.skipif(not kernel.AVAILABLE, reason="no C compiler")
 
+COMPILED: Any = kernel._kernel  # the calls break its signatures
 REFUSALS = (TypeError, ValueError, RuntimeError)
 HUGE = (2**31 - 1, 2**32, 2**60, 2**62, 2**63 - 1, 2**63, -(2**63), 2**70, -(2**70))
-OBJECTS = (None, "x", b"", 1.5, object(), [], (), 10**400, datetime.datetime_CAPI)  # type: ignore[attr-defined]
+OBJECTS: tuple[Any, ...] = (None, "x", b"", 1.5, object(), [], (), 10**400, datetime.datetime_CAPI)
 GUARD, GUARDED = 64, 77  # items before and after an output, and their value
 
 Arguments = list[Any]
@@ -36,7 +37,7 @@ def lined(n: int, multiple: int) -> int:
 def output(*shape: int, dtype: type = np.float32) -> np.ndarray:
     """Return an array between guards."""
     size = int(np.prod(shape))
-    whole = np.full(size + 2 * GUARD, GUARDED, dtype)
+    whole: np.ndarray = np.full(size + 2 * GUARD, GUARDED, dtype)
     return whole[GUARD : GUARD + size].reshape(shape)
 
 
@@ -80,8 +81,8 @@ def plan(spoiler: Spoiler, network: Sizes | None = None) -> Arguments:
     header = [p, len(widths), rotations, *flags, spoiler.randint(0, 2), *reference, 3, bones]
     header += [*widths, *spoiler.sample(range(p), p)]
     header += [spoiler.randrange(p) for _ in range(2 * bones)]
-    panels, last = kernel._kernel.FLOATS, widths[-1]
-    wide, even = lined(p, panels), lined(p, kernel._kernel.DOUBLES)
+    panels, last = COMPILED.FLOATS, widths[-1]
+    wide, even = lined(p, panels), lined(p, COMPILED.DOUBLES)
     n = 2 * p * wide + 6 * lined(last, panels) * lined(last, panels) + last + p + 9 * even * even
     for i, width in enumerate(widths):
         before, filled = widths[i - 1], lined(width, panels)
@@ -98,7 +99,7 @@ def lift(spoiler: Spoiler, network: Sizes | None = None, made: object = None) ->
     confidence = np.abs(floats(spoiler, n, p))
     outputs = [output(n, p, 3), output(n, 3, 3), output(n), output(n, 2), output(n), output(n, p)]
     arrays = [*outputs, output(n, dtype=np.bool_)]
-    made = made or kernel._kernel.plan(*plan(spoiler, network))
+    made = made or COMPILED.plan(*plan(spoiler, network))
     return [made, floats(spoiler, n, p, 2), confidence, spoiler.choice((False, True)), *arrays]
 
 
@@ -136,8 +137,8 @@ def network_forward(
 ) -> Arguments:
     """Return arguments of `network_forward`, by a pool that is given, or else by a new one."""
     network = network or sizes(spoiler)
-    pool = pool or kernel._kernel.worker_pool(*worker_pool(spoiler, network))
-    n, kept = spoiler.choice((1, 2, 40)), kernel._kernel.activations_per_frame(pool)
+    pool = pool or COMPILED.worker_pool(*worker_pool(spoiler, network))
+    n, kept = spoiler.choice((1, 2, 40)), COMPILED.activations_per_frame(pool)
     outputs = [output(n, kept), output(n, network.p, 3), output(n, 2, 3)]
     return [pool, floats(spoiler, weights(network)), floats(spoiler, n, network.p, 2), *outputs]
 
@@ -147,8 +148,8 @@ def network_backward(
 ) -> Arguments:
     """Return arguments of `network_backward`, by a pool that is given, or else by a new one."""
     network = network or sizes(spoiler)
-    pool = pool or kernel._kernel.worker_pool(*worker_pool(spoiler, network))
-    n, kept = spoiler.choice((1, 2, 40)), kernel._kernel.activations_per_frame(pool)
+    pool = pool or COMPILED.worker_pool(*worker_pool(spoiler, network))
+    n, kept = spoiler.choice((1, 2, 40)), COMPILED.activations_per_frame(pool)
     bars = [floats(spoiler, n, network.p, 3), floats(spoiler, n, 2, 3)]
     size = weights(network)
     return [pool, floats(spoiler, size), floats(spoiler, n, kept), *bars, output(size)]
@@ -161,7 +162,7 @@ ENTRY_POINTS: dict[str, Callable[[Spoiler], Arguments]] = {
     "observe": observe,
     "choose_vectors": lambda spoiler: [spoiler.choice((16, 32, 64))],
     "worker_pool": worker_pool,
-    "activations_per_frame": lambda s: [kernel._kernel.worker_pool(*worker_pool(s))],
+    "activations_per_frame": lambda s: [COMPILED.worker_pool(*worker_pool(s))],
     "network_forward": network_forward,
     "network_backward": network_backward,
 }
@@ -191,7 +192,7 @@ def spoil_array(spoiler: Spoiler, array: np.ndarray) -> Any:
         spoilt = array.copy()
         spoilt.setflags(write=False)
         return spoilt
-    return spoiler.choice((array.tobytes(), bytearray(array), memoryview(array), array.tolist()))
+    return spoiler.choice((array.tobytes(), bytearray(array), array.data, array.tolist()))
 
 
 def spoil_argument(spoiler: Spoiler, value: Any) -> Any:
@@ -211,7 +212,7 @@ def spoil_argument(spoiler: Spoiler, value: Any) -> Any:
         return spoiler.choice((*NUMBERS, 10**400))
     # A capsule: one of another network, or of another kind.
     make = spoiler.choice([name for name in ("plan", "worker_pool") if name in names()])
-    return getattr(kernel._kernel, make)(*ENTRY_POINTS[make](spoiler))
+    return getattr(COMPILED, make)(*ENTRY_POINTS[make](spoiler))
 
 
 def spoil(spoiler: Spoiler, arguments: Arguments) -> Arguments:
@@ -233,7 +234,7 @@ def spoil(spoiler: Spoiler, arguments: Arguments) -> Arguments:
 
 def names() -> set[str]:
     """Return the names of the kernel's entry points, but of those that are about to go."""
-    found = {name for name, _ in inspect.getmembers(kernel._kernel, inspect.isbuiltin)}
+    found = {name for name, _ in inspect.getmembers(COMPILED, inspect.isbuiltin)}
     return found - {"workers", "gradient"}
 
 
@@ -242,7 +243,7 @@ def called(name: str, arguments: Arguments) -> Any:
     outputs = [a for a in arguments if isinstance(a, np.ndarray) and a.base is not None]
     guarded = [a for a in outputs if a.flags.writeable and guards_are_whole(a)]
     try:
-        return getattr(kernel._kernel, name)(*arguments)
+        return getattr(COMPILED, name)(*arguments)
     finally:
         assert all(map(guards_are_whole, guarded))
 
@@ -260,7 +261,7 @@ def test_valid_arguments_are_accepted() -> None:
 @pytest.fixture(autouse=True)
 def _widest_vectors() -> Any:
     yield
-    kernel._kernel.choose_vectors(64)
+    COMPILED.choose_vectors(64)
 
 
 def test_a_call_is_computed_or_refused(fuzz: Fuzz) -> None:
@@ -296,9 +297,9 @@ def test_a_plan_lifts_once_at_a_time() -> None:
         def __buffer__(self, flags: int) -> memoryview:
             arguments[1] = points
             with pytest.raises(RuntimeError, match="in use"):
-                kernel._kernel.lift(*arguments)
+                COMPILED.lift(*arguments)
             return memoryview(points)
 
     arguments[1] = Reentrant()
-    kernel._kernel.lift(*arguments)
+    COMPILED.lift(*arguments)
     assert arguments[1] is points
