@@ -33,6 +33,7 @@ from deep_nrsfm_ros.commands.evaluate import figures as errors_in_words
 from deep_nrsfm_ros.data.bags import Frame, frames, read_bags, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.openpose import read_people
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.presets import BODY25, CMU31, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
@@ -126,7 +127,7 @@ def video(session: Session) -> Table:
         "human, tuned to it": session.trained("tuned", "tuned", *words, "--from", "human"),
         "human": shipped,
     }
-    seen = read_bags([bag], TOPIC, BODY25, HUMAN17, min_confidence=0.1).dataset
+    seen = read_bags([bag], BODY25, HUMAN17, ReadOptions(TOPIC, min_confidence=0.1)).dataset
     lifted = {
         name: lift_all(Lifter(model).lift, seen.points, seen.visible.astype(np.float32))
         for name, model in models.items()
@@ -191,7 +192,7 @@ def machine(session: Session) -> Table:
         bars("shape %", "proper %"),
     )
     for name, recording in recordings.items():
-        seen = read_bags([bags[name]], TOPIC, layout, layout).dataset
+        seen = read_bags([bags[name]], layout, layout, ReadOptions(TOPIC)).dataset
         confidence = seen.visible.astype(np.float32)
         truth = centre(recording.truth)
         shapes = {

@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks.speed.timing import arguments, by_turns, on_one_thread, show
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.bags import STORAGES, frames, read_bags, write_bag
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.presets import CMU31
 
 TOPIC = "/keypoints"
@@ -64,7 +65,7 @@ def readers(bag: Path) -> dict[str, Callable[[], int]]:
     """Return both ways to read a bag; each returns how many messages it read."""
 
     def ours() -> int:
-        return read_bags([bag], TOPIC, CMU31, CMU31).messages
+        return read_bags([bag], CMU31, CMU31, ReadOptions(TOPIC)).messages
 
     return {BARE: lambda: decode(bag), OURS: ours}
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.extras import how_to_install, is_installed
 from deep_nrsfm_ros.training.limits import Limits
 
@@ -150,7 +151,7 @@ def check_bags() -> Finding:
         with tempfile.TemporaryDirectory() as folder:
             bag = Path(folder) / "bag"
             write_bag(bag, "/keypoints", frames(points, np.ones((10, 17))), storage)
-            read = read_bags([bag], "/keypoints", HUMAN17, HUMAN17).dataset
+            read = read_bags([bag], HUMAN17, HUMAN17, ReadOptions("/keypoints")).dataset
             if not np.allclose(read.points, points, rtol=1e-4):
                 mend = "pip install --force-reinstall rosbags"
                 return Finding(f"{storage}: what was read is not what was written", mend)

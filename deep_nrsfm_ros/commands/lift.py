@@ -16,6 +16,7 @@ from deep_nrsfm_ros.data.camera_file import read_camera_file
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import KINDS, read_keypoints
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, lift_recording
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
@@ -93,13 +94,15 @@ def read_objects(given: argparse.Namespace, source: KeypointLayout) -> Detection
         seen = read_keypoints(
             given.input,
             len(source),
-            topic=given.topic,
-            rate=given.rate,
-            min_confidence=inputs.min_confidence,
+            ReadOptions(
+                topic=given.topic,
+                rate=given.rate,
+                min_confidence=inputs.min_confidence,
+                mapping=read_mapping(Path(given.mapping).expanduser()) if given.mapping else None,
+                image_size=inputs.image_size,
+            ),
             on_progress=on_progress,
             warn=warn,
-            mapping=read_mapping(Path(given.mapping).expanduser()) if given.mapping else None,
-            size=inputs.image_size,
         )
     return seen.largest() if given.objects == "largest" else seen
 

@@ -20,9 +20,10 @@ from safetensors import SafetensorError
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments, override
-from deep_nrsfm_ros.data.bags import most_keypoints, read_bags
+from deep_nrsfm_ros.data.bags import keypoint_count, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.sufficiency import Sufficiency
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -123,12 +124,14 @@ def read_data(given: argparse.Namespace, report: Reporter) -> Dataset:
     source, target = read_layouts(given)
     if given.bag:
         size = (given.image_width, given.image_height)
-        reading = read_bags(
-            *(given.bag, given.topic, source, target, given.min_confidence, report.reading),
-            max_frames=override(Limits(), given).max_frames,
+        options = ReadOptions(
+            topic=given.topic,
+            min_confidence=given.min_confidence,
             mapping=_mapping(given),
-            size=size if all(size) else None,
+            image_size=size if all(size) else None,
+            max_frames=override(Limits(), given).max_frames,
         )
+        reading = read_bags(given.bag, source, target, options, report.reading)
         for warning in reading.warnings:
             report.warn(warning)
         if reading.unreadable:
@@ -151,7 +154,8 @@ def read_layouts(given: argparse.Namespace) -> tuple[KeypointLayout, KeypointLay
                 f"--object {NUMBERED} takes the points of bags as they come; "
                 "leave out --keypoint-layout and --cmu, or name an object"
             )
-        points = KeypointLayout.numbered(most_keypoints(given.bag, given.topic, _mapping(given)))
+        options = ReadOptions(given.topic, mapping=_mapping(given))
+        points = KeypointLayout.numbered(keypoint_count(given.bag, options))
         return points, points
     target = find_layout("--object", given.object or HUMAN17.name)
     named = given.keypoint_layout

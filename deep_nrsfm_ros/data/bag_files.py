@@ -1,7 +1,7 @@
-"""The raw messages of a bag, as far as they can be read.
+"""The serialised messages of a bag, also of a damaged one.
 
-A recording that was cut off (power lost, disk full, recorder killed) has no index, no metadata or
-half a page at its end. Its readable part is given, with a warning that says what is lost.
+A recording that was cut off (power failure, full disk, killed recorder) has no index, no metadata
+or an incomplete page at its end. Its readable part is read, and a warning says what is lost.
 """
 
 from __future__ import annotations
@@ -23,13 +23,17 @@ SUFFIXES = (".db3", ".mcap")
 
 
 class BagError(ValueError):
-    """A bag that cannot be read or written: names the bag and the mend."""
+    """A bag cannot be read or written; the message names the bag and the remedy."""
 
 
 class Topic(NamedTuple):
-    """A topic of a bag: its name, type ("sensor_msgs/msg/PointCloud2") and number of messages.
+    """A topic of a bag.
 
-    definition: of the type, in the words of a .msg or .idl file; "" if the bag has none.
+    Attributes:
+        name: e.g. "/keypoints".
+        type: e.g. "sensor_msgs/msg/PointCloud2".
+        total: number of messages; of a damaged bag, as far as it is known.
+        definition: definition of the type in .msg or .idl format; "" if the bag has none.
     """
 
     name: str
@@ -39,35 +43,40 @@ class Topic(NamedTuple):
 
     @property
     def input_type(self) -> str:
-        """Return the type as `messages.INPUT_TYPES` write it."""
+        """Return the type as `messages.INPUT_TYPES` have it, e.g. "sensor_msgs/PointCloud2"."""
         return self.type.replace("/msg/", "/")
 
 
 class Record(NamedTuple):
-    """A message as it was recorded: when, in ns, and its serialised bytes."""
+    """A recorded message: time of recording in ns, and serialised bytes."""
 
     time: int
     raw: bytes
 
 
 class _Storage(Protocol):
-    """What reads one bag or one of its files."""
+    """A reader of a bag or of one of its files."""
 
     def topics(self) -> list[Topic]:
-        """Return what is there."""
+        """Return the topics."""
 
     def records(self, name: str) -> Iterator[Record]:
-        """Yield the records of a topic; raise anything where the file is damaged."""
+        """Yield the records of a topic; raise any exception where the file is damaged."""
 
     def close(self) -> None:
-        """Free the file."""
+        """Close the file."""
 
 
 class BagFile:
-    """An open bag. Close it after use."""
+    """An open bag; close it after use.
+
+    Attributes:
+        path: bag folder or file.
+        topics: all topics.
+    """
 
     def __init__(self, path: Path, storages: list[_Storage], problem: str) -> None:
-        """Take over open storages; `problem` says what was wrong when they were opened."""
+        """Take over open storages; `problem` says what is damaged, "" if nothing is."""
         self.path, self._storages, self._problem = path, storages, problem
         counts: Counter[tuple[str, str]] = Counter()
         definitions: dict[str, str] = {}
@@ -82,48 +91,55 @@ class BagFile:
             Topic(name, kind, max(count, recorded.get(name, 0)), definitions[kind])
             for (name, kind), count in counts.items()
         ]
-        self._given: Counter[str] = Counter()
+        self._read: Counter[str] = Counter()  # messages read so far, by topic
 
     def messages(self, topic: Topic) -> Iterator[bytes]:
-        """Yield the serialised messages of `topic`, by time within each file."""
+        """Yield the serialised messages of a topic, in order of time within each file."""
         return (record.raw for record in self.records(topic))
 
     def records(self, topic: Topic) -> Iterator[Record]:
-        """Yield the messages of `topic` with their times, by time within each file."""
+        """Yield the records of a topic, in order of time within each file.
+
+        Where a file is damaged it ends without an exception; see `warning`.
+        """
         for storage in self._storages:
             try:
                 for record in storage.records(topic.name):
-                    self._given[topic.name] += 1
+                    self._read[topic.name] += 1
                     yield record
             except GeneratorExit:
                 raise
-            except Exception as error:  # damaged files fail in many ways; what was read counts
+            except Exception as error:  # a damaged file fails in many ways; keep what was read
                 self._problem = self._problem or str(error)
 
     def warning(self, topic: Topic) -> str:
-        """Return what is lost of `topic` once it has been read, or "" for a sound bag."""
+        """Return a sentence on the lost messages of a topic after reading it; "" if none is."""
         if not self._problem:
             return ""
-        given, lost = self._given[topic.name], topic.total - self._given[topic.name]
-        share = f"{lost} of {topic.total} messages are lost" if lost > 0 else "its end may be lost"
-        return f"bag {self.path} is damaged ({self._problem}); read {given} messages, {share}"
+        read, lost = self._read[topic.name], topic.total - self._read[topic.name]
+        loss = f"{lost} of {topic.total} messages are lost" if lost > 0 else "its end may be lost"
+        return f"bag {self.path} is damaged ({self._problem}); read {read} messages, {loss}"
 
     def close(self) -> None:
-        """Free the files."""
+        """Close the files."""
         for storage in self._storages:
             storage.close()
 
 
 def open_bag(path: Path) -> BagFile:
-    """Open a bag folder or a single .db3 or .mcap file, sound or cut off.
+    """Open a bag, sound or damaged.
 
-    Raises BagError when the bag is missing, is no bag, or nothing of it can be read.
+    Args:
+        path: bag folder, or a single .db3 or .mcap file.
+
+    Raises:
+        BagError: the bag is missing, is no bag, or nothing of it can be read.
     """
     if not path.exists():
         raise BagError(f"bag {path} does not exist")
     try:
         return BagFile(path, [_Sound(path)], "")
-    except Exception as error:  # rosbags raises many kinds for a damaged bag
+    except Exception as error:  # a damaged bag makes rosbags raise exceptions of many types
         problem = str(error)
     files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES) if path.is_dir() else [path]
     storages: list[_Storage] = []
@@ -140,7 +156,7 @@ def open_bag(path: Path) -> BagFile:
 
 
 def lifter_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
-    """Return the topics `points` and `camera_rotation` of every lifter that was recorded."""
+    """Return the pair of topics `points` and `camera_rotation` of every recorded lifter."""
     topics = {topic.name: topic for topic in bag.topics}
     pairs = []
     for name, points in topics.items():
@@ -151,7 +167,7 @@ def lifter_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
 
 
 def _recorded_counts(path: Path) -> dict[str, int]:
-    """Return the messages per topic that metadata.yaml speaks of, if it is there and sound."""
+    """Return the number of messages per topic in metadata.yaml; {} if it is missing or damaged."""
     with suppress(Exception):
         text = (path / "metadata.yaml").read_text()
         topics = yaml.safe_load(text)["rosbag2_bagfile_information"]
@@ -163,21 +179,21 @@ def _recorded_counts(path: Path) -> dict[str, int]:
 
 
 def _topic(connection: Any, total: int) -> Topic:
-    """Return a connection of rosbags as a topic."""
+    """Return a connection of rosbags as a topic with `total` messages."""
     return Topic(connection.topic, connection.msgtype, total, connection.msgdef.data)
 
 
 class _Sound:
-    """A bag, or a file of one, that rosbags can read."""
+    """A sound bag or bag file, read by rosbags."""
 
     def __init__(self, path: Path) -> None:
-        """Open; raise what rosbags raises."""
+        """Open the bag; raise what rosbags raises."""
         self._reader = Reader(path)
         self._reader.open()
         self.close = self._reader.close
 
     def topics(self) -> list[Topic]:
-        """Return what is there."""
+        """Return the topics."""
         return [_topic(c, c.msgcount) for c in self._reader.connections]
 
     def records(self, name: str) -> Iterator[Record]:
@@ -188,13 +204,13 @@ class _Sound:
 
 
 class _CutMcap:
-    """An mcap file without its end: records are read one after the other up to the cut."""
+    """An mcap file without its end; records are scanned one by one up to the cut."""
 
     def __init__(self, path: Path) -> None:
-        """Find the topics; raise ValueError when even the beginning is missing."""
+        """Find the topics; raise ValueError if the beginning is missing."""
         self._reader: Any = McapReader(path)
         with suppress(Exception):
-            self._reader.open()  # fails for want of the index, after finding the first record
+            self._reader.open()  # fails without an index, but has found the first record
         self._reader.bio, self._reader.data_end = path.open("rb"), path.stat().st_size
         self.close = self._reader.close
         if not self._reader.data_start:
@@ -204,7 +220,7 @@ class _CutMcap:
             self._reader.meta_scan()
 
     def topics(self) -> list[Topic]:
-        """Return what is there; how many messages is unknown."""
+        """Return the topics; the number of messages is unknown."""
         return [_topic(c, 0) for c in self._reader.connections]
 
     def records(self, name: str) -> Iterator[Record]:
@@ -218,20 +234,20 @@ class _CutSqlite:
     """An sqlite3 file without its end."""
 
     def __init__(self, path: Path) -> None:
-        """Find the topics; raise sqlite3.Error when even they are missing."""
+        """Find the topics; raise sqlite3.Error if they are missing."""
         self._copy = _whole_pages(path)
         uri = Path(self._copy.name).absolute().as_uri()
         self._file = sqlite3.connect(f"{uri}?immutable=1", uri=True)
-        # Otherwise sqlite refuses a file shorter than its header says.
+        # Without it SQLite refuses a file that is shorter than its header says.
         self._file.execute("PRAGMA writable_schema = ON")
         self._topics = self._file.execute("SELECT id, name, type FROM topics").fetchall()
         self._definitions: dict[str, str] = {}
-        with suppress(sqlite3.Error):  # older bags have none
-            found = "SELECT topic_type, encoded_message_definition FROM message_definitions"
-            self._definitions = dict(self._file.execute(found).fetchall())
+        with suppress(sqlite3.Error):  # older bags have no definitions
+            query = "SELECT topic_type, encoded_message_definition FROM message_definitions"
+            self._definitions = dict(self._file.execute(query).fetchall())
 
     def topics(self) -> list[Topic]:
-        """Return what is there; how many messages is unknown."""
+        """Return the topics; the number of messages is unknown."""
         return [
             Topic(name, kind, 0, self._definitions.get(kind, "")) for _, name, kind in self._topics
         ]
@@ -245,7 +261,7 @@ class _CutSqlite:
                 yield Record(time, raw)
 
     def close(self) -> None:
-        """Free the file."""
+        """Close the file."""
         self._file.close()
         self._copy.close()
 
@@ -253,11 +269,11 @@ class _CutSqlite:
 def _whole_pages(path: Path) -> IO[bytes]:
     """Return the open sqlite3 file, or a temporary copy without the torn page at its end.
 
-    sqlite would take the missing part of a torn page for zeros and give a message half empty.
+    SQLite would read the missing part of a torn page as zeros and return half a message.
     """
     file = path.open("rb")
     page, size = int.from_bytes(file.read(18)[16:], "big"), path.stat().st_size
-    page = 65536 if page == 1 else page  # as the format has it
+    page = 65536 if page == 1 else page  # the SQLite format encodes 65536 as 1
     if not page or size % page == 0:
         return file
     copy = NamedTemporaryFile(suffix=path.suffix)  # noqa: SIM115 - the caller closes it

@@ -1,4 +1,4 @@
-"""Bags to datasets and keypoints to bags: rosbag2, both storages, no ROS needed."""
+"""Bags to datasets, and keypoints to bags: rosbag2 with both storages, without ROS."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.dataset import Dataset, DatasetBuilder
+from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import MessageError
@@ -31,24 +32,25 @@ from deep_nrsfm_ros.messages.decoding import (
     pack_points,
     read_observation,
 )
-from deep_nrsfm_ros.messages.field_mapping import FieldMapping, Size
 from deep_nrsfm_ros.messages.serialised import MessageReader
 
 STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
 Progress = Callable[[int, int], None]
-"""Called with the number of messages read so far and the number there are."""
+"""Called with the number of items done and their total number."""
 
-_SAMPLE = 256  # messages of a bag that tell how many keypoints there are
+_SAMPLE = 256  # messages of a bag that `keypoint_count` looks at
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 class BagReading(NamedTuple):
-    """What `read_bags` found.
+    """The result of `read_bags`.
 
-    dataset: every object of every readable message is a frame.
-    messages: how many messages the topic gave, the unreadable ones among them.
-    unreadable: how many of them were dropped; `reason` says why, for the first of them.
-    warnings: one sentence for each bag of which a part is lost.
+    Attributes:
+        dataset: a frame for every object of every readable message, in the order of the bags.
+        messages: number of messages on the topic, readable or not.
+        unreadable: number of them that could not be read.
+        reason: why the first unreadable message could not be read; "" if all could.
+        warnings: a sentence for each damaged bag that says what is missing.
     """
 
     dataset: Dataset
@@ -60,101 +62,116 @@ class BagReading(NamedTuple):
 
 def read_bags(
     paths: Sequence[Path],
-    topic: str,
     source: KeypointLayout,
     target: KeypointLayout,
-    min_confidence: float = 0.0,
+    options: ReadOptions = DEFAULT_READ_OPTIONS,
     on_progress: Progress | None = None,
-    max_frames: int | None = None,
-    mapping: FieldMapping | None = None,
-    size: Size | None = None,
 ) -> BagReading:
-    """Read the keypoints of all bags into one dataset in the layout `target`.
+    """Return the keypoints of all bags as one dataset; memory stays below about twice its size.
 
-    paths: bag folders or single .db3 or .mcap files.
-    topic: name of the topic, or of several by a `*` (see `topics.match`); "" takes the only one of
-        the mapping's type, or of a type in `messages.INPUT_TYPES`.
-    source: the layout in which the detector wrote the messages.
-    max_frames: more than these raise BagError.
-    mapping: how messages of its type are read. size: of the image, for normalised keypoints.
-    Memory stays within about twice the dataset. Raises BagError naming the bag when one is
-    missing, damaged beyond reading or without such a topic, or when no message is readable.
+    Args:
+        paths: bag folders, or single .db3 or .mcap files.
+        source: layout in which the detector wrote the messages.
+        target: layout of the dataset.
+        options: topic, mapping and limits.
+        on_progress: called after every 256 messages.
+
+    Raises:
+        BagError: a bag is missing, damaged beyond reading or without such a topic; no message is
+            readable; or there are more frames than `options.max_frames`. It names the bag.
     """
-    frames, warnings = DatasetBuilder(KeypointMap(source, target), min_confidence), []
+    builder, warnings = DatasetBuilder(KeypointMap(source, target), options.min_confidence), []
     messages, unreadable, reason = 0, 0, ""
     if not paths:
         raise BagError("no bag to read; name at least one")
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
-            for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
-                done, reader = messages, MessageReader(kind, decode)
-                for raw in bag.messages(chosen):
+            for topic, input_type, decode in keypoint_topics(bag, options.topic, options.mapping):
+                before, reader = messages, MessageReader(input_type, decode)
+                for raw in bag.messages(topic):
                     messages += 1
                     try:
-                        if make := reader.find_format(raw, len(source)):
-                            frames.take(make, raw)
-                        else:
-                            frames.add(reader(raw, len(source), min_confidence, size)[1])
-                    except Exception as error:  # whatever bytes a bag holds, others still count
+                        _add(builder, reader, raw, len(source), options)
+                    except Exception as error:  # damaged bytes fail in many ways; read the others
                         unreadable += 1
-                        reason = reason or _text(error)
-                    if max_frames is not None and frames.count > max_frames:
+                        reason = reason or _reason(error)
+                    if options.max_frames is not None and builder.count > options.max_frames:
                         raise BagError(
-                            f"bag {path} brings the frames above {max_frames}, the most that are "
-                            "read (max_frames); name fewer bags, or allow more"
+                            f"bag {path} brings the frames above {options.max_frames}, the most "
+                            "that are read (max_frames); name fewer bags, or allow more"
                         )
                     if on_progress and messages % 256 == 0:
-                        on_progress(messages, max(messages, done + chosen.total))
-                if warning := bag.warning(chosen):
+                        on_progress(messages, max(messages, before + topic.total))
+                if warning := bag.warning(topic):
                     warnings.append(warning)
     names = ", ".join(path.name for path in map(Path, paths))
     if messages == unreadable:
         raise BagError(f"no readable message in {names} ({messages} found); {reason or 'empty'}")
     if on_progress:
         on_progress(messages, messages)
-    dataset = frames.dataset(f"bags {names}")
+    dataset = builder.dataset(f"bags {names}")
     return BagReading(dataset, messages, unreadable, reason, tuple(warnings))
 
 
-def most_keypoints(paths: Sequence[Path], topic: str, mapping: FieldMapping | None = None) -> int:
-    """Return how many keypoints the objects in the bags have, for an object nobody has described.
+def _add(
+    builder: DatasetBuilder, reader: MessageReader, raw: bytes, keypoints: int, options: ReadOptions
+) -> None:
+    """Add the objects of a serialised message of `keypoints` keypoints to a dataset."""
+    if known_format := reader.find_format(raw, keypoints):
+        builder.add_serialised(known_format, raw)
+    else:
+        builder.add(reader(raw, keypoints, options.min_confidence, options.image_size)[1])
 
-    Looks at the first messages of each bag and takes the number that most of them have, since a
-    detector may send others while it sees nothing; or the highest, of a detector that leaves out
-    what it does not see. Raises BagError if no message tells.
+
+def keypoint_count(paths: Sequence[Path], options: ReadOptions = DEFAULT_READ_OPTIONS) -> int:
+    """Return the number of keypoints of the objects in bags, for an object without a layout.
+
+    It looks at the first 256 messages of each bag and takes the most frequent number, since a
+    detector may write another number when it detects nothing. For detectors that omit missing
+    keypoints it takes the largest number.
+
+    Args:
+        paths: bag folders, or single .db3 or .mcap files.
+        options: topic and mapping.
+
+    Raises:
+        BagError: no message has keypoints.
     """
     counts: Counter[int] = Counter()
-    reason, partial = "", False
+    reason, may_omit = "", False
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
-            for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
-                partial |= may_omit_keypoints(kind)
-                for raw in islice(bag.messages(chosen), _SAMPLE):
+            for topic, input_type, decode in keypoint_topics(bag, options.topic, options.mapping):
+                may_omit |= may_omit_keypoints(input_type)
+                for raw in islice(bag.messages(topic), _SAMPLE):
                     try:
                         message = decode(raw)
-                        count = count_keypoints(message, kind)
+                        count = count_keypoints(message, input_type)
                         if count:
-                            read_observation(
-                                message, kind, count, size=(1, 1)
-                            )  # a damaged one says anything
+                            # Only a readable message counts: damaged ones have any number.
+                            read_observation(message, input_type, count, size=(1, 1))
                             counts[count] += 1
                     except Exception as error:  # as in read_bags
-                        reason = reason or _text(error)
+                        reason = reason or _reason(error)
     if not counts:
         names = ", ".join(path.name for path in map(Path, paths))
         raise BagError(f"no message in {names} tells how many keypoints there are; {reason}")
-    return max(counts) if partial else counts.most_common(1)[0][0]
+    return max(counts) if may_omit else counts.most_common(1)[0][0]
 
 
-def _text(error: Exception) -> str:
-    """Return why a message is unreadable."""
+def _reason(error: Exception) -> str:
+    """Return in words why a message is unreadable."""
     return str(error) if isinstance(error, MessageError) else f"cannot be decoded: {error!r}"
 
 
 class Frame(NamedTuple):
     """One message to write: n objects of q keypoints.
 
-    stamp: ns. points: (n, q, 2). confidence: (n, q), 0 where missing. frame_id: the camera.
+    Attributes:
+        stamp: time in ns.
+        points: (n, q, 2) in pixels, x right and y down.
+        confidence: (n, q) in [0, 1], 0 where missing.
+        frame_id: name of the camera.
     """
 
     stamp: int
@@ -170,10 +187,14 @@ def frames(
     frame_id: str = "camera",
     start: int = 0,
 ) -> Iterator[Frame]:
-    """Yield one frame each of points (f, q, 2) and confidence (f, q), `rate` a second.
+    """Yield a frame with one object for each row of the arrays.
 
-    start: stamp of the first frame in ns. A `Dataset` gives `points` and, as confidence,
-    `visible`.
+    Args:
+        points: (f, q, 2), e.g. `points` of a `Dataset`.
+        confidence: (f, q), 0 where missing, e.g. `visible` of a `Dataset`.
+        rate: frames per second.
+        frame_id: name of the camera.
+        start: stamp of the first frame in ns.
     """
     for i in range(len(points)):
         yield Frame(
@@ -188,10 +209,19 @@ def write_bag(
     storage: str = "sqlite3",
     input_type: str = POINT_CLOUD,
 ) -> int:
-    """Write the frames as messages of `input_type` into a new bag; return how many.
+    """Write frames into a new bag and return the number of messages.
 
-    storage: "sqlite3" or "mcap". A missing keypoint is written as NaN with confidence 0.
-    Raises BagError if `path` exists.
+    A missing keypoint is written as NaN with confidence 0.
+
+    Args:
+        path: folder of the new bag.
+        topic: name of its only topic.
+        frames: the messages, in order of time.
+        storage: "sqlite3" or "mcap".
+        input_type: type of the messages, one of `messages.INPUT_TYPES`.
+
+    Raises:
+        BagError: `path` exists.
     """
     if path.exists():
         raise BagError(f"bag {path} exists already; choose another name or remove it")
@@ -206,7 +236,7 @@ def write_bag(
 
 
 def _make(kind: str, *values: Any) -> Any:
-    """Return a message of the type `kind`, fields in order."""
+    """Return a message of type `kind` with the values of its fields, in order."""
     return _STORE.types[kind](*values)
 
 
@@ -232,7 +262,7 @@ def _point_cloud(frame: Frame) -> Any:
 
 
 def point_cloud(header: Any, points: NDArray[np.floating], confidence: NDArray[np.floating]) -> Any:
-    """Return points (n, q, 2 or 3) with confidence (n, q) as a PointCloud2 for a bag."""
+    """Return points (n, q, 2 or 3) and confidence (n, q) as a PointCloud2 to write to a bag."""
     n, q = confidence.shape
     fields = [_make("sensor_msgs/msg/PointField", name, at, 7, 1) for name, at in POINT_FIELDS]
     data = np.frombuffer(pack_points(points, confidence), np.uint8)
@@ -253,7 +283,7 @@ def _multi_array(frame: Frame) -> Any:
 
 
 def _polygon(frame: Frame) -> Any:
-    """Return the frame, of one object, as a PolygonStamped."""
+    """Return a frame with one object as a PolygonStamped."""
     (triples,) = _triples(frame).tolist()
     points = [_make("geometry_msgs/msg/Point32", *triple) for triple in triples]
     polygon = _make("geometry_msgs/msg/Polygon", points)

@@ -1,4 +1,4 @@
-"""The dataset: every observation of one object or object category, from whatever source."""
+"""The dataset: 2D keypoints of one object or object category in many frames, from any source."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.messages.serialised import SerialisedFormat
 
-_BLOCK = 4096  # objects mapped and stored together
-_RUN = 2**20  # bytes of messages of one make that are read together
+_BLOCK = 4096  # objects that are mapped and stored together
+_RUN_BYTES = 2**20  # messages of one format that are read together
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """The set of 2D projections that a model is trained on.
+    """The f frames that a model is trained on, each with p keypoints of one object.
 
-    points: (f, p, 2) float32, x right and y down, any unit; the values of missing points are 0.
-    visible: (f, p) bool.
-    layout: names of the p keypoints.
-    source: where the frames come from, in words, for the provenance of a model.
-    shapes: (f, p, 3) float32 ground truth in the frame of the data, or None. For evaluation
-        only: nothing that trains reads it.
+    Attributes:
+        points: (f, p, 2) float32, x right and y down, in any unit; 0 where missing.
+        visible: (f, p) bool, False where missing.
+        layout: names of the p keypoints.
+        source: where the frames come from, in words, for the provenance of a model.
+        shapes: (f, p, 3) float32 ground truth in the axes of the data, or None. Only evaluation
+            reads it, training never does.
     """
 
     points: NDArray[np.float32]
@@ -35,7 +36,7 @@ class Dataset:
     shapes: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit each other or the layout."""
+        """Raise ValueError if the shapes of the arrays do not match each other or the layout."""
         f, p = len(self.points), len(self.layout)
         if self.points.shape != (f, p, 2):
             raise ValueError(f"points are {self.points.shape}; layout needs (frames, {p}, 2)")
@@ -49,16 +50,20 @@ class Dataset:
         return len(self.points)
 
     def __getitem__(self, frames: slice | NDArray[np.int64]) -> Dataset:
-        """Return the dataset of the chosen frames."""
+        """Return the dataset of a slice, or of indices, of the frames."""
         shapes = None if self.shapes is None else self.shapes[frames]
         return Dataset(self.points[frames], self.visible[frames], self.layout, self.source, shapes)
 
 
 def concatenate(datasets: list[Dataset]) -> Dataset:
-    """Return all frames as one dataset; the layouts must be the same.
+    """Return the frames of all datasets as one.
 
-    The ground truth is kept only if every part has it. Raises ValueError for none, or for
-    layouts that differ.
+    Args:
+        datasets: at least one, all of the same layout. The result has a ground truth only if
+            all of them have one.
+
+    Raises:
+        ValueError: there is no dataset, or the layouts differ.
     """
     if not datasets:
         raise ValueError("no datasets to concatenate; name at least one bag or trial")
@@ -76,63 +81,70 @@ def concatenate(datasets: list[Dataset]) -> Dataset:
 
 
 class DatasetBuilder:
-    """Objects gathered block by block, so that memory holds arrays, not messages.
+    """Builds a dataset from messages, block by block, so that memory holds arrays, not messages.
 
-    count: how many there are.
+    Attributes:
+        count: number of objects added.
     """
 
     def __init__(self, keypoint_map: KeypointMap, min_confidence: float) -> None:
-        """Start empty; a keypoint of a message that is taken needs `min_confidence`."""
+        """Start with an empty dataset.
+
+        Args:
+            keypoint_map: from the layout of the messages to the layout of the dataset.
+            min_confidence: keypoints of serialised messages below it are missing.
+        """
         self._map, self._min_confidence = keypoint_map, min_confidence
         self.count = 0
-        self._make: SerialisedFormat | None = None
-        self._run: list[bytes] = []  # messages of that make, not yet read
-        self._waiting: list[Observation] = []  # not yet mapped
-        self._objects = 0  # in those
+        self._format: SerialisedFormat | None = None
+        self._run: list[bytes] = []  # messages of that format, not yet read
+        self._pending: list[Observation] = []  # not yet mapped
+        self._pending_objects = 0
         self._points: list[NDArray[np.float32]] = []
         self._visible: list[NDArray[np.bool_]] = []
 
-    def take(self, make: SerialisedFormat, raw: bytes) -> None:
-        """Append the objects of a message of a known make, to be read with others of it."""
-        if make is not self._make or len(self._run) * len(raw) > _RUN:
-            self._read()
-            self._make = make
+    def add_serialised(self, known_format: SerialisedFormat, raw: bytes) -> None:
+        """Add the objects of a serialised message; messages of one format are read together."""
+        if known_format is not self._format or len(self._run) * len(raw) > _RUN_BYTES:
+            self._read_run()
+            self._format = known_format
         self._run.append(raw)
-        self.count += make.cloud.height
+        self.count += known_format.cloud.height
 
     def add(self, observation: Observation) -> None:
-        """Append the objects of one observation."""
-        self._read()
-        self._wait(observation)
+        """Add the objects of one observation."""
+        self._read_run()
+        self._add_pending(observation)
         self.count += len(observation.confidence)
 
-    def _read(self) -> None:
-        """Read the run."""
-        if self._make and self._run:
-            self._wait(self._make.read(self._run, self._min_confidence))
+    def _read_run(self) -> None:
+        """Read the serialised messages of the run."""
+        if self._format and self._run:
+            self._add_pending(self._format.read(self._run, self._min_confidence))
             self._run.clear()
 
-    def _wait(self, observation: Observation) -> None:
-        """Keep the objects of one observation until there are enough to map."""
-        self._waiting.append(observation)
-        self._objects += len(observation.confidence)
-        if self._objects + len(self._waiting) >= _BLOCK:  # some show none
-            self._store()
+    def _add_pending(self, observation: Observation) -> None:
+        """Keep an observation until there are enough objects to map."""
+        self._pending.append(observation)
+        self._pending_objects += len(observation.confidence)
+        # Observations without an object count too: they take memory.
+        if self._pending_objects + len(self._pending) >= _BLOCK:
+            self._map_pending()
 
-    def _store(self) -> None:
-        """Map what is waiting to the target layout."""
-        if self._waiting:
-            points = np.concatenate([seen.points for seen in self._waiting])
-            confidence = np.concatenate([seen.confidence for seen in self._waiting])
+    def _map_pending(self) -> None:
+        """Map the pending observations to the layout of the dataset."""
+        if self._pending:
+            points = np.concatenate([each.points for each in self._pending])
+            confidence = np.concatenate([each.confidence for each in self._pending])
             points, confidence = self._map(points, confidence)
             self._points.append(points)
             self._visible.append(confidence > 0)
-            self._waiting.clear()
-            self._objects = 0
+            self._pending.clear()
+            self._pending_objects = 0
 
     def dataset(self, source: str) -> Dataset:
-        """Return everything that was taken and added, in that order."""
-        self._read()
-        self._store()
+        """Return the dataset of all objects, in the order in which they were added."""
+        self._read_run()
+        self._map_pending()
         points, visible = np.concatenate(self._points), np.concatenate(self._visible)
         return Dataset(points, visible, self._map.target, source)

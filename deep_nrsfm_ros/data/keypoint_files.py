@@ -1,4 +1,4 @@
-"""Keypoint files of any kind to detections: bags, npz, COCO JSON, OpenPose JSON."""
+"""Keypoint files of several kinds to detections: bags, npz, COCO JSON, OpenPose JSON."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.bags import Progress
 from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.data.openpose import read_people
+from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.lifting.observation import Observation, to_observation
-from deep_nrsfm_ros.messages.field_mapping import FieldMapping, Size
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 
 KINDS = (
@@ -28,58 +28,58 @@ KINDS = (
     "OpenPose .json files, or OpenPose frames as .jsonl (.jsonl.gz)"
 )
 
-_MOST_EMPTY = 1_000_000  # nine hours at 30 Hz
+_MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
 
 
 class KeypointFileError(ValueError):
-    """A file of keypoints that cannot be read: names the file and the mend."""
+    """A file of keypoints cannot be read; the message names the file and the remedy."""
 
 
 def read_keypoints(
     path: Path,
     keypoints: int,
-    *,
-    topic: str = "",
-    rate: float = 30.0,
-    min_confidence: float = 0.0,
+    options: ReadOptions = DEFAULT_READ_OPTIONS,
     on_progress: Progress = lambda done, total: None,
     warn: Callable[[str], None] = lambda message: None,
-    mapping: FieldMapping | None = None,
-    size: Size | None = None,
 ) -> Detections:
-    """Return everyone in a file or folder of `KINDS`, whichever it turns out to be.
+    """Return the detections in a file or folder of any of `KINDS`.
 
-    keypoints: q of the detector's layout. topic: of a bag; "" takes the only one that fits.
-    rate: frames a second of files that have no stamps. min_confidence: below, a keypoint is
-    missing. mapping, size: of a bag, see `read_bag`. Raises KeypointFileError or BagError, which
-    name the file and what is wrong with it.
+    Args:
+        path: the file or folder; its name and content say of which kind it is.
+        keypoints: number q of keypoints of the detector's layout, e.g. 17.
+        options: topic and mapping for bags, rate for files without stamps, least confidence.
+        on_progress: called while reading.
+        warn: called with a sentence about each damaged part.
+
+    Raises:
+        KeypointFileError: the file is missing, of no known kind, or damaged.
+        BagError: a bag cannot be read.
     """
     name = path.name.lower()
     if not path.exists():
         raise KeypointFileError(f"{path} does not exist")
     if is_bag(path):
-        words = (on_progress, warn, mapping, size)
-        return read_bag(path, topic, keypoints, min_confidence, *words)
+        return read_bag(path, keypoints, options, on_progress, warn)
     try:
         if path.is_dir():
             files = sorted(path.glob("*.json"), key=_natural)
             if not files:
                 raise KeypointFileError(f"it holds neither a bag nor .json files; expected {KINDS}")
             texts = ((file.name, file.read_bytes()) for file in files)
-            return _openpose(texts, len(files), keypoints, rate, min_confidence, on_progress)
+            return _openpose(texts, len(files), keypoints, options, on_progress)
         if name.endswith(".npz"):
-            return _npz(path, keypoints, rate, min_confidence)
+            return _npz(path, keypoints, options)
         if name.endswith((".jsonl", ".jsonl.gz")):
             data = path.read_bytes()
             lines = (gzip.decompress(data) if name.endswith(".gz") else data).splitlines()
             numbered = ((f"line {i}", line) for i, line in enumerate(lines, 1) if line.strip())
-            return _openpose(numbered, len(lines), keypoints, rate, min_confidence, on_progress)
+            return _openpose(numbered, len(lines), keypoints, options, on_progress)
         if name.endswith(".json"):
             content = json.loads(path.read_bytes())
             if isinstance(content, dict) and "people" in content:
-                one = [(path.name, path.read_bytes())]
-                return _openpose(one, 1, keypoints, rate, min_confidence, on_progress)
-            return _coco(content, keypoints, rate, min_confidence)
+                frame = [(path.name, path.read_bytes())]
+                return _openpose(frame, 1, keypoints, options, on_progress)
+            return _coco(content, keypoints, options)
     except (ValueError, TypeError, ArithmeticError, EOFError, OSError, zlib.error) as error:
         raise KeypointFileError(f"{path}: {error}") from None
     except (MemoryError, RecursionError) as error:
@@ -88,7 +88,7 @@ def read_keypoints(
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a path that exists looks like a bag."""
+    """Return whether an existing path looks like a bag."""
     if path.is_dir():
         return any(f.name == "metadata.yaml" or f.suffix in SUFFIXES for f in path.iterdir())
     return path.suffix in SUFFIXES
@@ -96,47 +96,57 @@ def is_bag(path: Path) -> bool:
 
 def read_bag(
     path: Path,
-    topic: str,
     keypoints: int,
-    min_confidence: float = 0.0,
+    options: ReadOptions = DEFAULT_READ_OPTIONS,
     on_progress: Progress = lambda done, total: None,
     warn: Callable[[str], None] = lambda message: None,
-    mapping: FieldMapping | None = None,
-    size: Size | None = None,
 ) -> Detections:
-    """Return everyone on a topic of a bag ("": the only one that fits); raise BagError if none.
+    """Return the detections on a topic of a bag, in order of time.
 
-    The topic may have a `*`, mapping and size are as in `bags.read_bags`.
-    Stamps are those of the headers, or the time of recording where there is no header. Messages
-    that cannot be read are left out; `warn` gets how many, and the reason of the first.
+    Stamps are those of the headers, or the time of recording for messages without a header.
+    Unreadable messages are left out.
+
+    Args:
+        path: bag folder, or a single .db3 or .mcap file.
+        keypoints: number q of keypoints of the detector's layout.
+        options: topic, mapping, image size and least confidence.
+        on_progress: called after every 256 messages.
+        warn: called with a sentence about each damaged part and about unreadable messages.
+
+    Raises:
+        BagError: the bag cannot be read, or has no such topic.
+        KeypointFileError: no message is readable.
     """
-    seen, stamps, reason, camera, count = [], [], "", "", 0
+    observations, stamps, reason, camera, count = [], [], "", "", 0
     with closing(open_bag(path)) as bag:
-        for chosen, kind, decode in keypoint_topics(bag, topic, mapping):
-            reader = MessageReader(kind, decode)
-            for record in bag.records(chosen):
+        for topic, input_type, decode in keypoint_topics(bag, options.topic, options.mapping):
+            reader = MessageReader(input_type, decode)
+            for record in bag.records(topic):
                 count += 1
                 try:
-                    header, shown = reader(record.raw, keypoints, min_confidence, size)
-                    seen.append(shown)
+                    header, observation = reader(
+                        record.raw, keypoints, options.min_confidence, options.image_size
+                    )
+                    observations.append(observation)
                     stamps.append((header and header.stamp) or record.time)
                     camera = camera or (header.frame_id if header else "")
-                except Exception as error:  # whatever bytes a bag holds, the others still count
+                except Exception as error:  # damaged bytes fail in many ways; read the others
                     reason = reason or str(error) or repr(error)
                 if count % 256 == 0:
-                    on_progress(count, max(count, chosen.total))
-            if warning := bag.warning(chosen):
+                    on_progress(count, max(count, topic.total))
+            if warning := bag.warning(topic):
                 warn(warning)
-    if not seen:
+    if not observations:
         raise KeypointFileError(f"no readable message in {path} ({count} found); {reason}")
-    if len(seen) < count:
-        warn(f"{count - len(seen)} of {count} messages could not be read: {reason}")
+    if len(observations) < count:
+        warn(f"{count - len(observations)} of {count} messages could not be read: {reason}")
     order = np.argsort(stamps, kind="stable")
-    return gather([seen[i] for i in order], [stamps[i] for i in order], keypoints, camera)
+    ordered = [observations[i] for i in order], [stamps[i] for i in order]
+    return gather(*ordered, keypoints, camera)
 
 
 def stamp_of(message: Any) -> int:
-    """Return the stamp of a message's header in ns, 0 if it has none."""
+    """Return the stamp in the header of a message in ns; 0 if it has no header."""
     header = read_header(message)
     return header.stamp if header else 0
 
@@ -145,25 +155,24 @@ def _openpose(
     texts: Iterable[tuple[str, bytes]],
     total: int,
     keypoints: int,
-    rate: float,
-    min_confidence: float,
+    options: ReadOptions,
     on_progress: Progress,
 ) -> Detections:
-    """Return the people of frames of OpenPose JSON, each with the name of where it stands."""
-    seen: list[Observation] = []
+    """Return the people in frames of OpenPose JSON, given as pairs (file or line, JSON)."""
+    observations: list[Observation] = []
     for done, (name, text) in enumerate(texts, 1):
         try:
-            seen.append(read_people(text, keypoints, min_confidence))
+            observations.append(read_people(text, keypoints, options.min_confidence))
         except ValueError as error:
             raise KeypointFileError(f"{name}: {error}; is it the right keypoint layout?") from None
         on_progress(done, total)
-    if not seen:
+    if not observations:
         raise KeypointFileError("it is empty")
-    return gather(seen, stamps_at(rate, len(seen)), keypoints)
+    return gather(observations, stamps_at(options.rate, len(observations)), keypoints)
 
 
-def _coco(content: Any, keypoints: int, rate: float, min_confidence: float) -> Detections:
-    """Return the people of COCO keypoint annotations, or of a list of results."""
+def _coco(content: Any, keypoints: int, options: ReadOptions) -> Detections:
+    """Return the people in COCO keypoint annotations, or in a list of COCO results."""
     rows = content.get("annotations") if isinstance(content, dict) else content
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise KeypointFileError(
@@ -189,25 +198,26 @@ def _coco(content: Any, keypoints: int, rate: float, min_confidence: float) -> D
     by_frame: list[list[Mapping[str, Any]]] = [[] for _ in names]
     for row in rows:
         by_frame[frames[row["image_id"]]].append(row)
-    seen = [_people(people, keypoints, min_confidence) for people in by_frame]
+    observations = [_people(people, keypoints, options.min_confidence) for people in by_frame]
     identities = [str(p.get("track_id", i)) for people in by_frame for i, p in enumerate(people)]
-    return gather(seen, stamps_at(rate, len(seen)), keypoints, identities=identities)
+    stamps = stamps_at(options.rate, len(observations))
+    return gather(observations, stamps, keypoints, identities=identities)
 
 
 def _people(
     rows: Sequence[Mapping[str, Any]], keypoints: int, min_confidence: float
 ) -> Observation:
-    """Return the observation of annotations of one image."""
+    """Return the annotations of one image as an observation."""
     values = np.reshape([row["keypoints"] for row in rows], (len(rows), keypoints, 3))
     return to_observation(values.astype(np.float64), min_confidence)
 
 
-def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Detections:
-    """Return the objects of arrays: see README, "Files instead of topics"."""
+def _npz(path: Path, keypoints: int, options: ReadOptions) -> Detections:
+    """Return the objects in the arrays of an .npz: see README, "Files instead of topics"."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
+    except Exception as error:  # a damaged file makes zipfile and NumPy raise many types
         raise KeypointFileError(f"damaged or no .npz file: {error!r}") from error
     if "points" not in arrays:
         raise KeypointFileError(
@@ -227,23 +237,27 @@ def _npz(path: Path, keypoints: int, rate: float, min_confidence: float) -> Dete
     count = int(frame.max(initial=-1)) + 1
     if m and int(frame.min()) < 0:
         raise KeypointFileError(f"`frame` has {frame.min()}; frames are counted from 0")
-    if count > m + _MOST_EMPTY:
+    if count > m + _MAX_EMPTY:
         raise KeypointFileError(
-            f"`frame` goes to {count - 1} with {m} objects; at most {_MOST_EMPTY} frames may show "
+            f"`frame` goes to {count - 1} with {m} objects; at most {_MAX_EMPTY} frames may show "
             "nobody"
         )
     if "stamps" in arrays:
         count = max(count, len(arrays["stamps"]))
         stamps = _numbers(arrays, "stamps", np.int64, (count,))
     else:
-        stamps = stamps_at(rate, count)
-    identities = arrays.get("identities", _places(frame)).astype(str)
+        stamps = stamps_at(options.rate, count)
+    identities = arrays.get("identities", _index_in_frame(frame)).astype(str)
     if identities.shape != (m,):
         raise KeypointFileError(f"`identities` is {identities.shape}; ({m},) is needed")
-    seen = to_observation(points, min_confidence)
+    observation = to_observation(points, options.min_confidence)
     order = np.argsort(frame, kind="stable")
     return Detections(
-        seen.points[order], seen.confidence[order], frame[order], identities[order], stamps
+        observation.points[order],
+        observation.confidence[order],
+        frame[order],
+        identities[order],
+        stamps,
     )
 
 
@@ -253,7 +267,7 @@ def _numbers(
     kind: type,
     shape: tuple[int, ...] | None = None,
 ) -> NDArray[Any]:
-    """Return an array of an npz, of numbers and of the shape that it must have."""
+    """Return an array of an .npz as `kind`; raise KeypointFileError unless it has that shape."""
     array = arrays[name]
     if array.dtype.kind not in "fiu" or shape is not None and array.shape != shape:
         wanted = "of numbers" if shape is None else f"of numbers {shape}"
@@ -263,17 +277,17 @@ def _numbers(
     return array.astype(kind)
 
 
-def _places(frame: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the place of each object among those of its frame (m,)."""
+def _index_in_frame(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index (m,) of each object among the objects of its frame."""
     order = np.argsort(frame, kind="stable")
     ordered = frame[order]
-    places = np.empty(len(frame), np.int64)
-    places[order] = np.arange(len(frame)) - np.searchsorted(ordered, ordered)
-    return places
+    index = np.empty(len(frame), np.int64)
+    index[order] = np.arange(len(frame)) - np.searchsorted(ordered, ordered)
+    return index
 
 
 def _natural(name: Any) -> list[tuple[int, int, str]]:
-    """Return what sorts names as people do: frame_2 before frame_10."""
+    """Return a key that sorts numbers in names by value: frame_2 before frame_10."""
     text = name.name if isinstance(name, Path) else str(name)
     parts = re.split(r"(\d+)", text)
     return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p]

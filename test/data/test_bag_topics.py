@@ -8,7 +8,8 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from deep_nrsfm_ros.data.bag_files import BagError
-from deep_nrsfm_ros.data.bags import most_keypoints, read_bags
+from deep_nrsfm_ros.data.bags import keypoint_count, read_bags
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17, REP155
@@ -61,14 +62,14 @@ def test_detections_of_yolo(tmp_path: Path, recorded: Any, storage: StoragePlugi
     bag = yolo_bag(tmp_path / "bag", recorded, given, storage_plugin=storage)
     (file,) = (f for f in bag.iterdir() if f.suffix != ".yaml")
     for path in (bag, file):
-        reading = read_bags([path], "", COCO17, HUMAN17)
+        reading = read_bags([path], COCO17, HUMAN17)
         assert reading.unreadable == 0
         points, confidence = given[..., :2].astype(np.float32), given[..., 2].astype(np.float32)
         points[1:, 16] = confidence[1:, 16] = 0
         points, confidence = KeypointMap(COCO17, HUMAN17)(points, confidence)
         np.testing.assert_allclose(reading.dataset.points, points, rtol=1e-6)
         np.testing.assert_array_equal(reading.dataset.visible, confidence > 0)
-    assert most_keypoints([bag], "/yolo") == 17
+    assert keypoint_count([bag], ReadOptions("/yolo")) == 17
 
 
 @pytest.mark.parametrize("storage", list(StoragePlugin))
@@ -81,7 +82,7 @@ def test_a_bag_that_was_cut_off_keeps_its_definitions(
     lost = 300 if storage == StoragePlugin.MCAP else file.stat().st_size // 3
     file.write_bytes(file.read_bytes()[:-lost])
     (bag / "metadata.yaml").unlink()
-    reading = read_bags([bag], "/yolo", COCO17, HUMAN17)
+    reading = read_bags([bag], COCO17, HUMAN17, ReadOptions("/yolo"))
     assert 100 < len(reading.dataset) <= 400 and reading.warnings
 
 
@@ -94,14 +95,14 @@ def test_bodies_of_several_topics(tmp_path: Path, recorded: Any) -> None:
     }
     bag = write(tmp_path / "bag", recorded, topics)
     pattern = "/humans/bodies/*/skeleton2d"
-    reading = read_bags([bag], pattern, REP155, REP155, size=(640, 480))
+    reading = read_bags([bag], REP155, REP155, ReadOptions(pattern, image_size=(640, 480)))
     expected = given[..., :2] * [640, 480]
     np.testing.assert_allclose(reading.dataset.points, expected, rtol=1e-5)
     with pytest.raises(BagError, match="2 keypoint topics; name one of"):
-        read_bags([bag], "", REP155, REP155)
+        read_bags([bag], REP155, REP155)
     with pytest.raises(BagError, match="size of the image is needed"):
-        read_bags([bag], pattern, REP155, REP155)
-    assert most_keypoints([bag], pattern) == 18
+        read_bags([bag], REP155, REP155, ReadOptions(pattern))
+    assert keypoint_count([bag], ReadOptions(pattern)) == 18
 
 
 def test_a_type_of_ones_own_by_its_mapping(tmp_path: Path, recorded: Any) -> None:
@@ -109,11 +110,11 @@ def test_a_type_of_ones_own_by_its_mapping(tmp_path: Path, recorded: Any) -> Non
     messages = [recorded.animals([(1, joints), (2, joints)])] * 3
     bag = write(tmp_path / "bag", recorded, {"/farm": ("my_msgs/Animals", messages)})
     for topic in ("", "/farm"):
-        dataset = read_bags([bag], topic, ANIMAL, ANIMAL, mapping=MAPPING).dataset
+        dataset = read_bags([bag], ANIMAL, ANIMAL, ReadOptions(topic, mapping=MAPPING)).dataset
         np.testing.assert_array_equal(dataset.points, [[[3, 4], [5, 6], [1, 2], [7, 8]]] * 6)
-    assert most_keypoints([bag], "", MAPPING) == 4
+    assert keypoint_count([bag], ReadOptions(mapping=MAPPING)) == 4
     with pytest.raises(BagError, match=r"/farm .* type my_msgs/Animals; .* field mapping"):
-        read_bags([bag], "/farm", ANIMAL, ANIMAL)
+        read_bags([bag], ANIMAL, ANIMAL, ReadOptions("/farm"))
 
 
 def test_a_bag_without_the_definition_says_so(tmp_path: Path, recorded: Any) -> None:
@@ -125,4 +126,4 @@ def test_a_bag_without_the_definition_says_so(tmp_path: Path, recorded: Any) -> 
             connection = writer.add_connection(topic, kind, msgdef=text, rihs01="RIHS01_0")
             writer.write(connection, 0, b"\0\1\0\0")
     with pytest.raises(BagError, match="does not carry the definition of yolo_msgs/Det"):
-        read_bags([bag], "/topic0", COCO17, COCO17)
+        read_bags([bag], COCO17, COCO17, ReadOptions("/topic0"))

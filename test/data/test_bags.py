@@ -18,10 +18,11 @@ from deep_nrsfm_ros.data.bags import (
     STORAGES,
     Frame,
     frames,
-    most_keypoints,
+    keypoint_count,
     read_bags,
     write_bag,
 )
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN17
@@ -52,7 +53,7 @@ def test_round_trip(tmp_path: Path, storage: str, input_type: str) -> None:
     assert write_bag(bag, TOPIC, frames(points, confidence), storage, input_type) == len(points)
     (file,) = (f for f in bag.iterdir() if f.suffix != ".yaml")
     for path, topic in ((bag, TOPIC), (bag, ""), (file, TOPIC)):
-        reading = read_bags([path], topic, BODY25, BODY25)
+        reading = read_bags([path], BODY25, BODY25, ReadOptions(topic))
         np.testing.assert_array_equal(reading.dataset.points, points)
         np.testing.assert_array_equal(reading.dataset.visible, confidence > 0)
         assert reading[1:] == (len(points), 0, "", ())
@@ -61,7 +62,7 @@ def test_round_trip(tmp_path: Path, storage: str, input_type: str) -> None:
 def test_points_come_in_the_layout_of_the_model(tmp_path: Path) -> None:
     points, confidence = detections(20)
     write_bag(tmp_path / "bag", TOPIC, frames(points, confidence))
-    dataset = read_bags([tmp_path / "bag"], TOPIC, BODY25, HUMAN17).dataset
+    dataset = read_bags([tmp_path / "bag"], BODY25, HUMAN17, ReadOptions(TOPIC)).dataset
     mapped, sure = KeypointMap(BODY25, HUMAN17)(points, confidence)
     np.testing.assert_array_equal(dataset.points, mapped)
     np.testing.assert_array_equal(dataset.visible, sure > 0)
@@ -76,9 +77,9 @@ def test_several_bags_and_several_objects(tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
     reading = read_bags(
         [tmp_path / "a", tmp_path / "b"],
-        TOPIC,
         BODY25,
         BODY25,
+        ReadOptions(TOPIC),
         on_progress=lambda *p: seen.append(p),
     )
     np.testing.assert_array_equal(reading.dataset.points, np.concatenate([points, points]))
@@ -91,7 +92,7 @@ def test_several_bags_and_several_objects(tmp_path: Path) -> None:
 def test_many_blocks_of_frames_keep_their_order(tmp_path: Path, input_type: str) -> None:
     points, confidence = detections(5000, COCO17)
     write_bag(tmp_path / "bag", TOPIC, frames(points, confidence), "mcap", input_type)
-    dataset = read_bags([tmp_path / "bag"], TOPIC, COCO17, COCO17).dataset
+    dataset = read_bags([tmp_path / "bag"], COCO17, COCO17, ReadOptions(TOPIC)).dataset
     np.testing.assert_array_equal(dataset.points, points)
     np.testing.assert_array_equal(dataset.visible, confidence > 0)
 
@@ -105,7 +106,7 @@ def test_messages_of_several_makes_keep_their_order(tmp_path: Path) -> None:
         for i, (start, end) in enumerate(zip([0, *ends], ends, strict=False))
     )
     assert write_bag(tmp_path / "bag", TOPIC, seen) == 400
-    reading = read_bags([tmp_path / "bag"], TOPIC, BODY25, BODY25, min_confidence=0.3)
+    reading = read_bags([tmp_path / "bag"], BODY25, BODY25, ReadOptions(TOPIC, min_confidence=0.3))
     np.testing.assert_array_equal(reading.dataset.visible, confidence >= 0.3)
     sure = np.where(reading.dataset.visible[..., None], points, 0)
     np.testing.assert_array_equal(reading.dataset.points, sure)
@@ -115,14 +116,16 @@ def test_messages_of_several_makes_keep_their_order(tmp_path: Path) -> None:
 def test_progress_counts_to_the_total(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", TOPIC, frames(*detections(600)))
     seen: list[tuple[int, int]] = []
-    read_bags([tmp_path / "bag"], "", BODY25, BODY25, on_progress=lambda *p: seen.append(p))
+    read_bags([tmp_path / "bag"], BODY25, BODY25, on_progress=lambda *p: seen.append(p))
     assert seen == [(256, 600), (512, 600), (600, 600)]
 
 
 def test_low_confidence_is_missing(tmp_path: Path) -> None:
     points, confidence = detections(10)
     write_bag(tmp_path / "bag", TOPIC, frames(points, confidence))
-    dataset = read_bags([tmp_path / "bag"], TOPIC, BODY25, BODY25, min_confidence=0.5).dataset
+    dataset = read_bags(
+        [tmp_path / "bag"], BODY25, BODY25, ReadOptions(TOPIC, min_confidence=0.5)
+    ).dataset
     np.testing.assert_array_equal(dataset.visible, confidence >= 0.5)
 
 
@@ -148,7 +151,7 @@ def test_unreadable_messages_are_counted_not_fatal(tmp_path: Path) -> None:
     bad = [b"", good[0][:40], random.bytes(300), good[0][:-8], b"\0\1\0\0" + b"\xff" * 200]
     mixed = [m for pair in zip(good[:5], bad, strict=True) for m in pair] + good[5:]
     write_raw(tmp_path / "bag", {TOPIC: ("sensor_msgs/msg/PointCloud2", mixed)})
-    reading = read_bags([tmp_path / "bag"], TOPIC, BODY25, BODY25)
+    reading = read_bags([tmp_path / "bag"], BODY25, BODY25, ReadOptions(TOPIC))
     assert (len(reading.dataset), reading.messages, reading.unreadable) == (10, 15, 5)
     assert "cannot be decoded" in reading.reason
     np.testing.assert_array_equal(reading.dataset.points, detections(10)[0])
@@ -157,7 +160,7 @@ def test_unreadable_messages_are_counted_not_fatal(tmp_path: Path) -> None:
 def test_wrong_layout_says_why_nothing_is_readable(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", TOPIC, frames(*detections(3)))
     with pytest.raises(BagError, match=r"bag \(3 found\).*25 keypoints.*has 17"):
-        read_bags([tmp_path / "bag"], TOPIC, COCO17, HUMAN17)
+        read_bags([tmp_path / "bag"], COCO17, HUMAN17, ReadOptions(TOPIC))
 
 
 def test_wrong_topics_list_what_is_there(tmp_path: Path) -> None:
@@ -172,20 +175,20 @@ def test_wrong_topics_list_what_is_there(tmp_path: Path) -> None:
         ("/b", r"no readable message in bag \(0 found\)"),
     ):
         with pytest.raises(BagError, match=expected):
-            read_bags([tmp_path / "bag"], topic, BODY25, BODY25)
+            read_bags([tmp_path / "bag"], BODY25, BODY25, ReadOptions(topic))
 
 
 def test_missing_and_foreign_bags_are_named(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="bag .*nowhere does not exist"):
-        read_bags([tmp_path / "nowhere"], TOPIC, BODY25, BODY25)
+        read_bags([tmp_path / "nowhere"], BODY25, BODY25, ReadOptions(TOPIC))
     (tmp_path / "empty").mkdir()
     for name in ("text.txt", "text.db3", "text.mcap"):
         (tmp_path / name).write_text("no bag\n" * 100)
     for name in ("empty", "text.txt", "text.db3", "text.mcap"):
         with pytest.raises(BagError, match=f"bag .*{name} cannot be read"):
-            read_bags([tmp_path / name], TOPIC, BODY25, BODY25)
+            read_bags([tmp_path / name], BODY25, BODY25, ReadOptions(TOPIC))
     with pytest.raises(BagError, match="at least one"):
-        read_bags([], TOPIC, BODY25, BODY25)
+        read_bags([], BODY25, BODY25, ReadOptions(TOPIC))
 
 
 @pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
@@ -199,7 +202,7 @@ def test_a_compressed_bag_is_read_as_any_other(tmp_path: Path, mode: Compression
         copy = writer.add_connection(topic.topic, topic.msgtype, typestore=STORE)
         for _, time, raw in plain.messages():
             writer.write(copy, time, raw)
-    reading = read_bags([tmp_path / "bag"], "", BODY25, BODY25)
+    reading = read_bags([tmp_path / "bag"], BODY25, BODY25)
     np.testing.assert_array_equal(reading.dataset.points, points)
     assert reading[1:] == (len(points), 0, "", ())
 
@@ -217,7 +220,7 @@ def test_a_split_bag_is_read_from_its_first_file_to_its_last(tmp_path: Path, sto
     about["relative_file_paths"].append(file.name)
     about["message_count"] = about["topics_with_message_count"][0]["message_count"] = 50
     (bag / "metadata.yaml").write_text(yaml.safe_dump(described))
-    reading = read_bags([bag], TOPIC, BODY25, BODY25)
+    reading = read_bags([bag], BODY25, BODY25, ReadOptions(TOPIC))
     np.testing.assert_array_equal(reading.dataset.points, points)
     assert reading[1:] == (len(points), 0, "", ())
 
@@ -235,7 +238,9 @@ def test_cut_off_bag_gives_its_readable_part(tmp_path: Path, storage: str, metad
     whole = file.read_bytes()
     for share in (0.9, 0.6, 0.3):
         file.write_bytes(whole[: int(share * len(whole))])
-        dataset, messages, unreadable, _, warnings = read_bags([bag], TOPIC, BODY25, BODY25)
+        dataset, messages, unreadable, _, warnings = read_bags(
+            [bag], BODY25, BODY25, ReadOptions(TOPIC)
+        )
         assert (share - 0.3) * count < len(dataset) < count
         assert unreadable == 0 and messages == len(dataset)
         np.testing.assert_array_equal(dataset.points, points[:messages])
@@ -245,7 +250,7 @@ def test_cut_off_bag_gives_its_readable_part(tmp_path: Path, storage: str, metad
     for share in (0.001, 0):
         file.write_bytes(whole[: int(share * len(whole))])
         with pytest.raises(BagError, match="bag"):
-            read_bags([bag], TOPIC, BODY25, BODY25)
+            read_bags([bag], BODY25, BODY25, ReadOptions(TOPIC))
 
 
 @pytest.mark.parametrize("column", ["name", "type"])
@@ -261,13 +266,13 @@ def test_a_topic_that_has_lost_its_name_or_type_is_none(tmp_path: Path, column: 
         tables.execute("DROP TABLE topics")
         tables.execute("ALTER TABLE damaged RENAME TO topics")
     for path in (bag, file):
-        assert len(read_bags([path], "", BODY25, BODY25).dataset) == 30
+        assert len(read_bags([path], BODY25, BODY25).dataset) == 30
 
 
 def test_bag_without_metadata_only_is_read_in_full(tmp_path: Path) -> None:
     write_bag(tmp_path / "bag", TOPIC, frames(*detections(30)))
     (tmp_path / "bag" / "metadata.yaml").unlink()
-    assert len(read_bags([tmp_path / "bag"], TOPIC, BODY25, BODY25).dataset) == 30
+    assert len(read_bags([tmp_path / "bag"], BODY25, BODY25, ReadOptions(TOPIC)).dataset) == 30
 
 
 def test_write_bag_never_overwrites(tmp_path: Path) -> None:
@@ -293,7 +298,7 @@ def test_float_array_bag_needs_no_layout_of_its_own(tmp_path: Path) -> None:
     flat = np.arange(1, 35, dtype=np.float32)
     raw = STORE.serialize_cdr(STORE.types[kind](layout, flat), kind)
     write_raw(tmp_path / "bag", {TOPIC: (kind, [bytes(raw)])})
-    dataset = read_bags([tmp_path / "bag"], "", COCO17, COCO17).dataset
+    dataset = read_bags([tmp_path / "bag"], COCO17, COCO17).dataset
     np.testing.assert_array_equal(dataset.points, flat.reshape(1, 17, 2))
 
 
@@ -302,23 +307,23 @@ def test_bags_tell_how_many_keypoints_there_are(tmp_path: Path, input_type: str)
     for name, layout, count in (("a", COCO17, 3), ("b", BODY25, 5)):
         found = frames(*detections(count, layout))
         write_bag(tmp_path / name, TOPIC, found, input_type=input_type)
-    assert most_keypoints([tmp_path / "a"], TOPIC) == 17
-    assert most_keypoints([tmp_path / "a", tmp_path / "b"], "") == 25  # what most messages have
+    assert keypoint_count([tmp_path / "a"], ReadOptions(TOPIC)) == 17
+    assert keypoint_count([tmp_path / "a", tmp_path / "b"]) == 25  # what most messages have
 
 
 def test_messages_without_objects_or_sense_do_not_count(tmp_path: Path) -> None:
     nobody = Frame(0, np.zeros((0, 4, 2)), np.zeros((0, 4)))
     write_bag(tmp_path / "empty", TOPIC, [nobody] * 5)
     with pytest.raises(BagError, match="no message in empty tells how many keypoints"):
-        most_keypoints([tmp_path / "empty"], TOPIC)
+        keypoint_count([tmp_path / "empty"], ReadOptions(TOPIC))
     (good,) = raw_messages(1)
     width = good.index(b"\x19\0\0\0")  # 25
     huge = good[:width] + b"\xff\xff\xff\x7f" + good[width + 4 :]
     write_raw(tmp_path / "bag", {TOPIC: ("sensor_msgs/msg/PointCloud2", [huge, b"", huge, good])})
-    assert most_keypoints([tmp_path / "empty", tmp_path / "bag"], TOPIC) == 25
+    assert keypoint_count([tmp_path / "empty", tmp_path / "bag"], ReadOptions(TOPIC)) == 25
     write_raw(tmp_path / "huge", {TOPIC: ("sensor_msgs/msg/PointCloud2", [huge])})
     with pytest.raises(BagError, match="no message in huge tells .*points need"):
-        most_keypoints([tmp_path / "huge"], TOPIC)
+        keypoint_count([tmp_path / "huge"], ReadOptions(TOPIC))
 
 
 def test_more_frames_than_allowed_are_refused_before_they_fill_the_memory(tmp_path: Path) -> None:
@@ -326,5 +331,7 @@ def test_more_frames_than_allowed_are_refused_before_they_fill_the_memory(tmp_pa
     points, confidence = np.ones((300, 17, 2)), np.ones((300, 17))
     write_bag(path, "/k", frames(points, confidence))
     with pytest.raises(BagError, match=r"above 299.*\(max_frames\)"):
-        read_bags([path], "/k", HUMAN17, HUMAN17, max_frames=299)
-    assert len(read_bags([path], "/k", HUMAN17, HUMAN17, max_frames=300).dataset) == 300
+        read_bags([path], HUMAN17, HUMAN17, ReadOptions("/k", max_frames=299))
+    assert (
+        len(read_bags([path], HUMAN17, HUMAN17, ReadOptions("/k", max_frames=300)).dataset) == 300
+    )

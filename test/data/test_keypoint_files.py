@@ -13,6 +13,7 @@ import pytest
 from deep_nrsfm_ros.data.bags import Frame, write_bag
 from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.presets import COCO17
 from deep_nrsfm_ros.lifting.observation import to_observation
 from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY
@@ -104,7 +105,7 @@ KINDS = ("openpose folder", "jsonl", "jsonl.gz", "coco", "npz", "mcap", "sqlite3
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_gives_the_same_people(kind: str, tmp_path: Path, seen: Detections) -> None:
-    found = read_keypoints(write(kind, tmp_path, seen), Q, rate=10)
+    found = read_keypoints(write(kind, tmp_path, seen), Q, ReadOptions(rate=10))
     if kind == "npz":  # the objects of a frame stay in their order, which was turned round
         found = found[np.lexsort((found.identities, found.frame))]
     assert_same(found, seen)
@@ -125,7 +126,7 @@ def test_coco_results_without_images(tmp_path: Path, seen: Detections) -> None:
 
 def test_plain_npz_is_a_frame_each(tmp_path: Path, seen: Detections) -> None:
     np.savez(tmp_path / "a.npz", points=seen.points)
-    found = read_keypoints(tmp_path / "a.npz", Q, rate=50)
+    found = read_keypoints(tmp_path / "a.npz", Q, ReadOptions(rate=50))
     assert found.frame.tolist() == list(range(7)) and set(found.identities) == {"0"}
     assert found.stamps.tolist() == [20_000_000 * i for i in range(7)]
     np.testing.assert_array_equal(found.confidence > 0, (seen.points != 0).any(-1))
@@ -141,7 +142,7 @@ def test_largest_is_one_a_frame(seen: Detections) -> None:
 
 def test_low_confidence_is_missing(tmp_path: Path, seen: Detections) -> None:
     for kind in ("coco", "npz"):
-        found = read_keypoints(write(kind, tmp_path, seen), Q, min_confidence=0.6)
+        found = read_keypoints(write(kind, tmp_path, seen), Q, ReadOptions(min_confidence=0.6))
         assert (found.confidence > 0).sum() == (seen.confidence >= 0.6).sum()
 
 

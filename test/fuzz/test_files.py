@@ -16,6 +16,7 @@ from deep_nrsfm_ros.data import bags
 from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.bags import frames, read_bags, write_bag
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.layout_file import LayoutFileError, read_layout
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
 from deep_nrsfm_ros.messages.mapping_file import MappingError, read_mapping
@@ -50,7 +51,7 @@ def test_a_bag_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: Path) -> N
         (path / name).write_bytes(spoiler.spoil_bytes(whole[name]))
         try:
             named = [path if with_metadata else path / data]
-            reading = read_bags(named, "", layout, layout, max_frames=1000)
+            reading = read_bags(named, layout, layout, ReadOptions(max_frames=1000))
             assert len(reading.dataset) <= 1000
         except BagError as refusal:
             assert str(refusal)

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.data import synthetic_excavator as excavator
 from benchmarks.real import train_from_bags
 from deep_nrsfm_ros.data.bags import read_bags
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 
 
@@ -35,7 +36,7 @@ def test_the_video_becomes_a_bag_of_all_people_in_it(tmp_path: Path) -> None:
             lines.write(json.dumps({"people": people}) + "\n")
     session = train_from_bags.Session(tmp_path, tmp_path / "out", None, 1)
     bag = session.bag("video", lambda: train_from_bags._people(tmp_path / train_from_bags.VIDEO))
-    reading = read_bags([bag], train_from_bags.TOPIC, BODY25, HUMAN17)
+    reading = read_bags([bag], BODY25, HUMAN17, ReadOptions(train_from_bags.TOPIC))
     assert (reading.messages, reading.unreadable, len(reading.dataset)) == (3, 0, 3)
     nose = HUMAN17.index("nose")
     assert not reading.dataset.visible[:, nose].any()
