@@ -301,7 +301,7 @@ def test_arrays_that_do_not_fit_the_model_are_refused(
     points: tuple[int, ...], confidence: tuple[int, ...]
 ) -> None:
     with pytest.raises(ValueError, match=r"'random' needs \(n, 17, 2\)") as caught:
-        Lifter(random_model())(np.ones(points, np.float32), np.ones(confidence, np.float32))
+        Lifter(random_model()).lift(np.ones(points, np.float32), np.ones(confidence, np.float32))
     assert str(points) in str(caught.value)
 
 
