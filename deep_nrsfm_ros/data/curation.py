@@ -1,4 +1,4 @@
-"""What of a dataset is fit to be learned from: the rest is left out, counted and shown."""
+"""Filter a dataset for training; count and report what was dropped."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.configuration import check, option
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.outliers import find_outliers
+from deep_nrsfm_ros.nrsfm.geometry import centre_visible, rms_radius
 
 Bools = NDArray[np.bool_]
 
-_RECENT = 4  # kept frames that a frame is compared with: several objects may take turns
-_HOPELESS = 0.25  # share of a frame's visible points that may be outliers
-_EXAMPLES = 12  # worst frames that are kept for show
-_APART = 0.005  # of the data, by which they are
-_SUSPICIOUS = 0.1  # share of the data from which on curation itself is in doubt
+_RECENT = 4  # kept frames that a frame is compared with: frames of several objects may alternate
+_MAX_OUTLIER_SHARE = 0.25  # of a frame's visible keypoints; frames with more are dropped
+_EXAMPLES = 12  # worst frames with outliers that are kept for the report
+_MIN_GAP = 0.005  # between two of these frames, as a share of the data
+_SUSPICIOUS = 0.1  # share of the data above which a count gets a warning
 
 
 @dataclass(frozen=True)
@@ -28,35 +29,45 @@ class Curation:
     """Curation."""
 
     min_visible: int = option(
-        4, "frames with fewer visible keypoints are left out; 0 keeps all", low=0, high=1000
+        4,
+        "least number of visible keypoints of a frame; frames with fewer are left out; 0 = keep "
+        "all, 4 typical",
+        low=0,
+        high=1000,
     )
     min_change: float = option(
         0.02,
-        "frames that differ from one kept just before by less than this share of the object's "
-        "size (a still camera on a still object) are left out; 0 keeps all",
+        "least RMS change between a frame and the frames kept shortly before it, relative to the "
+        "size of the object; frames with less change, e.g. of a still object, are left out; "
+        "0 = keep all, 0.02 typical, 0.1 strong",
         low=0.0,
         high=1.0,
     )
     outlier_threshold: float = option(
         6.0,
-        "keypoints that deviate from what the others of their frame foretell by more than so many "
-        "times the usual (swaps, jumps) are hidden; 0 keeps all",
+        "Mahalanobis distance between a keypoint and its prediction from the frame's other "
+        "keypoints, in typical distances of that keypoint, above which it is hidden, e.g. a left "
+        "and right that are swapped; 0 = keep all, 6 typical, 3 strong",
         low=0.0,
         high=1000.0,
     )
 
 
 KEEP_ALL = Curation(min_visible=0, min_change=0.0, outlier_threshold=0.0)
-"""Everything turned off."""
+"""Curation that keeps all frames and keypoints."""
 
 
 @dataclass(frozen=True)
 class OutlierFrame:
     """A frame with outliers.
 
-    frame: its place in the data as given. points: (p, 2) and visible: (p,) as given.
-    outliers: (p,) which points were found. deviation: of the worst, in usual deviations.
-    dropped: the whole frame was left out, as too little of it agrees with the rest.
+    Attributes:
+        frame: its index in the dataset before curation.
+        points: (p, 2) its keypoints before curation.
+        visible: (p,) its visible keypoints before curation.
+        outliers: (p,) which of them are outliers.
+        deviation: Mahalanobis distance of the worst keypoint, in typical distances.
+        dropped: True if the whole frame was left out, because it has too many outliers.
     """
 
     frame: int
@@ -69,12 +80,18 @@ class OutlierFrame:
 
 @dataclass(frozen=True)
 class Curated:
-    """What is left of a dataset, and what became of the rest.
+    """A curated dataset, and what was dropped. Each dropped frame is counted once.
 
-    frames: (f,) where each frame of `dataset` was among all `total` ones.
-    few_visible, near_duplicates, inconsistent: frames left out, each counted once.
-    hidden: (p,) how often each keypoint was hidden in frames that stayed, which are `corrected`.
-    outlier_frames: some frames with outliers, the worst first.
+    Attributes:
+        dataset: the frames that were kept, without outliers.
+        frames: (f,) index of each of them before curation.
+        total: number of frames before curation.
+        few_visible: frames dropped because they have too few visible keypoints.
+        near_duplicates: frames dropped because they hardly differ from an earlier one.
+        inconsistent: frames dropped because they have too many outliers.
+        corrected: frames that were kept with some of their keypoints hidden.
+        hidden: (p,) number of frames in which each keypoint was hidden.
+        outlier_frames: some frames with outliers, the worst first, for the report.
     """
 
     dataset: Dataset
@@ -89,13 +106,13 @@ class Curated:
 
     @property
     def summary(self) -> str:
-        """Return one sentence with every count, "" if nothing was touched."""
-        out = {
+        """Return one sentence with every count; "" if nothing was dropped or hidden."""
+        dropped = {
             "with too few visible keypoints": self.few_visible,
             "near-duplicates": self.near_duplicates,
             "that contradict the rest": self.inconsistent,
         }
-        parts = [f"{count} {what}" for what, count in out.items() if count]
+        parts = [f"{count} {reason}" for reason, count in dropped.items() if count]
         sentences = [f"left out {', '.join(parts)}"] if parts else []
         if self.corrected:
             hidden = self.hidden.sum()
@@ -103,41 +120,46 @@ class Curated:
         return f"of {self.total} frames, {'; '.join(sentences)}" if sentences else ""
 
     @property
-    def hidden_by_name(self) -> list[tuple[str, int, int]]:
-        """Return (keypoint, times hidden, times seen before that), in order of the layout."""
+    def hidden_by_keypoint(self) -> list[tuple[str, int, int]]:
+        """Return (keypoint, frames where hidden, frames where visible before), in layout order."""
         names = self.dataset.layout.keypoints
-        seen = self.dataset.visible.sum(0) + self.hidden
-        return list(zip(names, self.hidden.tolist(), seen.tolist(), strict=True))
+        visible = self.dataset.visible.sum(0) + self.hidden
+        return list(zip(names, self.hidden.tolist(), visible.tolist(), strict=True))
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return a sentence for each count that is suspiciously high."""
-        found = []
+        warnings = []
         judged = self.total - self.few_visible - self.near_duplicates
         if self.few_visible > 0.5 * self.total:
-            found.append(
+            warnings.append(
                 f"{self.few_visible} of {self.total} frames show too few keypoints; look at the "
                 "detector, --min-confidence and the keypoint layout"
             )
         if self.inconsistent > _SUSPICIOUS * judged:
-            found.append(
+            warnings.append(
                 f"{self.inconsistent} of {judged} frames contradict the rest; if they are rare "
                 "poses and not mistakes of the detector, --outlier-threshold 0 keeps them"
             )
-        seen = self.dataset.visible.sum(0) + self.hidden
-        for name, count, total in zip(
-            self.dataset.layout.keypoints, self.hidden, seen, strict=True
-        ):
+        for name, count, total in self.hidden_by_keypoint:
             if count > _SUSPICIOUS * total:
-                found.append(f"{name} was an outlier in {count} of {total} frames: is it swapped?")
-        return tuple(found)
+                warnings.append(
+                    f"{name} was an outlier in {count} of {total} frames: is it swapped?"
+                )
+        return tuple(warnings)
 
 
 def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
-    """Return what is fit to be learned from, by `options` (all defaults if None).
+    """Return a dataset without poor frames, near duplicates and outliers.
 
-    Frames keep their order; the ground truth, if any, goes with them and is not looked at.
-    Raises ValueError when an option is out of range or no frame shows enough keypoints.
+    Frames keep their order and their ground truth, which has no influence. Deterministic.
+
+    Args:
+        dataset: is not changed.
+        options: what to drop; None = defaults.
+
+    Raises:
+        ValueError: an option is out of range, or no frame has enough visible keypoints.
     """
     options = options or Curation()
     check(options)
@@ -151,50 +173,56 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
     if options.min_change:
         points, visible = dataset.points[frames], dataset.visible[frames]
         frames = frames[changed_frames(points, visible, options.min_change)]
-    judged, visible = len(frames), dataset.visible[frames]
+    visible = dataset.visible[frames]
     outliers: Bools = np.zeros_like(visible)
-    worst: NDArray[np.float64] = np.zeros(judged)
+    worst: NDArray[np.float64] = np.zeros(len(frames))
     if options.outlier_threshold:
         outliers, worst = find_outliers(dataset.points[frames], visible, options.outlier_threshold)
     number = outliers.sum(1)
-    stay = (number <= _HOPELESS * visible.sum(1)) & (
+    keep = (number <= _MAX_OUTLIER_SHARE * visible.sum(1)) & (
         (number == 0) | (visible.sum(1) - number >= options.min_visible)
     )
     order = np.argsort(-worst, kind="stable")
-    suspects = tuple(
+    examples = tuple(
         OutlierFrame(
             int(frames[i]),
             dataset.points[frames[i]],
             visible[i],
             outliers[i],
             float(worst[i]),
-            not stay[i],
+            not keep[i],
         )
-        for i in spread_out(order, frames, _APART * len(dataset), _EXAMPLES)
+        for i in spread_out(order, frames, _MIN_GAP * len(dataset), _EXAMPLES)
         if number[i]
     )
-    kept = dataset[frames[stay]]
-    kept.visible[outliers[stay]] = False
+    kept = dataset[frames[keep]]  # a copy, which may be changed
+    kept.visible[outliers[keep]] = False
     kept.points[~kept.visible] = 0
     return Curated(
-        kept,
-        frames[stay],
-        len(dataset),
-        int((~enough).sum()),
-        int(enough.sum()) - judged,
-        int((~stay).sum()),
-        int((number[stay] > 0).sum()),
-        outliers[stay].sum(0),
-        suspects,
+        dataset=kept,
+        frames=frames[keep],
+        total=len(dataset),
+        few_visible=int((~enough).sum()),
+        near_duplicates=int(enough.sum()) - len(frames),
+        inconsistent=int((~keep).sum()),
+        corrected=int((number[keep] > 0).sum()),
+        hidden=outliers[keep].sum(0),
+        outlier_frames=examples,
     )
 
 
 def spread_out(
     order: NDArray[np.int64], frames: NDArray[np.int64], gap: float, most: int
 ) -> list[int]:
-    """Return the first of `order` whose frames are more than `gap` frames from each other.
+    """Return the first indices of `order` whose frames are more than `gap` apart.
 
-    order: indices into frames (f,). The neighbours of a frame show the same thing once more.
+    Neighbouring frames look alike, so that one of them is enough as an example.
+
+    Args:
+        order: indices into `frames`, the most interesting first.
+        frames: (f,) frame numbers.
+        gap: least difference between two chosen frame numbers, exclusive.
+        most: number of indices to return at most.
     """
     chosen: list[int] = []
     for i in order.tolist():
@@ -205,49 +233,50 @@ def spread_out(
     return chosen
 
 
-def changed_frames(points: NDArray[np.float32], visible: Bools, least: float) -> Bools:
-    """Tell (f,) which of the frames (f, p, 2) differ from the few kept before them.
+def changed_frames(points: NDArray[np.float32], visible: Bools, min_change: float) -> Bools:
+    """Return which frames (f,) differ from the few frames kept before them.
 
-    A frame that shows no other keypoints than a kept one, and whose points, centred and scaled by
-    their RMS radius, are within `least` (RMS) of it, says nothing new.
+    A frame is a near duplicate if all its visible keypoints are visible in a kept frame too, and
+    the RMS distance between the two is below `min_change`, after centring and scaling.
+
+    Args:
+        points: (f, p, 2), in any unit.
+        visible: (f, p).
+        min_change: in RMS radii of the object, e.g. 0.02.
     """
     kept = np.zeros(len(points), bool)
     recent: deque[_Kept] = deque(maxlen=_RECENT)
     for part in slices(len(points)):
-        seen = visible[part]
-        fitted = _fitted(points[part], seen)
-        patterns = (int.from_bytes(row) for row in np.packbits(seen, 1))
-        for i, now, pattern in zip(range(part.start, part.stop), fitted, patterns, strict=True):
-            closest = least**2 * pattern.bit_count()
-            for before in recent:
-                if pattern & ~before.pattern:
+        scaled = _scaled(points[part], visible[part])
+        patterns = (int.from_bytes(row) for row in np.packbits(visible[part], 1))
+        for i, frame, pattern in zip(range(part.start, part.stop), scaled, patterns, strict=True):
+            limit = min_change**2 * pattern.bit_count()
+            for other in recent:
+                if pattern & ~other.pattern:
                     continue
-                then = before.fitted
-                if pattern != before.pattern:
-                    then = _fitted(points[before.frame], visible[i])
-                away = (now - then).ravel()
-                if away @ away < closest:
+                reference = other.scaled
+                if pattern != other.pattern:  # compare the keypoints that both show
+                    reference = _scaled(points[other.frame], visible[i])
+                difference = (frame - reference).ravel()
+                if difference @ difference < limit:
                     break
             else:
                 kept[i] = True
-                recent.append(_Kept(i, pattern, now))
+                recent.append(_Kept(i, pattern, frame))
     return kept
 
 
 class _Kept(NamedTuple):
-    """A frame that was kept: which, its visible points as bits, and as `_fitted` has it."""
+    """A kept frame: its index, its visible keypoints as bits, and its points from `_scaled`."""
 
     frame: int
     pattern: int
-    fitted: NDArray[np.float32]
+    scaled: NDArray[np.float32]
 
 
-def _fitted(points: NDArray[np.float32], visible: Bools) -> NDArray[np.float32]:
-    """Return points (..., p, 2), the visible centred and with RMS radius 1, the others 0."""
-    there = visible[..., None].astype(np.float32)
-    number = np.maximum(there.sum(-2, keepdims=True), 1)
-    X = np.where(visible[..., None], points, np.float32(0))
-    X = (X - X.sum(-2, keepdims=True) / number) * there
-    radius = np.sqrt((X * X).sum((-2, -1), keepdims=True) / number)
-    fitted: NDArray[np.float32] = X / np.maximum(radius, np.float32(1e-9))
-    return fitted
+def _scaled(points: NDArray[np.float32], visible: Bools) -> NDArray[np.float32]:
+    """Return points (..., p, 2) centred and of RMS radius 1 over the visible; 0 where missing."""
+    mask = visible[..., None].astype(np.float32)
+    X = centre_visible(np.where(visible[..., None], points, np.float32(0)), mask)
+    scaled: NDArray[np.float32] = X / np.maximum(rms_radius(X, mask), np.float32(1e-9))
+    return scaled

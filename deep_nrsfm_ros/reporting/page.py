@@ -108,7 +108,7 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         spectrum=bars(sufficiency.spectrum[:12], "spectrum of the stacked keypoints, %"),
         curated=training.curated,
         hidden=sorted(
-            (row for row in training.curated.hidden_by_name if row[1]), key=lambda row: -row[1]
+            (row for row in training.curated.hidden_by_keypoint if row[1]), key=lambda row: -row[1]
         ),
         suspects=[
             (suspect, skeleton(suspect.points, suspect.visible, model.layout, suspect.outliers))

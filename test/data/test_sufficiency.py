@@ -49,7 +49,7 @@ def test_a_deforming_object_from_all_sides_is_fine() -> None:
     found = assess_sufficiency(dataset(S @ random_cameras(400, np.random.default_rng(0))))
     assert found.refusal == "" and found.warnings == ()
     assert found.view_span > 90 and 0.1 < found.deformation < 0.9
-    assert len(found.spectrum) == found.points == P and found.frames == 400
+    assert len(found.spectrum) == found.keypoints == P and found.frames == 400
     assert np.linalg.norm(found.spectrum) == pytest.approx(1)
     assert "degrees" in found.summary
 
