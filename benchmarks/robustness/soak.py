@@ -2,7 +2,7 @@
 
 Prints a line every ten seconds. The lifter listens as it does by itself, best effort and depth 1:
 where the machine is too busy it misses messages, and counts them. Exit code 1: what it says in
-/diagnostics to have lifted, rejected and missed is not what was sent, or memory grew too much.
+/diagnostics to have lifted, rejected and dropped is not what was sent, or memory grew too much.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ WINDOW = 10.0
 SETTLED = 3  # windows after which memory shall grow no more
 RELIABLE = {"reliability": "reliable", "history": "keep_all"}
 COLUMNS = "{:>8} {:>9} {:>7} {:>9} {:>8} {:>8} {:>8} {:>8} {:>8}"
-COUNTED = ("lifted", "without objects", "rejected", "missed")
+COUNTED = ("lifted", "without objects", "rejected", "dropped")
 
 
 def views(f: int, rng: np.random.Generator) -> NDArray[np.floating]:
@@ -98,7 +98,7 @@ class Soak:
     def settle(self, seconds: float = 60.0) -> dict[str, int]:
         """Wait for the last answers, or so long; return what the lifter says when all is still.
 
-        The last message of all must be answered: from its number the lifter knows what it missed.
+        The last message of all must be answered: from its number the lifter knows what it dropped.
         """
         self._spin(lambda: not self._waiting, seconds)
         for _ in range(int(seconds)):
@@ -184,7 +184,7 @@ def soak(given: argparse.Namespace, folder: Path) -> bool:
         "training",
         "sent",
         "answered",
-        "missed",
+        "dropped",
         "p50 ms",
         "p99 ms",
         "max ms",
@@ -200,13 +200,13 @@ def soak(given: argparse.Namespace, folder: Path) -> bool:
             if wanted != training:
                 client.call("/lifter/train" if wanted else "/lifter/cancel_training")
                 training = wanted
-            sent, answered, missed = client.sent, client.answered, client.counted["missed"]
+            sent, answered, dropped = client.sent, client.answered, client.counted["dropped"]
             ms = client.send(WINDOW)
             now = memory(process.pid)
             settled = now if i == min(SETTLED, windows - 1) else settled
             grown = now - settled if settled else 0.0
             figures = (*np.percentile(ms, (50, 99)), ms.max(), now)
-            lost = client.counted["missed"] - missed
+            lost = client.counted["dropped"] - dropped
             counts = (client.sent - sent, client.answered - answered, lost)
             row = (f"{(i + 1) * WINDOW / 60:.1f}", "on" if training else "off", *counts)
             print(COLUMNS.format(*row, *(f"{figure:.2f}" for figure in figures)), flush=True)

@@ -85,7 +85,7 @@ class Lifter:
     def __init__(self) -> None:
         """Load the model; `run` takes messages."""
         self._node: Any = lifter.LifterNode()
-        ((self._source, _),) = self._node._listener._heard.values()
+        ((self._source, _),) = self._node._keypoint_topics._subscribed.values()
         self.publishers = (self._node._points, self._node._rotation)
         self.published: list[Any] = []
 

@@ -1,8 +1,8 @@
-"""Keypoint messages to observations, by duck typing: nothing of ROS is imported.
+"""Read observations from decoded keypoint messages, by duck typing: ROS is not imported.
 
-Live messages of rclpy and messages that rosbags read from a bag have the same fields and take the
-same path. Whatever is wrong with a message ends in a `MessageError`, before anything of a size
-that the message claims is allocated.
+Live messages of rclpy and messages that rosbags reads from a bag have the same fields and take the
+same path. Every malformed message raises `MessageError`, before memory of a size that the message
+claims is allocated.
 """
 
 from __future__ import annotations
@@ -29,20 +29,24 @@ POINT_CLOUD = "sensor_msgs/PointCloud2"
 MULTI_ARRAY = "std_msgs/Float32MultiArray"
 POLYGON = "geometry_msgs/PolygonStamped"
 
-# The layout that `pack_points` writes, as (name, offset) of float32 fields.
 POINT_FIELDS = (("x", 0), ("y", 4), ("z", 8), ("confidence", 12))
+"""Name and offset in bytes of the float32 fields of the lifter's PointCloud2."""
 POINT_STEP = 16
-
+"""Bytes of a point of the lifter's PointCloud2."""
 
 InputType = str | FieldMapping
-"""One of `INPUT_TYPES`, or the mapping of any other."""
+"""One of `INPUT_TYPES`, or the field mapping of any other type."""
 
 
 def resolve_input_type(option: str, word: str) -> InputType:
-    """Return the input type that `word`, given by `option`, stands for.
+    """Return the input type that the value of an option names.
 
-    word: one of `INPUT_TYPES`, or the path of a field mapping. Raises ValueError for anything else,
-    or for a damaged file.
+    Args:
+        option: name of the option, for the error text.
+        word: one of `INPUT_TYPES`, or the path of a field mapping.
+
+    Raises:
+        ValueError: `word` is neither, or the file is invalid.
     """
     name = word.replace("/msg/", "/")
     if name in INPUT_TYPES:
@@ -56,7 +60,7 @@ def resolve_input_type(option: str, word: str) -> InputType:
 
 
 def type_name(input_type: InputType) -> str:
-    """Return the type of the messages, "package/Type"."""
+    """Return the name of the message type, "package/Type"."""
     return input_type if isinstance(input_type, str) else input_type.type
 
 
@@ -67,13 +71,18 @@ def read_observation(
     min_confidence: float = 0.0,
     size: Size | None = None,
 ) -> Observation:
-    """Return the observation in `message`, which is of type `input_type`.
+    """Return the objects in a message.
 
-    keypoints: q, the number that the detector's layout has; another number is an error.
-    min_confidence: a keypoint below it is missing. So is one with confidence 0, at (0, 0), or
-        with NaN or infinity in a coordinate or its confidence.
-    size: width and height of the image, where the keypoints are normalised by them.
-    Raises MessageError for a malformed message, ValueError for an unknown `input_type`.
+    Args:
+        message: of rclpy or rosbags.
+        input_type: type of the message.
+        keypoints: q, the number of keypoints of the detector's layout.
+        min_confidence: in [0, 1]; a keypoint with less is missing, see `to_observation`.
+        size: width and height of the image; needed for normalised keypoints.
+
+    Raises:
+        MessageError: the message is malformed or has another number of keypoints.
+        ValueError: `input_type` is unknown.
     """
     mapping = _mapping(input_type)
     try:
@@ -90,10 +99,12 @@ def read_observation(
 
 
 def count_keypoints(message: Any, input_type: InputType) -> int:
-    """Return how many keypoints each object in `message` has; 0 if there is no object in it.
+    """Return the number of keypoints of each object in a message, 0 if there is no object.
 
-    Where the detector leaves some out it is the least that there can be. Raises MessageError for
-    an array of plain numbers that may be pairs or triples.
+    Where the detector leaves keypoints out, this is the least possible number.
+
+    Raises:
+        MessageError: an array without dimensions that may hold pairs or triples.
     """
     mapping = _mapping(input_type)
     if mapping:
@@ -106,9 +117,9 @@ def count_keypoints(message: Any, input_type: InputType) -> int:
     if len(shape) > 1:
         return shape[-2] if math.prod(shape) else 0
     numbers = max(len(message.data) - int(message.layout.data_offset), 0)
-    fits = [numbers // size for size in (2, 3) if numbers % size == 0]
-    if not numbers or len(fits) == 1:
-        return fits[0]
+    counts = [numbers // size for size in (2, 3) if numbers % size == 0]
+    if not numbers or len(counts) == 1:
+        return counts[0]
     raise MessageError(
         f"data has {numbers} numbers and no layout; give it one, so that (x, y) can be told from "
         "(x, y, confidence)"
@@ -116,21 +127,22 @@ def count_keypoints(message: Any, input_type: InputType) -> int:
 
 
 def may_omit_keypoints(input_type: InputType) -> bool:
-    """Tell whether messages leave out keypoints, so that none need tell how many there are."""
+    """Return whether messages may omit keypoints, so that none shows how many there are."""
     mapping = _mapping(input_type)
     return bool(mapping and mapping.keypoint_id and not mapping.names)
 
 
 def _mapping(input_type: InputType) -> FieldMapping | None:
-    """Return the mapping of an input type, if it is read by one."""
+    """Return the field mapping of an input type, None if it has none."""
     return MAPPINGS.get(input_type) if isinstance(input_type, str) else input_type
 
 
 def pack_points(points: NDArray[np.floating], confidence: NDArray[np.floating]) -> bytes:
-    """Return the data of a little-endian PointCloud2 with the fields `POINT_FIELDS`.
+    """Return the data of a little-endian PointCloud2 of height n, width p, and `POINT_STEP`.
 
-    points: (n, p, 3) or (n, p, 2), z is then 0. confidence: (n, p). Height is n, width is p,
-    point_step is `POINT_STEP`.
+    Args:
+        points: (n, p, 3), or (n, p, 2) with z = 0.
+        confidence: (n, p).
     """
     packed = np.zeros((*confidence.shape, 4), "<f4")
     packed[..., : points.shape[-1]] = points
@@ -139,14 +151,15 @@ def pack_points(points: NDArray[np.floating], confidence: NDArray[np.floating]) 
 
 
 def read_points(message: Any) -> NDArray[np.float32]:
-    """Return (n, p, 4) of the lifter's PointCloud2: x, y, z, confidence.
+    """Return x, y, z and confidence (n, p, 4) of the lifter's PointCloud2.
 
-    Raises MessageError for a cloud of another make.
+    Raises:
+        MessageError: the cloud has other fields or another size.
     """
     n, p = int(message.height), int(message.width)
-    found = tuple((str(field.name), int(field.offset)) for field in message.fields)
-    if found != POINT_FIELDS or int(message.point_step) != POINT_STEP:
-        raise MessageError(f"fields are {found}; a lifter's points have {POINT_FIELDS}")
+    fields = tuple((str(field.name), int(field.offset)) for field in message.fields)
+    if fields != POINT_FIELDS or int(message.point_step) != POINT_STEP:
+        raise MessageError(f"fields are {fields}; a lifter's points have {POINT_FIELDS}")
     data = memoryview(message.data).cast("B")
     if len(data) != n * p * POINT_STEP:
         raise MessageError(f"data has {len(data)} bytes; {n} x {p} points need {n * p * 16}")
@@ -155,16 +168,16 @@ def read_points(message: Any) -> NDArray[np.float32]:
 
 
 def _point_cloud(message: Any, keypoints: int) -> NDArray[np.floating]:
-    """Return (n, q, 2 or 3) of a PointCloud2: fields x, y and, where there is one, confidence."""
+    """Return x, y and, if there is one, confidence (n, q, 2 or 3) of a PointCloud2."""
     return point_cloud_format(message, keypoints).values(memoryview(message.data).cast("B"))
 
 
 def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:
-    """Return (n, q, 2 or 3) of a Float32MultiArray.
+    """Return x, y and, if there is one, confidence (n, q, 2 or 3) of a Float32MultiArray.
 
-    The sizes of the layout's dimensions tell the shape: q x 2, q x 3, n x q x 2 or n x q x 3,
-    rows of x, y and, in threes, confidence. Strides are not looked at: the data is dense. With no
-    dimensions, or a single one, the data is one object: 2q numbers are q x 2, 3q are q x 3.
+    The sizes of the dimensions are the shape: q x 2, q x 3, n x q x 2 or n x q x 3. Strides are
+    ignored: the data is dense. With no dimension, or a single one, the data is one object: 2q
+    numbers are q x 2, 3q numbers are q x 3.
     """
     data = np.asarray(message.data, np.float32)[int(message.layout.data_offset) :]
     shape = [int(dimension.size) for dimension in message.layout.dim]
@@ -188,9 +201,9 @@ def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:
 
 
 def _polygon(message: Any, keypoints: int) -> NDArray[np.floating]:
-    """Return (1, q, 2 or 3) of a PolygonStamped; z is the confidence.
+    """Return x, y and confidence (the field z), (1, q, 2 or 3), of a PolygonStamped.
 
-    A z of exactly 0 everywhere is a sender that gives no confidence: all points are certain.
+    If z is 0 for all points, the detector gives no confidence, and all points have confidence 1.
     """
     points = message.polygon.points
     check_keypoints(len(points), keypoints, "number of points")
@@ -205,3 +218,4 @@ _READERS: dict[str, Callable[[Any, int], NDArray[np.floating]]] = {
 }
 
 INPUT_TYPES = (*_READERS, *MAPPINGS)
+"""Message types that are read without a mapping file."""

@@ -1,4 +1,4 @@
-"""From one keypoint message to lifted shapes: all that a change of parameters replaces at once."""
+"""The way of one keypoint message to lifted shapes, as one configuration defines it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from deep_nrsfm_ros.model_files.folders import default_bags_dir, default_models_
 from deep_nrsfm_ros.model_files.model_file import Model
 
 MODEL_ORDER = "model"
+"""Value of `keypoint_layout` for keypoints in the order of the model's layout."""
 AUTO = "auto"
+"""Value of `input_type` for the type of the first publisher."""
 
 
 @dataclass(frozen=True)
@@ -31,54 +33,76 @@ class InputOptions:
     model: str = option("human", "model to lift with: a name in the model folders, or a path")
     models_dir: str = option(
         str(default_models_dir()),
-        "folder for trained models, looked through before those that come with the package",
+        "folder of trained models; it is searched before the models of the package",
         read_only=True,
     )
     bags_dir: str = option(
         str(default_bags_dir()),
-        "folder of the bags that train.bags may name, set by the owner; relative names begin here",
+        "folder that holds all bags that train.bags may name; relative names begin here",
         read_only=True,
     )
     input_type: str = option(
         POINT_CLOUD,
         f"type of the keypoint messages: one of {', '.join(INPUT_TYPES)}; the path of a field "
-        "mapping for any other; or 'auto': that of the first publisher",
+        "mapping for any other type; or 'auto' for the type of the first publisher",
         read_only=True,
     )
     topics: tuple[str, ...] = option(
         (),
-        "topics with keypoints, '*' for any one part of a name, which is then the identity of "
-        "what comes from there: /humans/bodies/*/skeleton2d; none: keypoints",
+        "topics with keypoints; '*' stands for one part of a topic name, which becomes the "
+        "identity of the objects on it, as in /humans/bodies/*/skeleton2d; empty = keypoints",
         read_only=True,
     )
     image_width: int = option(
-        0, "width of the image in pixels, for normalised keypoints; 0: unknown", low=0, high=1000000
+        0,
+        "width of the image in pixels, needed for normalised keypoints; 0 = unknown, 640 typical",
+        low=0,
+        high=1000000,
     )
-    image_height: int = option(0, "height of the image in pixels, likewise", low=0, high=1000000)
+    image_height: int = option(
+        0,
+        "height of the image in pixels, needed for normalised keypoints; 0 = unknown, 480 typical",
+        low=0,
+        high=1000000,
+    )
     keypoint_layout: str = option(
         MODEL_ORDER,
-        "order of the detector's keypoints: a preset, the path of a layout file, or 'model' for "
-        "the order of the model's own",
+        "order of the detector's keypoints: a preset such as coco17, the path of a layout file, or "
+        "'model' for the order of the model's layout",
     )
     max_objects: int = option(
         100,
-        "most objects in a message; one with more is dropped, not lifted for seconds",
+        "largest number of objects in a message; a message with more is rejected, so that it does "
+        "not block the lifter for seconds; 100 typical",
         low=1,
         high=100_000,
     )
     min_confidence: float = option(
-        0.1, "a keypoint with less confidence counts as missing", low=0, high=1
+        0.1,
+        "detector confidence below which a keypoint is missing; 0 = all keypoints are used, 0.1 "
+        "typical, 0.5 strict",
+        low=0,
+        high=1,
     )
 
     @property
     def image_size(self) -> Size | None:
-        """Return width and height of the image, None if they are unknown."""
+        """Width and height of the image in pixels, None if they are unknown."""
         known = self.image_width and self.image_height
         return (self.image_width, self.image_height) if known else None
 
 
 class Pipeline:
-    """One model, one detector layout, one set of options, ready for messages."""
+    """Immutable per-configuration pipeline, swapped atomically on a parameter change.
+
+    Only the filters of smoothing change from message to message.
+
+    Attributes:
+        model: lifts.
+        detector: layout that `keypoint_layout` names; None: the model's own.
+        source: layout of the messages, `detector` or the model's.
+        edges: pairs of keypoint indices of the model's layout, to draw.
+    """
 
     def __init__(
         self,
@@ -86,11 +110,19 @@ class Pipeline:
         detector: KeypointLayout | None,
         inputs: InputOptions,
         lifting: LiftingOptions,
-        steadying: SmoothingOptions,
+        smoothing: SmoothingOptions,
     ) -> None:
-        """Raise ValueError if the model and the detector's layout do not fit each other.
+        """Prepare a model and its input.
 
-        detector: the layout that `inputs.keypoint_layout` names; None for the model's own.
+        Args:
+            model: weights and layout.
+            detector: layout that `inputs.keypoint_layout` names; None: the model's own.
+            inputs: how messages are read.
+            lifting: how keypoints are lifted.
+            smoothing: how shapes are smoothed.
+
+        Raises:
+            ValueError: the layouts of model and detector do not fit each other.
         """
         self.model, self.detector = model, detector
         self.source = detector or model.layout
@@ -100,64 +132,81 @@ class Pipeline:
         self._min_confidence = inputs.min_confidence
         self._size = inputs.image_size
         self._min_visible, self._max_objects = lifting.min_visible, inputs.max_objects
-        self._steadying = steadying
-        self._steady: dict[str, Smoother] = {}
+        self._smoothing = smoothing
+        self._smoothers: dict[str, Smoother] = {}
 
     def read(
         self, raw: bytes, reader: MessageReader, size: Size | None = None
     ) -> tuple[Header | None, Observation]:
         """Return the header of a serialised message, None if its type has none, and its objects.
 
-        The keypoints are as the model orders them. size: that of the image, instead of the one that
-        the options tell. Raises MessageError.
+        Args:
+            raw: the serialised message.
+            reader: of the message's topic.
+            size: of the image in pixels; None: that of the options.
+
+        Returns:
+            The header, and an observation in the order of the model's layout.
+
+        Raises:
+            MessageError: the message is malformed or has more than `max_objects` objects.
         """
         q = len(self.source)
-        header, seen = reader(raw, q, self._min_confidence, size or self._size)
-        if len(seen.confidence) > self._max_objects:
+        header, observation = reader(raw, q, self._min_confidence, size or self._size)
+        points, confidence, identities = observation
+        if len(confidence) > self._max_objects:
             raise MessageError(
-                f"message has {len(seen.confidence)} objects; expected at most "
+                f"message has {len(confidence)} objects; expected at most "
                 f"{self._max_objects} (max_objects)"
             )
-        return header, Observation(*self._map(seen.points, seen.confidence), seen.identities)
+        return header, Observation(*self._map(points, confidence), identities)
 
     @property
-    def steadies(self) -> bool:
-        """Tell whether objects are filtered over time, for which their identities matter."""
-        return self._steadying.enabled
+    def needs_identities(self) -> bool:
+        """Whether `lift` needs the identities of objects: smoothing is enabled."""
+        return self._smoothing.enabled
 
     def lift(
         self,
-        seen: Observation,
+        observation: Observation,
         intrinsics: Intrinsics | None,
         identities: tuple[str, ...],
         topic: str,
         time: float,
     ) -> tuple[Lifted, tuple[str, ...]]:
-        """Return the shapes of the objects, smoothed if so configured, and their identities.
+        """Return the lifted objects of a message, smoothed if so configured, and their identities.
 
-        intrinsics: of the camera, for the shapes to be at their place; None: they are centred.
-        identities: n, of the objects on their topic; "" where there is none. time: of the message,
-        in seconds. Objects that are bridged come last; there may be none at all. Objects that
-        cannot be lifted are NaN, unless all are: then MessageError is raised.
+        All objects are lifted in one pass. Objects whose gap smoothing fills are appended. There
+        may be no objects at all. Objects that cannot be lifted are NaN.
+
+        Args:
+            observation: n objects in the order of the model's layout.
+            intrinsics: of the camera: shapes are at their positions; None: shapes are centred.
+            identities: n, unique on the topic; "" if unknown.
+            topic: of the message; each topic has its own filters.
+            time: stamp of the message in seconds.
+
+        Raises:
+            MessageError: there are objects, and none can be lifted.
         """
-        points, confidence = seen.points, seen.confidence
+        points, confidence = observation.points, observation.confidence
         if intrinsics:
             lifted = lift_perspective(self._lifter, intrinsics, points, confidence)
         else:
-            lifted = self._lifter.lift(points, confidence)
-        steady = self._steady.get(topic)
-        if steady is None:
-            steady = self._steady[topic] = Smoother(self._steadying)
-        lifted, identities = steady(lifted, identities, time)
+            lifted = self._lifter(points, confidence)
+        smoother = self._smoothers.get(topic)
+        if smoother is None:
+            smoother = self._smoothers[topic] = Smoother(self._smoothing)
+        lifted, identities = smoother(lifted, identities, time)
         if identities and np.isnan(lifted.residual).all():
-            most = (confidence > 0).sum(1).max()
-            if most >= self._min_visible:
+            visible = (confidence > 0).sum(1).max()
+            if visible >= self._min_visible:
                 raise MessageError(
                     "message has its visible keypoints on one line or on one spot"
-                    + ", or where the camera's lens sees nothing" * bool(intrinsics)
+                    + ", or outside the view of the camera's lens" * bool(intrinsics)
                 )
             raise MessageError(
-                f"message has at most {most} visible keypoints of the "
+                f"message has at most {visible} visible keypoints of the "
                 f"model's {len(self.model.layout)} in an object; min_visible is {self._min_visible}"
             )
         return lifted, identities

@@ -1,4 +1,4 @@
-"""The camera that the keypoints come from: its CameraInfo, as the lifter hears it."""
+"""Subscription to the CameraInfo of the camera that the keypoints come from."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.camera_info import read_camera_info
 from deep_nrsfm_ros.messages.field_mapping import Size
 
-# Drivers send it with every image; a simulator or a bag may send it once and keep it.
+# Drivers publish CameraInfo with every image; a simulator or a bag may publish it once, latched.
 _STREAM = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -26,74 +26,86 @@ class CameraOptions:
 
     camera_info: str = option(
         "",
-        "topic with the sensor_msgs/CameraInfo of the camera: objects come out at their place "
-        "before it, and nothing is lifted before it is heard; empty: they come out centred",
+        "topic of the camera's sensor_msgs/CameraInfo: objects are lifted to their positions in "
+        "the optical frame, and only once a CameraInfo has been received; empty = objects are "
+        "centred on their keypoints",
         read_only=True,
     )
     rectified: bool = option(
         False,
-        "the keypoints are those of the rectified image, without distortion, to which CameraInfo's "
-        "P belongs, not K and D",
+        "whether the keypoints are those of the rectified image (CameraInfo's P) and not of the "
+        "raw image (K and D)",
         read_only=True,
     )
     tf_prefix: str = option(
         "",
-        "the frame of each object is sent on /tf, its name this and the identity of the object "
-        "(see ~/objects); needs camera_info; empty: none",
+        "prefix of the frames of objects on /tf; the name of a frame is the prefix and the "
+        "identity of the object (see ~/objects); needs camera_info; empty = no frames",
         read_only=True,
     )
 
 
 class CameraInfoSubscription:
-    """What is known of the camera from the last CameraInfo.
+    """Keeps the last CameraInfo.
 
-    frame: its frame_id. size: width and height of the image, None if they are unknown.
-    intrinsics: None before the first usable message, and always where no CameraInfo is wanted.
+    Attributes:
+        enabled: whether the options name a topic.
+        intrinsics: of the camera; None before the first usable message, and if not enabled.
+        frame: frame_id of the camera, "" if unknown.
+        size: width and height of the image in pixels, None if unknown.
     """
 
     def __init__(self, node: Node, options: CameraOptions) -> None:
-        """Listen where the options say; raise ValueError if they do not fit each other."""
+        """Subscribe to the topic of the options.
+
+        Raises:
+            ValueError: `tf_prefix` without `camera_info`.
+        """
         if options.tf_prefix and not options.camera_info:
             raise ValueError(
                 f"tf_prefix is {options.tf_prefix!r} without camera_info: a frame needs a place"
             )
-        self.wanted = bool(options.camera_info)
+        self.enabled = bool(options.camera_info)
         self.intrinsics: Intrinsics | None = None
         self.frame = ""
         self.size: Size | None = None
         self._rectified = options.rectified
         self._topic = ""
-        self._problem = "has not come yet: is the camera's driver running?"
-        if not self.wanted:
+        self._problem = "has not been received: is the camera's driver running?"
+        if not self.enabled:
             return
         for qos in (_STREAM, _LATCHED):
             subscription = node.create_subscription(
                 CameraInfo,
                 options.camera_info,
-                self._take,
+                self._receive,
                 qos,
-                # Most publishers are not latched, which is no fault.
+                # Most publishers are not latched: an incompatible QoS is no problem here.
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             )
             self._topic = subscription.topic_name
 
-    def known(self) -> Intrinsics | None:
-        """Return the intrinsics, None if none are wanted; raise MessageError while they lack."""
-        if self.wanted and self.intrinsics is None:
+    def require_intrinsics(self) -> Intrinsics | None:
+        """Return the intrinsics, None if not enabled.
+
+        Raises:
+            MessageError: no usable CameraInfo has been received.
+        """
+        if self.enabled and self.intrinsics is None:
             raise MessageError(f"CameraInfo on {self._topic} {self._problem}")
         return self.intrinsics
 
     @property
     def status(self) -> str:
-        """Return in words what is known."""
-        if not self.wanted:
+        """The state as text, for diagnostics."""
+        if not self.enabled:
             return "none: objects are centred"
         if self.intrinsics is None:
             return f"CameraInfo on {self._topic} {self._problem}"
         return f"{self.intrinsics.lens}, focal length {self.intrinsics.focal[0]:.1f} pixels"
 
-    def _take(self, message: CameraInfo) -> None:
-        """Keep what a CameraInfo says, or why it says nothing."""
+    def _receive(self, message: CameraInfo) -> None:
+        """Keep the intrinsics of a CameraInfo, or the reason why it has none."""
         try:
             self.intrinsics = read_camera_info(message, rectified=self._rectified)
         except MessageError as problem:

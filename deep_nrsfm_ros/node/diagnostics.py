@@ -1,4 +1,4 @@
-"""Diagnostics of the lifter: its health, counted and judged, and the message that reports it."""
+"""Diagnostics of the lifter: counts of messages, their rating, and the message on /diagnostics."""
 
 from __future__ import annotations
 
@@ -12,148 +12,166 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from numpy.typing import NDArray
 
 OK, WARN, ERROR = range(3)
+"""Levels of diagnostic_msgs/DiagnosticStatus."""
 
-_SILENCE = 3.0
-_POOR_FIT = 0.3
-_UNSURE = 0.3
+_MAX_SILENCE = 3.0  # seconds without a message
+_MAX_RESIDUAL = 0.3  # median reprojection error
+_MIN_CONFIDENCE = 0.3  # median confidence of objects
 
 
 class Report(NamedTuple):
-    """A level of `OK`, `WARN` or `ERROR`, one line that says why, and named figures."""
+    """Result of one reporting period.
+
+    Attributes:
+        level: `OK`, `WARN` or `ERROR`.
+        message: one line that says why.
+        values: named figures as text.
+    """
 
     level: int
     message: str
     values: dict[str, str]
 
 
-class Health:
-    """Counts what happens to messages and sums it up.
+class LifterDiagnostics:
+    """Counts messages and rates each reporting period.
 
-    ERROR: messages came since the last report and none could be lifted, or there is a publisher
-    that cannot be heard and nothing else to lift.
-    WARN: some messages could not be lifted; none has come for 3 s; more were missed, having come
-    while others were lifted, than were lifted; half of the objects seen since the last report fit
-    the model worse than a reprojection error of 0.3; or half of them have a confidence below 0.3.
+    ERROR: messages were received and none could be lifted; or a publisher cannot be received and no
+        other message was lifted.
+    WARN: some messages were rejected; no message for 3 s; more messages were dropped than received;
+        the median reprojection error is above 0.3; or the median confidence is below 0.3.
     OK: otherwise.
+
+    Attributes:
+        total_lifted: messages lifted since the start.
+        total_empty: messages without objects since the start.
+        total_rejected: messages since the start that could not be lifted.
+        total_dropped: messages since the start that were sent and not received.
+        last_problem: reason of the last rejected message or publisher that cannot be received.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin to count; `clock` gives seconds."""
+        """Start all counts at 0.
+
+        Args:
+            clock: returns seconds.
+        """
         self._clock = clock
         self._last_input = self._last_report = clock()
         self._seconds: list[float] = []
-        self._errors: list[NDArray[np.float32]] = []
+        self._residuals: list[NDArray[np.float32]] = []
         self._confidences: list[NDArray[np.float32]] = []
-        self._rejected = self._empty = self._missed = 0
-        self._unheard = ""
+        self._rejected = self._empty = self._dropped = 0
+        self._publisher_problem = ""
         self.total_lifted = 0
         self.total_empty = 0
         self.total_rejected = 0
-        self.total_missed = 0
+        self.total_dropped = 0
         self.last_problem = ""
 
     @property
     def idle(self) -> bool:
-        """Tell whether no message has come since the last report."""
+        """Whether no message has been received since the last report."""
         return not self._seconds and not self._rejected and not self._empty
 
     def lifted(
-        self,
-        seconds: float,
-        reprojection_error: NDArray[np.float32],
-        confidence: NDArray[np.float32],
+        self, seconds: float, residual: NDArray[np.float32], confidence: NDArray[np.float32]
     ) -> None:
-        """Count a message that took `seconds`.
+        """Count a lifted message; the arrays are kept until the report, which sums them up.
 
-        reprojection_error: (n) of its objects, NaN of those that could not be lifted.
-        confidence: (n, p) of their keypoints. Both are kept until the report, which sums them up.
+        Args:
+            seconds: processing time.
+            residual: (n,) reprojection error of its objects, NaN if not lifted.
+            confidence: (n, p) of their keypoints.
         """
         self._last_input = self._clock()
         self._seconds.append(seconds)
-        self._errors.append(reprojection_error)
+        self._residuals.append(residual)
         self._confidences.append(confidence)
-        self._unheard = ""
+        self._publisher_problem = ""
         self.total_lifted += 1
 
-    def saw_nothing(self) -> None:
-        """Count a message without any object: the detector works and sees none."""
+    def empty(self) -> None:
+        """Count a message without objects."""
         self._last_input = self._clock()
         self._empty += 1
-        self._unheard = ""
+        self._publisher_problem = ""
         self.total_empty += 1
 
     def rejected(self, reason: str) -> None:
-        """Count a message that could not be lifted, and remember why."""
+        """Count a message that could not be lifted."""
         self._last_input = self._clock()
         self._rejected += 1
         self.total_rejected += 1
         self.last_problem = reason
 
-    def missed(self, count: int) -> None:
-        """Count messages that were sent and never came."""
-        self._missed += count
-        self.total_missed += count
+    def dropped(self, count: int) -> None:
+        """Count messages that were sent and not received."""
+        self._dropped += count
+        self.total_dropped += count
 
-    def unheard(self, reason: str) -> None:
-        """Remember that there is a publisher whose messages do not arrive, and why."""
-        self._unheard = self.last_problem = reason
+    def publisher_problem(self, reason: str) -> None:
+        """Record why the messages of a publisher cannot be received."""
+        self._publisher_problem = self.last_problem = reason
 
     def report(self) -> Report:
-        """Return how the time since the last report went, and begin anew."""
+        """Return the report of the period since the last one, and start the next period."""
         now = self._clock()
         seconds = np.array(self._seconds or [np.nan])
-        error, confidence = self._medians()
+        residual, confidence = self._medians()
         rate = len(self._seconds) / max(now - self._last_report, 1e-9)
-        level, message = self._judge(now - self._last_input, error, confidence)
+        level, message = self._rate_period(now - self._last_input, residual, confidence)
         values = {
             "rate [Hz]": f"{rate:.1f}",
             "processing time p50 [ms]": f"{np.median(seconds) * 1e3:.3f}",
             "processing time max [ms]": f"{seconds.max() * 1e3:.3f}",
-            "reprojection error": f"{error:.4f}",
+            "reprojection error": f"{residual:.4f}",
             "confidence": f"{confidence:.2f}",
             "messages lifted": str(self.total_lifted),
             "messages without objects": str(self.total_empty),
             "messages rejected": str(self.total_rejected),
-            "messages missed": str(self.total_missed),
+            "messages dropped": str(self.total_dropped),
             "last problem": self.last_problem or "none",
         }
-        self._last_report, self._rejected, self._empty, self._missed = now, 0, 0, 0
+        self._last_report, self._rejected, self._empty, self._dropped = now, 0, 0, 0
         self._seconds.clear()
-        self._errors.clear()
+        self._residuals.clear()
         self._confidences.clear()
         return Report(level, message, values)
 
     def _medians(self) -> tuple[float, float]:
-        """Return the reprojection error and confidence of half of the objects, NaN if none."""
-        if not self._errors:
+        """Return median reprojection error and confidence of the lifted objects, NaN if none."""
+        if not self._residuals:
             return np.nan, np.nan
-        error = np.concatenate(self._errors)
-        models = groupby(self._confidences, lambda one: one.shape[1])  # of as many keypoints each
+        residual = np.concatenate(self._residuals)
+        # Models with different numbers of keypoints may follow one another in a period.
+        models = groupby(self._confidences, lambda array: array.shape[1])
         confidence = np.concatenate([np.concatenate(list(of)).mean(1) for _, of in models])
-        known = ~np.isnan(error)
-        if not known.any():
+        lifted = ~np.isnan(residual)
+        if not lifted.any():
             return np.nan, np.nan
-        return float(np.median(error[known])), float(np.median(confidence[known]))
+        return float(np.median(residual[lifted])), float(np.median(confidence[lifted]))
 
-    def _judge(self, silence: float, error: float, confidence: float) -> tuple[int, str]:
+    def _rate_period(self, silence: float, residual: float, confidence: float) -> tuple[int, str]:
         """Return level and message by the rules of the class."""
         if self._rejected:
-            came = self._rejected + len(self._seconds)
+            received = self._rejected + len(self._seconds)
             level = WARN if self._seconds else ERROR
-            return level, f"{self._rejected} of {came} messages rejected: {self.last_problem}"
-        if self._unheard:
-            return ERROR, self._unheard
-        if silence > _SILENCE:
+            return level, f"{self._rejected} of {received} messages rejected: {self.last_problem}"
+        if self._publisher_problem:
+            return ERROR, self._publisher_problem
+        if silence > _MAX_SILENCE:
             return WARN, f"no keypoints for {silence:.0f} s"
-        if self._missed > (came := len(self._seconds) + self._empty):
+        if self._dropped > (received := len(self._seconds) + self._empty):
             return WARN, (
-                f"{self._missed} of {self._missed + came} messages missed: they come faster than "
-                "they are lifted; set test_time_rotations to 1 or refill to 0, or send fewer"
+                f"{self._dropped} of {self._dropped + received} messages dropped: they arrive "
+                "faster than they are lifted; set test_time_rotations to 1 or refill to 0, or send "
+                "fewer"
             )
-        if error > _POOR_FIT:
-            return WARN, f"poor fit: half of the reprojection errors are above {error:.2f}"
-        if confidence < _UNSURE:
-            return WARN, f"low confidence: that of half of the objects is below {confidence:.2f}"
+        if residual > _MAX_RESIDUAL:
+            return WARN, f"poor fit: median reprojection error {residual:.2f}"
+        if confidence < _MIN_CONFIDENCE:
+            return WARN, f"low confidence: median {confidence:.2f}"
         if self._empty and not self._seconds:
             return OK, "the detector sees no object"
         return OK, "lifting" if self._seconds else "waiting for keypoints"
@@ -162,7 +180,15 @@ class Health:
 def status(
     name: str, level: int, message: str, values: Mapping[str, Any], hardware_id: str = ""
 ) -> DiagnosticStatus:
-    """Return a diagnostic status with its values as text."""
+    """Return a diagnostic status whose values are written as text.
+
+    Args:
+        name: of the status, "node: task".
+        level: `OK`, `WARN` or `ERROR`.
+        message: one line that says why.
+        values: named figures.
+        hardware_id: "" for none.
+    """
     return DiagnosticStatus(
         level=bytes([level]),
         name=name,

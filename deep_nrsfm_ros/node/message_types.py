@@ -1,4 +1,4 @@
-"""Message classes by name, imported when they are asked for: no detector's package is required."""
+"""Message classes by name, imported on demand: no detector's package is required."""
 
 from __future__ import annotations
 
@@ -12,35 +12,39 @@ from deep_nrsfm_ros.lifting.observation import MessageError
 
 
 def message_class(name: str) -> Any:
-    """Return the class of messages of type "package/Type".
+    """Return the class of the message type "package/Type".
 
-    Raises ValueError that says what to install when the package is absent.
+    Raises:
+        ValueError: the package is not installed or has no such message.
     """
     package, _, kind = name.partition("/")
     try:
-        found = getattr(import_module(f"{package}.msg"), kind, None)
+        cls = getattr(import_module(f"{package}.msg"), kind, None)
     except ImportError as error:
         raise ValueError(
-            f"messages of type {name} need the package {package}, which is not here ({error}): "
+            f"messages of type {name} need the package {package}, not importable ({error}): "
             f"install it (ros-jazzy-{package.replace('_', '-')}, or from source) and source the "
             "workspace that it is in"
         ) from None
-    if found is None:
+    if cls is None:
         raise ValueError(f"package {package} has no message {kind}")
-    return found
+    return cls
 
 
 def decoder(name: str) -> Callable[[bytes], Any]:
-    """Return what makes messages of type "package/Type" of bytes, or raises MessageError.
+    """Return the function that decodes serialised messages of type "package/Type".
 
-    Raises ValueError as `message_class` does.
+    It raises MessageError for bytes that are no such message.
+
+    Raises:
+        ValueError: as `message_class`.
     """
-    found = message_class(name)
+    cls = message_class(name)
 
     def decode(raw: bytes) -> Any:
         try:
-            return deserialize_message(raw, found)
-        except Exception as error:  # of the middleware, of several kinds
+            return deserialize_message(raw, cls)
+        except Exception as error:  # the middleware raises several kinds
             raise MessageError(f"{len(raw)} bytes that are no {name}: {error}") from None
 
     return decode

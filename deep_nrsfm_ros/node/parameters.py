@@ -1,4 +1,4 @@
-"""ROS parameters from dataclass options: declared with descriptors, read back as the dataclass."""
+"""Declare the options of a dataclass as ROS parameters, and read them back."""
 
 from __future__ import annotations
 
@@ -16,10 +16,16 @@ Config = TypeVar("Config")
 
 
 def declare(node: Node, cls: type[Config], prefix: str = "") -> Config:
-    """Declare a parameter for every option of the dataclass `cls` and return their values.
+    """Declare a parameter for every option of a dataclass, and return their values.
 
-    prefix: "train." gives train.steps and so on. Raises ValueError, or rclpy's
-    ParameterException, for a value from outside that does not fit.
+    Args:
+        node: owns the parameters.
+        cls: the dataclass.
+        prefix: of their names; "train." gives train.steps.
+
+    Raises:
+        ValueError: a value from outside is invalid.
+        ParameterException: rclpy refuses a value from outside.
     """
     for field, _, opt in options(cls):
         descriptor = _descriptor(field.default, opt)
@@ -30,31 +36,38 @@ def declare(node: Node, cls: type[Config], prefix: str = "") -> Config:
 def read(
     node: Node, cls: type[Config], prefix: str = "", changes: Sequence[Parameter] = ()
 ) -> Config:
-    """Return the dataclass `cls` as it stands in the node's parameters, once `changes` are made.
+    """Return a dataclass of the values of a node's parameters.
 
-    Raises ValueError that names the first parameter outside its range.
+    Args:
+        node: owns the parameters.
+        cls: the dataclass.
+        prefix: of their names.
+        changes: new values, which take precedence.
+
+    Raises:
+        ValueError: a value is invalid; the text names the first such parameter.
     """
     proposed = {parameter.name: parameter.value for parameter in changes}
     values = {}
     for field, _, opt in options(cls):
         name = parameter_name(field, prefix)
-        # `[]` in a parameter file leaves an array without a value: that is the default too.
-        now = node.get_parameter_or(name, Parameter(name, value=_to_ros(field.default)))
-        value = proposed.get(name, now.value)
+        # `[]` in a parameter file leaves an array without a value; it means the default.
+        present = node.get_parameter_or(name, Parameter(name, value=_to_ros(field.default)))
+        value = proposed.get(name, present.value)
         values[field.name] = _from_ros(name, value, field.default)
         opt.check(name, values[field.name])
     return cls(**values)
 
 
 def parameter_name(field: Field[Any], prefix: str = "") -> str:
-    """Return the name of the parameter of an option, e.g. "train.from" of the field `from_`."""
+    """Return the name of an option's parameter: "train.from" for the field `from_`."""
     return prefix + field.name.rstrip("_")
 
 
 def _descriptor(default: Any, opt: Option) -> ParameterDescriptor:
-    """Say what the parameter means and allows, for `ros2 param describe` and for tools."""
+    """Return the descriptor that `ros2 param describe` and tools show."""
     descriptor = ParameterDescriptor(description=opt.description, read_only=opt.read_only)
-    # People write `0` for `0.0`; only a parameter of dynamic type takes it (see _from_ros).
+    # Users write `0` for `0.0`; only a parameter of dynamic type accepts it (see _from_ros).
     descriptor.dynamic_typing = isinstance(default, float)
     if opt.choices:
         descriptor.additional_constraints = "one of " + ", ".join(opt.choices)
@@ -70,7 +83,7 @@ def _descriptor(default: Any, opt: Option) -> ParameterDescriptor:
 
 def _to_ros(value: Any) -> Any:
     """Return the value of an option as a parameter's value."""
-    # rclpy takes an empty list for an array of bytes; a single empty string stands for it.
+    # rclpy reads an empty list as an array of bytes; [""] stands for it.
     return (list(value) or [""]) if isinstance(value, tuple) else value
 
 

@@ -1,4 +1,4 @@
-"""Which topics the lifter listens to, of which type, and what keeps it from hearing anything."""
+"""Subscriptions to the keypoint topics: their types, and publishers that cannot be received."""
 
 from __future__ import annotations
 
@@ -23,14 +23,22 @@ from deep_nrsfm_ros.node.message_types import decoder, message_class
 
 DEFAULT_TOPIC = "keypoints"
 SENSOR_INPUT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Best effort, depth 1: messages that arrive during a lift are dropped."""
 
 LOG_PERIOD = 2.0
-"""Seconds in which the same complaint is logged once."""
+"""Seconds between two log entries of the same kind."""
 
 
 @dataclass(frozen=True)
 class KeypointTopic:
-    """A topic that is heard: how its messages are read, and who is who in them."""
+    """State of a subscribed topic.
+
+    Attributes:
+        topic: its resolved name.
+        reader: reads its messages.
+        tracker: gives identities to its objects.
+        dropped: counts its dropped messages.
+    """
 
     topic: str
     reader: MessageReader
@@ -39,180 +47,190 @@ class KeypointTopic:
 
 
 class KeypointSubscriptions:
-    """Subscribes to the topics of `InputOptions`, to some as soon as they are there."""
+    """Subscribes to the topics of `InputOptions`, to patterns as their topics appear.
+
+    Attributes:
+        topics: resolved names and patterns.
+    """
 
     def __init__(
         self,
         node: Node,
         inputs: InputOptions,
         on_message: Callable[[KeypointTopic, bytes], None],
-        on_trouble: Callable[[str], None],
-        on_missed: Callable[[int], None],
+        on_problem: Callable[[str], None],
+        on_dropped: Callable[[int], None],
     ) -> None:
-        """Listen to what is known by now; call `look` now and then for the rest.
+        """Subscribe to the topics whose type is known; call `update` periodically for the others.
 
-        on_trouble: is told of publishers that cannot be heard, and of the mend. on_missed: is told
-        how many messages have not come since the last `look`. Raises ValueError if the type of
-        the messages is none, or its package is not here.
+        Args:
+            node: owns the subscriptions.
+            inputs: topics and type of the messages.
+            on_message: called with each serialised message.
+            on_problem: called with the reason, and the remedy, why a publisher is not received.
+            on_dropped: called with the number of messages dropped since the last `update`.
+
+        Raises:
+            ValueError: the type of the messages is unknown, or its package is not installed.
         """
-        self._node, self._on_message, self._on_trouble = node, on_message, on_trouble
-        self._on_missed = on_missed
+        self._node, self._on_message, self._on_problem = node, on_message, on_problem
+        self._on_dropped = on_dropped
         self._log = node.get_logger()
         self._type: InputType | None = None
         if inputs.input_type != AUTO:
             self._type = resolve_input_type("input_type", inputs.input_type)
             message_class(type_name(self._type))
         self._own = f"{node.get_fully_qualified_name()}/"
-        wanted = map(self._resolve, inputs.topics or (DEFAULT_TOPIC,))
-        self.topics = tuple(dict.fromkeys(wanted))
-        self._heard: dict[str, tuple[KeypointTopic, Subscription]] = {}
+        resolved = map(self._resolve, inputs.topics or (DEFAULT_TOPIC,))
+        self.topics = tuple(dict.fromkeys(resolved))
+        self._subscribed: dict[str, tuple[KeypointTopic, Subscription]] = {}
         for topic in self.topics:
             if self._type and WILDCARD not in topic:
-                self._listen(topic, self._type)
-        self.look(idle=False)
+                self._subscribe(topic, self._type)
+        self.update(idle=False)
         for topic in self.topics:
-            if not any(match(topic, heard) is not None for heard in self._heard):
+            if not any(match(topic, name) is not None for name in self._subscribed):
                 self._log.info(f"waiting for a publisher on {topic}")
 
     @property
-    def heard(self) -> str:
-        """Return the topics that are heard, with their types, in words."""
-        sources = (source for source, _ in self._heard.values())
+    def description(self) -> str:
+        """The subscribed topics with their types, as text."""
+        subscribed = (topic for topic, _ in self._subscribed.values())
         return (
-            ", ".join(f"{s.topic} ({type_name(s.reader.input_type)})" for s in sources)
+            ", ".join(f"{t.topic} ({type_name(t.reader.input_type)})" for t in subscribed)
             or "none yet"
         )
 
-    def look(self, *, idle: bool) -> None:
-        """Find what was missed, and topics that have come and gone. Call it once a second.
+    def update(self, *, idle: bool) -> None:
+        """Count dropped messages and follow topics that appear and vanish; call it once a second.
 
-        idle: nothing has come lately, so see if there are publishers that cannot be heard.
+        Args:
+            idle: no message has been received since the last call: look for publishers that cannot
+                be received.
         """
-        for source, _ in self._heard.values():
-            there = self._node.get_publishers_info_by_topic(source.topic)
-            self._on_missed(source.dropped.take_count(bytes(one.endpoint_gid) for one in there))
+        for topic, _ in self._subscribed.values():
+            publishers = self._node.get_publishers_info_by_topic(topic.topic)
+            gids = (bytes(publisher.endpoint_gid) for publisher in publishers)
+            self._on_dropped(topic.dropped.take_count(gids))
         for pattern in self.topics:
             if WILDCARD in pattern:
-                for topic in self._matching(pattern):
-                    self._meet(topic, idle)
-            elif pattern not in self._heard:
-                self._meet(pattern, idle)
+                for name in self._matching(pattern):
+                    self._update_topic(name, idle)
+            elif pattern not in self._subscribed:
+                self._update_topic(pattern, idle)
         if idle:
-            for source, _ in list(self._heard.values()):
-                self._check(source)
+            for topic, _ in list(self._subscribed.values()):
+                self._check_types(topic)
 
     def _matching(self, pattern: str) -> list[str]:
-        """Return the topics that a pattern stands for, those of the lifter itself aside."""
+        """Return the topics that match a pattern, except those of the lifter itself."""
         names = (name for name, _ in self._node.get_topic_names_and_types())
         return [n for n in names if match(pattern, n) is not None and not n.startswith(self._own)]
 
-    def _meet(self, topic: str, idle: bool) -> None:
-        """Listen to a topic if somebody publishes there, and no longer if nobody does."""
+    def _update_topic(self, topic: str, idle: bool) -> None:
+        """Subscribe to a topic that has a publisher; unsubscribe from one that has none."""
         types = self._types(topic)
-        usable = [kind for kind in types if kind in self._usable]
-        if topic in self._heard:
+        usable = [kind for kind in types if kind in self._usable_types]
+        if topic in self._subscribed:
             if not types:
-                self._leave(topic)
+                self._unsubscribe(topic)
         elif len(usable) == 1:
             try:
-                self._listen(topic, self._type or resolve_input_type("input_type", usable[0]))
+                self._subscribe(topic, self._type or resolve_input_type("input_type", usable[0]))
             except ValueError as problem:
-                self._complain(f"cannot listen to {topic}: {problem}")
-        elif types and idle:  # what does not hinder others is no trouble
-            mend = (
+                self._report(f"cannot subscribe to {topic}: {problem}")
+        elif types and idle:  # while other topics are lifted, this is no problem
+            remedy = (
                 "start the lifter with one as input_type"
                 if usable
                 else "change the publisher, or start the lifter with another input_type, which may "
                 "be the path of a field mapping"
             )
-            expected = "one type" if usable else " or ".join(self._usable)
-            self._complain(f"{topic} carries {', '.join(types)}; expected {expected}: {mend}")
+            expected = "one type" if usable else " or ".join(self._usable_types)
+            self._report(f"{topic} carries {', '.join(types)}; expected {expected}: {remedy}")
 
-    def _check(self, source: KeypointTopic) -> None:
-        """Say so if messages of another type are published where the lifter listens.
-
-        DDS keeps such publishers apart and reports nothing.
-        """
+    def _check_types(self, source: KeypointTopic) -> None:
+        """Report publishers of another type on a subscribed topic: DDS does not report them."""
         types, expected = self._types(source.topic), type_name(source.reader.input_type)
         if not self._type and types and expected not in types:
-            self._leave(source.topic)  # another detector: its type is read at the next look
+            # Another detector publishes; the next update subscribes with its type.
+            self._unsubscribe(source.topic)
         elif others := [kind for kind in types if kind != expected]:
-            self._complain(
+            self._report(
                 f"{source.topic} carries {', '.join(others)}; expected {expected}: change the "
                 "publisher, or start the lifter with another input_type"
             )
 
-    def _listen(self, topic: str, input_type: InputType) -> None:
+    def _subscribe(self, topic: str, input_type: InputType) -> None:
         """Subscribe to a topic; raise ValueError if its type cannot be imported."""
-        names = [match(pattern, topic) for pattern in self.topics]
+        wildcards = [match(pattern, topic) for pattern in self.topics]
         several = len(self.topics) > 1
-        name = next(filter(None, names), topic.strip("/") if several else "")
+        prefix = next(filter(None, wildcards), topic.strip("/") if several else "")
         kind = type_name(input_type)
-        source = KeypointTopic(
-            topic, MessageReader(input_type, decoder(kind)), Tracker(name), DroppedMessages()
-        )
+        reader = MessageReader(input_type, decoder(kind))
+        source = KeypointTopic(topic, reader, Tracker(prefix), DroppedMessages())
         subscription = self._node.create_subscription(
             message_class(kind),
             topic,
-            partial(self._take, source),
+            partial(self._receive, source),
             SENSOR_INPUT,
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=partial(self._mend_qos, topic)
+                incompatible_qos=partial(self._report_qos, topic)
             ),
-            # Topics that come and go would leave parameters behind.
+            # Topics of a pattern come and go, and their parameters would stay.
             qos_overriding_options=QoSOverridingOptions.with_default_policies()
             if topic in self.topics
             else None,
         )
-        self._heard[topic] = source, subscription
-        self._log.info(f"listening to {topic} ({kind})")
+        self._subscribed[topic] = source, subscription
+        self._log.info(f"subscribed to {topic} ({kind})")
 
-    def _take(self, source: KeypointTopic, raw: bytes, info: Mapping[str, Any]) -> None:
-        """Pass a message on, serialised as it came."""
+    def _receive(self, source: KeypointTopic, raw: bytes, info: Mapping[str, Any]) -> None:
+        """Pass a serialised message on."""
         source.dropped.received(info["publication_sequence_number"])
         self._on_message(source, raw)
 
-    def _leave(self, topic: str) -> None:
-        """Listen to a topic no longer."""
-        _, subscription = self._heard.pop(topic)
+    def _unsubscribe(self, topic: str) -> None:
+        """Unsubscribe from a topic."""
+        _, subscription = self._subscribed.pop(topic)
         self._node.destroy_subscription(subscription)
-        self._log.info(f"no longer listening to {topic}")
+        self._log.info(f"unsubscribed from {topic}: it has no usable publisher")
 
     @property
-    def _usable(self) -> tuple[str, ...]:
-        """Return the types that would be heard."""
+    def _usable_types(self) -> tuple[str, ...]:
+        """The message types that can be received."""
         return (type_name(self._type),) if self._type else INPUT_TYPES
 
     def _types(self, topic: str) -> list[str]:
         """Return the types that are published on a topic."""
-        found = self._node.get_publishers_info_by_topic(topic)
-        return sorted({info.topic_type.replace("/msg/", "/") for info in found})
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        return sorted({info.topic_type.replace("/msg/", "/") for info in publishers})
 
     def _resolve(self, name: str) -> str:
-        """Return the whole name of a topic; raise ValueError if it is none.
+        """Return the full name of a topic or pattern; raise ValueError for an invalid name.
 
-        rclpy knows no `*`, so that what has one is not remapped.
+        rclpy does not accept `*`, so a pattern is not remapped.
         """
         if WILDCARD not in name:
             try:
                 return str(self._node.resolve_topic_name(name))
-            except RuntimeError:  # of rcl, with a place in its source
+            except RuntimeError:  # rcl's text is about its own source
                 raise ValueError(f"topics names {name!r}, which is no name of a topic") from None
         return name if name.startswith("/") else f"{self._node.get_namespace().rstrip('/')}/{name}"
 
-    def _mend_qos(self, topic: str, event: Any) -> None:
-        """Say how to hear a publisher whose quality of service does not fit."""
+    def _report_qos(self, topic: str, event: Any) -> None:
+        """Report a publisher whose quality of service does not fit, and the remedy."""
         policy = qos_policy_name_from_kind(event.last_policy_kind)
         parameter = f"qos_overrides.{topic}.subscription.{policy.split('_')[0].lower()}"
         reason = (
-            f"a publisher on {topic} offers a {policy} that does not fit: nothing comes from "
-            f"it; start the lifter without -p {parameter}, or change the publisher"
+            f"a publisher on {topic} offers an incompatible {policy}: its messages are not "
+            f"received; start the lifter without -p {parameter}, or change the publisher"
         )
-        self._on_trouble(reason)
+        self._on_problem(reason)
         self._log.error(reason)
 
-    def _complain(self, reason: str) -> None:
-        """Tell of a publisher that cannot be heard."""
-        self._on_trouble(reason)
+    def _report(self, reason: str) -> None:
+        """Report a publisher that cannot be received."""
+        self._on_problem(reason)
         self._log.error(reason, throttle_duration_sec=LOG_PERIOD)

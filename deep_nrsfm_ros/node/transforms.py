@@ -1,4 +1,4 @@
-"""The objects as frames on /tf."""
+"""Frames of the objects on /tf."""
 
 from __future__ import annotations
 
@@ -14,13 +14,21 @@ from deep_nrsfm_ros.node import publishing
 
 
 class TransformBroadcaster:
-    """Sends the frame of each object: its origin the mean of the keypoints, its axes the object's.
+    """Publishes a frame for each object: origin at the mean of its keypoints, axes of the object.
 
-    tf2_msgs is asked for only here: it comes with ROS, but not from PyPI.
+    tf2_msgs is imported only here: ROS has it, PyPI has not.
     """
 
     def __init__(self, node: Node, prefix: str) -> None:
-        """Raise ValueError, naming the package, where tf2_msgs is missing."""
+        """Create the publisher.
+
+        Args:
+            node: owns the publisher.
+            prefix: of the names of the frames.
+
+        Raises:
+            ValueError: the package tf2_msgs is not installed.
+        """
         try:
             from tf2_msgs.msg import TFMessage
         except ModuleNotFoundError:
@@ -29,23 +37,27 @@ class TransformBroadcaster:
                 "(apt install ros-jazzy-tf2-msgs), or leave tf_prefix empty"
             ) from None
         self._message, self._prefix = TFMessage, prefix
-        # As tf2_ros has it.
+        # Depth 100, as in tf2_ros.
         self._publisher = node.create_publisher(TFMessage, "/tf", 100)
 
     def send(self, header: Header, lifted: Lifted, identities: Sequence[str]) -> None:
-        """Send the frames of the objects that were lifted, by their identities or numbers."""
+        """Publish the frames of lifted objects, named by identity or, without one, by row."""
         names = [f"{self._prefix}{identity or i}" for i, identity in enumerate(identities)]
         self._publisher.publish(self._message(transforms=frames(header, lifted, names)))
 
 
 def frames(header: Header, lifted: Lifted, names: Sequence[str]) -> list[TransformStamped]:
-    """Return what leads from the frame of each object to the header's; objects that are NaN lack.
+    """Return the transforms from object frames to the header's frame; lifted objects only.
 
-    names: n, of the frames of the objects.
+    Args:
+        header: of the message.
+        lifted: n objects at their positions.
+        names: n names of frames.
     """
-    moves, stamped = publishing.transforms(lifted, positioned=True), publishing.to_header(header)
+    transforms = publishing.transforms(lifted, positioned=True)
+    stamped = publishing.to_header(header)
     return [
-        TransformStamped(header=stamped, child_frame_id=name, transform=move)
-        for name, move in zip(names, moves, strict=True)
-        if not math.isnan(move.translation.x)
+        TransformStamped(header=stamped, child_frame_id=name, transform=transform)
+        for name, transform in zip(names, transforms, strict=True)
+        if not math.isnan(transform.translation.x)
     ]

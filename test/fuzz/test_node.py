@@ -55,9 +55,9 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
     (tmp_path / "link.safetensors").symlink_to("/etc/passwd")
     inputs = InputOptions(model="thing", models_dir=str(tmp_path), bags_dir=str(tmp_path))
     stub: Any = SimpleNamespace(get_parameter_or=lambda name, default: default)
-    stub._fence = PathSandbox(tmp_path, tmp_path, ["thing"])
+    stub._sandbox = PathSandbox(tmp_path, tmp_path, ["thing"])
     stub._pipeline = Pipeline(bench.model, None, inputs, LiftingOptions(), SmoothingOptions())
-    stub._prepare = lambda changes: LifterNode._prepare(stub, changes)
+    stub._build_pipeline = lambda changes: LifterNode._build_pipeline(stub, changes)
     p = len(bench.layout)
     points = np.random.default_rng(0).uniform(50, 600, (1, p, 2))
     valid = bags._ENCODERS[POINT_CLOUD](next(frames(points, np.ones((1, p)))))
@@ -86,7 +86,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
     def one(spoiler: Spoiler) -> str:
         chosen = spoiler.choices(defaults, k=spoiler.choice((1, 1, 2, 5)))
         changes = [Parameter(name, value=value(spoiler, default)) for name, default in chosen]
-        result = LifterNode._consider(stub, changes)
+        result = LifterNode._validate_parameters(stub, changes)
         assert result.successful != bool(result.reason)
         assert "internal error" not in result.reason, result.reason
         given = {change.name: change.value for change in changes}
@@ -94,7 +94,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
             Parameter(name, value=given[name]) if name in given else default
         )
         try:
-            sandboxed(ros_parameters.read(stub, TrainingOptions, "train."), stub._fence)
+            sandboxed(ros_parameters.read(stub, TrainingOptions, "train."), stub._sandbox)
         except (ValueError, OSError) as refusal:
             assert str(refusal)
         finally:

@@ -15,7 +15,7 @@ identity: number
 keypoints: joints
 x: place.u
 y: place.v
-score: sure
+confidence: sure
 keypoint_id: label
 names: [head, tail]
 units: normalised
@@ -34,7 +34,7 @@ def test_every_field_is_read(tmp_path: Path) -> None:
         keypoints="joints",
         x="place.u",
         y="place.v",
-        score="sure",
+        confidence="sure",
         keypoint_id="label",
         names=("head", "tail"),
         units="normalised",

@@ -159,7 +159,7 @@ def start_lifter(domain: int, models: Path, tmp_path: Path) -> Iterator[StartLif
         lifter = LifterProcess([*program], parameters, tmp_path / f"lifter{len(started)}")
         started.append(lifter)
         if listens:
-            lifter.wait_for_log("listening to")
+            lifter.wait_for_log("subscribed to")
         return lifter
 
     yield start

@@ -67,7 +67,7 @@ def test_objects_are_at_their_place_once_camera_info_is_heard(
     message, pixels = keypoints()
     sender = client.node.create_timer(0.1, lambda: publisher.publish(message))
     client.wait_for_health(
-        lambda _, v: "/camera_info has not come yet" in v["last problem"] + v["camera"]
+        lambda _, v: "/camera_info has not been received" in v["last problem"] + v["camera"]
     )
     assert not client.heard["/lifter/points"]
     client.node.destroy_timer(sender)

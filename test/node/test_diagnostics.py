@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, Health
+from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics
 
 
 class Clock:
@@ -21,15 +21,15 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def health(clock: Clock) -> Health:
-    return Health(clock)
+def health(clock: Clock) -> LifterDiagnostics:
+    return LifterDiagnostics(clock)
 
 
 GOOD, POOR = np.full(2, 0.05, np.float32), np.full(2, 0.6, np.float32)
 SURE, UNSURE = np.full((2, 5), 0.8, np.float32), np.full((2, 5), 0.2, np.float32)
 
 
-def test_lifting_is_ok_and_measured(health: Health, clock: Clock) -> None:
+def test_lifting_is_ok_and_measured(health: LifterDiagnostics, clock: Clock) -> None:
     for milliseconds in (1, 2, 9):
         health.lifted(milliseconds / 1e3, GOOD, SURE)
     clock.now += 2
@@ -43,7 +43,7 @@ def test_lifting_is_ok_and_measured(health: Health, clock: Clock) -> None:
     assert values["messages lifted"] == "3"
 
 
-def test_each_report_begins_anew_but_totals_stay(health: Health, clock: Clock) -> None:
+def test_each_report_begins_anew_but_totals_stay(health: LifterDiagnostics, clock: Clock) -> None:
     health.rejected("too short")
     health.lifted(0.001, POOR, SURE)
     assert health.report().level == WARN
@@ -55,23 +55,23 @@ def test_each_report_begins_anew_but_totals_stay(health: Health, clock: Clock) -
     assert values["last problem"] == "too short"
 
 
-def test_a_detector_that_sees_nothing_is_heard(health: Health, clock: Clock) -> None:
-    health.unheard("a publisher that is gone by now")
+def test_a_detector_that_sees_nothing_is_heard(health: LifterDiagnostics, clock: Clock) -> None:
+    health.publisher_problem("a publisher that is gone by now")
     clock.now += 10
-    health.saw_nothing()
+    health.empty()
     assert not health.idle
     level, message, values = health.report()
     assert (level, message) == (OK, "the detector sees no object")
     assert values["messages without objects"] == "1" and health.idle
 
 
-def test_nothing_but_rejected_messages_is_an_error_that_says_why(health: Health) -> None:
+def test_nothing_but_rejected_messages_is_an_error_that_says_why(health: LifterDiagnostics) -> None:
     health.rejected("5 keypoints, not 17")
     level, message, _ = health.report()
     assert level == ERROR and "1 of 1" in message and "5 keypoints, not 17" in message
 
 
-def test_silence_is_a_warning_after_three_seconds(health: Health, clock: Clock) -> None:
+def test_silence_is_a_warning_after_three_seconds(health: LifterDiagnostics, clock: Clock) -> None:
     clock.now += 2.9
     assert health.report().level == OK
     clock.now += 0.2
@@ -79,21 +79,23 @@ def test_silence_is_a_warning_after_three_seconds(health: Health, clock: Clock) 
     assert level == WARN and "no keypoints for 3 s" in message
 
 
-def test_an_unheard_publisher_is_an_error_until_something_is_lifted(health: Health) -> None:
-    health.unheard("wrong type")
+def test_an_unheard_publisher_is_an_error_until_something_is_lifted(
+    health: LifterDiagnostics,
+) -> None:
+    health.publisher_problem("wrong type")
     assert health.report()[:2] == (ERROR, "wrong type")
     assert health.report().level == ERROR
     health.lifted(0.001, GOOD, SURE)
     assert health.report().level == OK
 
 
-def test_a_poor_fit_is_a_warning(health: Health) -> None:
+def test_a_poor_fit_is_a_warning(health: LifterDiagnostics) -> None:
     health.lifted(0.001, POOR, SURE)
     level, message, _ = health.report()
     assert level == WARN and "0.60" in message
 
 
-def test_low_confidence_is_a_warning_of_half_of_the_objects(health: Health) -> None:
+def test_low_confidence_is_a_warning_of_half_of_the_objects(health: LifterDiagnostics) -> None:
     health.lifted(0.001, GOOD, UNSURE)
     level, message, values = health.report()
     assert level == WARN and "confidence" in message and values["confidence"] == "0.20"
@@ -102,13 +104,15 @@ def test_low_confidence_is_a_warning_of_half_of_the_objects(health: Health) -> N
     assert health.report().level == OK
 
 
-def test_a_model_of_fewer_keypoints_may_take_over_between_two_reports(health: Health) -> None:
+def test_a_model_of_fewer_keypoints_may_take_over_between_two_reports(
+    health: LifterDiagnostics,
+) -> None:
     health.lifted(0.001, GOOD, SURE)
     health.lifted(0.001, GOOD, UNSURE[:, :3])
     assert health.report().values["confidence"] == "0.50"
 
 
-def test_objects_that_could_not_be_lifted_do_not_spoil_the_error(health: Health) -> None:
+def test_objects_that_could_not_be_lifted_do_not_spoil_the_error(health: LifterDiagnostics) -> None:
     health.lifted(0.001, np.array([np.nan, 0.1], np.float32), SURE)
     values = health.report().values
     assert (values["reprojection error"], values["confidence"]) == ("0.1000", "0.80")
@@ -116,7 +120,7 @@ def test_objects_that_could_not_be_lifted_do_not_spoil_the_error(health: Health)
     assert health.report().level == OK
 
 
-def test_idle_tells_whether_anything_came(health: Health) -> None:
+def test_idle_tells_whether_anything_came(health: LifterDiagnostics) -> None:
     assert health.idle
     health.rejected("x")
     assert not health.idle
@@ -124,17 +128,17 @@ def test_idle_tells_whether_anything_came(health: Health) -> None:
     assert health.idle
 
 
-def test_more_missed_than_lifted_is_a_warning_with_the_mend(health: Health) -> None:
+def test_more_dropped_than_lifted_is_a_warning_with_the_mend(health: LifterDiagnostics) -> None:
     health.lifted(0.01, np.array([0.1], np.float32), np.array([[0.9]], np.float32))
-    health.missed(1)
+    health.dropped(1)
     assert health.report().level == OK
     health.lifted(0.01, np.array([0.1], np.float32), np.array([[0.9]], np.float32))
-    health.missed(2)
+    health.dropped(2)
     level, message, values = health.report()
     assert (
         level == WARN
-        and message.startswith("2 of 3 messages missed")
+        and message.startswith("2 of 3 messages dropped")
         and "test_time_rotations" in message
     )
-    assert values["messages missed"] == "3"
+    assert values["messages dropped"] == "3"
     assert health.report().level == OK

@@ -81,7 +81,7 @@ def test_a_signal_at_any_moment_of_the_start_ends_it_with_code_0(start_lifter: S
         # In CPU time, so that a busy machine moves no moment.
         moment = lifter.cpu_seconds + (moments.uniform(0, 1.5) if i else 0)
         wait_until(
-            lambda one=lifter, at=moment: one.cpu_seconds >= at or "listening to" in one.log,
+            lambda one=lifter, at=moment: one.cpu_seconds >= at or "subscribed to" in one.log,
             "the moment",
         )
         code = lifter.stop((signal.SIGINT, signal.SIGTERM)[i % 2], "during the start")
@@ -280,7 +280,7 @@ def test_what_comes_too_fast_is_counted(start_lifter: StartLifter, connect: Conn
     def counts(status: Any) -> np.ndarray:
         said = {pair.key: pair.value for pair in status.values}
         return np.array(
-            [int(said[f"messages {word}"]) for word in ("lifted", "rejected", "missed")]
+            [int(said[f"messages {word}"]) for word in ("lifted", "rejected", "dropped")]
         )
 
     client.exchange(counting, cloud(0))

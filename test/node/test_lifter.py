@@ -148,7 +148,7 @@ def test_bad_input_is_counted_and_the_next_message_lifted(
     status = client.wait_for_health(lambda _, v: v["messages rejected"] == str(len(bad)))
     last = {pair.key: pair.value for pair in status.values}["last problem"]
     assert "3 visible keypoints" in last
-    assert "dropped" in lifter.log
+    assert "rejected" in lifter.log
 
 
 def test_a_detector_that_sees_nobody_is_no_trouble(
@@ -240,8 +240,8 @@ def test_steadied_it_follows_slower_and_bridges_a_gap(
     held = answer(cloud(pixels(0)), 101)
     np.testing.assert_array_equal(held[..., :3], first[..., :3])
     np.testing.assert_allclose(held[..., 3], 0.8 * first[..., 3], rtol=1e-4)
-    assert client.set_parameters(steady__min_cutoff=0.001, steady__beta=0) == ""
-    assert "at least 0" in client.set_parameters(steady__bridge=-1)
+    assert client.set_parameters(smoothing__min_cutoff=0.001, smoothing__beta=0) == ""
+    assert "at least 0" in client.set_parameters(smoothing__max_gap=-1)
     alone = answer(here, 200)
     np.testing.assert_allclose(alone, first, rtol=1e-4)  # what was known is forgotten
     steadied = answer(there, 201)

@@ -106,11 +106,11 @@ def test_the_type_is_that_of_the_publisher(start_lifter: StartLifter, connect: C
     lifter = start_lifter(listens=False, input_type="auto")
     lifter.wait_for_log("waiting for a publisher on /keypoints")
     client = connect()
-    client.wait_for_health(lambda _, v: v["heard"] == "none yet")
+    client.wait_for_health(lambda _, v: v["subscribed"] == "none yet")
     publisher = client.publisher(PointCloud2)
-    lifter.wait_for_log("listening to /keypoints (sensor_msgs/PointCloud2)")
+    lifter.wait_for_log("subscribed to /keypoints (sensor_msgs/PointCloud2)")
     assert unpack(client.exchange(publisher, cloud(pixels(0, 300)))).shape == (2, P, 4)
-    client.wait_for_health(lambda _, v: v["heard"] == "/keypoints (sensor_msgs/PointCloud2)")
+    client.wait_for_health(lambda _, v: v["subscribed"] == "/keypoints (sensor_msgs/PointCloud2)")
     client.node.destroy_publisher(publisher)
     # Another detector takes its place.
     publisher = client.publisher(PolygonStamped)
@@ -195,7 +195,7 @@ def test_bodies_on_topics_that_come_and_go(start_lifter: StartLifter, connect: C
         _, objects = exchange(client, publisher, polygon(pixels(0)))
         assert objects.joint_names == [name]
     client.node.destroy_publisher(publishers["ab12"])
-    lifter.wait_for_log("no longer listening to /humans/bodies/ab12/skeleton2d")
+    lifter.wait_for_log("unsubscribed from /humans/bodies/ab12/skeleton2d")
     exchange(client, publishers["cd34"], polygon(pixels(0)))
 
 
@@ -220,7 +220,7 @@ def test_a_wildcard_passes_by_what_is_not_meant(
     assert objects.joint_names == ["cam"]
     sender = client.node.create_timer(0.1, lambda: publisher.publish(cloud(pixels(0))))
     status = client.wait_for_health(lambda status, v: float(v["rate [Hz]"]) > 0)
-    assert values(status)["heard"] == "/cam/points (sensor_msgs/PointCloud2)"
+    assert values(status)["subscribed"] == "/cam/points (sensor_msgs/PointCloud2)"
     assert "carries" not in status.message
     client.node.destroy_timer(sender)
 
