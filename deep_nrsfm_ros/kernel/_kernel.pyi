@@ -6,10 +6,35 @@ MOST_LAYERS: int  # of a network
 MAX_KEYPOINTS: int  # of a network
 MAX_WIDTH: int  # of a dictionary of a network, in atoms
 
-def plan(header: Any, floats: Any, doubles: Any, /) -> object: ...
-def lift(
-    plan: object, points: Any, confidence: Any, perspective: bool, /, *arrays: Any
-) -> None: ...
+def plan(header: Any, floats: Any, doubles: Any, /) -> object:
+    """Return the plan of a lifter: its constants in the kernel's layout, and memory to compute in.
+
+    Args:
+        header: int32: counts, flags, widths and indices of keypoints.
+        floats: float32: weights of the network, error covariance.
+        doubles: float64: constants of the correction and of the confidence.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: A count, index or length is out of range.
+    """
+
+def lift(plan: object, points: Any, confidence: Any, perspective: bool, /, *outputs: Any) -> None:
+    """Lift n objects and fill the outputs, which must not overlap other arrays.
+
+    Args:
+        plan: as `plan` returned it.
+        points: (n, p, 2) float32.
+        confidence: (n, p) float32, 0 = missing.
+        perspective: whether points are where rays meet the plane z = 1.
+        outputs: the six arrays of `lifting.Lifted`, float32, and (n,) bool: not lifted.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: The arrays do not fit the plan and each other.
+        RuntimeError: The plan is in use by another lift.
+    """
+
 def workers(header: Any, L: Any, L_inverse: Any, /) -> object: ...
 def gradient(
     workers: object,
@@ -24,16 +49,38 @@ def gradient(
     gradient: Any,
     /,
 ) -> None: ...
-def observe(
-    data: bytes,
+def decode_keypoints(
+    data: Any,
     messages: tuple[int, int],
     objects: tuple[int, int],
     steps: tuple[int, int],
-    offsets: tuple[int, ...],
-    farthest: float,
-    least: float,
+    offsets: tuple[int, int, int],
+    max_coordinate: float,
+    min_confidence: float,
     points: Any,
     confidence: Any,
     /,
-) -> None: ...
-def choose_vectors(bytes: int, /) -> int: ...
+) -> None:
+    """Read the keypoints of serialised messages that differ in their data alone.
+
+    Args:
+        data: bytes of all messages.
+        messages: how many, and bytes from one to the next.
+        objects: n objects of a message, and p keypoints of an object.
+        steps: bytes from an object to the next, and from a keypoint to the next.
+        offsets: bytes to the first x, y and confidence, little-endian float32; -1: no confidence.
+        max_coordinate: keypoints with a coordinate of this size or more are missing.
+        min_confidence: keypoints with less confidence are missing.
+        points: output (messages n, p, 2) float32, 0 where missing.
+        confidence: output (messages n, p) float32 in [0, 1], 0 where missing.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: A number is out of range, or the arrays do not fit the data.
+    """
+
+def choose_vectors(bytes: int, /) -> int:
+    """Set how many bytes a vector of the processor has: 16, 32 or 64; return what it supports.
+
+    For tests, which try all of them. It holds for the whole process.
+    """

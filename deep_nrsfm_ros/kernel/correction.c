@@ -1,14 +1,18 @@
-/* correction.py, for one object. */
+/* The correction of one object: `correct` of lifting/correction.py.
+
+   The errors of a shape are normal, with the covariance Sigma of the model. Their mean given the keypoints, and
+   then the bone lengths, solves A x = b with A the covariance of these observations. In this file p is filled up
+   to a multiple of DOUBLES. */
 #include <string.h>
 
 #include "plan.h"
 
-/* Set the rows of A = H Sigma H^T (2, p) x (2, p) for point i; p in DOUBLES. Only the upper half is read.
+/* Set the rows of A = H Sigma H^T, (2, p) x (2, p), of keypoint i; only the upper half is read.
 
-   Sigma: (3, 3, p), its three rows for that point. m: the cameras (3, 2, p). */
+   Sigma: (3, 3, p), its three rows of the keypoint. m: (3, 2, p), the point cameras. */
 INLINE void project_inline(ptrdiff_t p, ptrdiff_t i, const float *restrict Sigma, const double *restrict m,
-                           double *restrict A, int wide) {
-    double *restrict along = A + (size_t)i * wide, *restrict across = A + (size_t)(p + i) * wide + p;
+                           double *restrict A, int stride) {
+    double *restrict along = A + (size_t)i * stride, *restrict across = A + (size_t)(p + i) * stride + p;
     for (ptrdiff_t j = 0; j < p; j++) {
         double x[3], y[3];
         for (int c = 0; c < 3; c++) {
@@ -21,8 +25,8 @@ INLINE void project_inline(ptrdiff_t p, ptrdiff_t i, const float *restrict Sigma
         across[j] = y[0] * m[p + j] + y[1] * m[3 * p + j] + y[2] * m[5 * p + j];
     }
 }
-FAST(project, (ptrdiff_t p, ptrdiff_t i, const float *Sigma, const double *m, double *A, int wide),
-     (p, i, Sigma, m, A, wide))
+FAST(project, (ptrdiff_t p, ptrdiff_t i, const float *Sigma, const double *m, double *A, int stride),
+     (p, i, Sigma, m, A, stride))
 
 /* E (n) += v^T Sigma, for v (n) and Sigma (n, n); n is a multiple of DOUBLES. */
 INLINE void combine_inline(ptrdiff_t n, const double *restrict v, const float *restrict Sigma,
@@ -34,10 +38,10 @@ INLINE void combine_inline(ptrdiff_t n, const double *restrict v, const float *r
 }
 FAST(combine, (ptrdiff_t n, const double *v, const float *Sigma, double *E), (n, v, Sigma, E))
 
-/* E (3, p) of the answer x beside A: that of the keypoints, and of n bones. */
-static void errors(Plan *k, const double *x, int stride, int n) {
+/* Set E (3, p) = Sigma H^T x from the solution x (2 p + n) of the keypoints and n bones; x is a column of A. */
+static void expected_error(Plan *k, const double *x, int stride, int n) {
     int p = DOUBLES_OF(k->p);
-    double *m = k->cameras, *v = k->seen;
+    double *m = k->point_cameras, *v = k->spread;
     for (int j = 0; j < 3 * p; j++) k->E[j] = 0;
     for (int i = 0; i < p; i++) {
         double along = x[(size_t)i * stride], across = x[(size_t)(p + i) * stride];
@@ -47,104 +51,104 @@ static void errors(Plan *k, const double *x, int stride, int n) {
     for (int b = 0; b < n; b++)
         for (int end = 0; end < 2; end++)
             for (int r = 0; r < 3; r++)
-                v[3 * k->ends[2 * b + end] + r] +=
-                    (end ? -1 : 1) * k->edges[4 * b + r] * x[(size_t)(2 * p + b) * stride];
+                v[3 * k->bone_ends[2 * b + end] + r] +=
+                    (end ? -1 : 1) * k->bone_directions[4 * b + r] * x[(size_t)(2 * p + b) * stride];
     combine(3 * p, v, k->covariance, k->E);
 }
 
-/* Set along (3, p), the covariance of the errors with the growth of a bone, and `seen` (2, p), that of the
-   keypoints: of Sigma its rows (3, 3, p) of both ends, of the bone its unit vector g. m: as above. */
-INLINE void grow_inline(ptrdiff_t p, const float *restrict from, const float *restrict to,
+/* Set along (3, p), the covariance of the errors with the growth of a bone, and spread (2, p), its projection into
+   the image. from, to: (3, 3, p), the rows of Sigma of the bone's ends. g: its unit vector. m: as above. */
+INLINE void bone_spread_inline(ptrdiff_t p, const float *restrict from, const float *restrict to,
                         const double *restrict g, const double *restrict m, double *restrict along,
-                        double *restrict seen) {
+                        double *restrict spread) {
     for (ptrdiff_t j = 0; j < 3 * p; j++)
         along[j] = g[0] * (from[j] - to[j]) + g[1] * (from[3 * p + j] - to[3 * p + j]) +
                    g[2] * (from[6 * p + j] - to[6 * p + j]);
     for (ptrdiff_t i = 0; i < p; i++) {
         double x = along[i], y = along[p + i], z = along[2 * p + i];
-        seen[i] = m[i] * x + m[2 * p + i] * y + m[4 * p + i] * z;
-        seen[p + i] = m[p + i] * x + m[3 * p + i] * y + m[5 * p + i] * z;
+        spread[i] = m[i] * x + m[2 * p + i] * y + m[4 * p + i] * z;
+        spread[p + i] = m[p + i] * x + m[3 * p + i] * y + m[5 * p + i] * z;
     }
 }
-FAST(grow,
+FAST(bone_spread,
      (ptrdiff_t p, const float *from, const float *to, const double *g, const double *m,
-      double *along, double *seen),
-     (p, from, to, g, m, along, seen))
+      double *along, double *spread),
+     (p, from, to, g, m, along, spread))
 
-/* Set the columns of the bones and the right side, b (2, p), in the rows (2, p) of the keypoints. */
+/* Set the columns of the bones and the right side b (2, p) in the rows (2, p) of the keypoints. */
 static void add_columns(Plan *k, const double *b, double *A, int stride) {
     int p = DOUBLES_OF(k->p), n = DOUBLES_OF(k->bones);
-    double *seen = k->seen;
+    double *spread = k->spread;
     for (int first = 0; first < n; first += DOUBLES) {
-        memset(seen, 0, DOUBLES * 2 * p * sizeof(double));
+        memset(spread, 0, DOUBLES * 2 * p * sizeof(double));
         for (int bone = first; bone < first + DOUBLES && bone < k->bones; bone++) {
-            const float *from = k->covariance + (size_t)9 * p * k->ends[2 * bone];
-            const float *to = k->covariance + (size_t)9 * p * k->ends[2 * bone + 1];
-            grow(p, from, to, k->edges + 4 * bone, k->cameras, k->along + (size_t)3 * p * bone,
-                 seen + (bone - first) * 2 * p);
+            const float *from = k->covariance + (size_t)9 * p * k->bone_ends[2 * bone];
+            const float *to = k->covariance + (size_t)9 * p * k->bone_ends[2 * bone + 1];
+            bone_spread(p, from, to, k->bone_directions + 4 * bone, k->point_cameras, k->bone_covariance + (size_t)3 * p * bone,
+                 spread + (bone - first) * 2 * p);
         }
         for (int i = 0; i < 2 * p; i++)
             for (int j = 0; j < DOUBLES; j++)
-                A[(size_t)i * stride + 2 * p + first + j] = seen[2 * j * p + i];
+                A[(size_t)i * stride + 2 * p + first + j] = spread[2 * j * p + i];
     }
     for (int i = 0; i < 2 * p; i++)
         for (int j = 0; j < DOUBLES; j++) A[(size_t)i * stride + 2 * p + n + j] = j ? 0 : b[i];
 }
 
-/* Set the rows of the bones, whose `along` are there; `size`: that of the object. */
+/* Set the rows of the bones from their covariances; size: that of the object, see measure_bones. */
 static void add_rows(Plan *k, double size, double *A, int stride) {
     int p = DOUBLES_OF(k->p), n = DOUBLES_OF(k->bones);
     for (int b = 0; b < n; b++) {
         double *row = A + (size_t)(2 * p + b) * stride + 2 * p;
         for (int j = b; j < n + DOUBLES; j++) row[j] = j == b;
-        if (b >= k->bones) continue; /* No bone: x = 0. */
-        const int *ends = k->ends + 2 * b;
-        const double *known = k->lengths + 2 * b, *along = k->along + (size_t)3 * p * b;
-        const double *g = k->edges + 4 * b;
-        double spread = size * known[1], missing = size * known[0] - g[3];
-        for (int r = 0; r < 3; r++) missing += g[r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
+        if (b >= k->bones) continue; /* Beyond the last bone: x = 0. */
+        const int *ends = k->bone_ends + 2 * b;
+        const double *bone = k->bone_lengths + 2 * b, *along = k->bone_covariance + (size_t)3 * p * b;
+        const double *g = k->bone_directions + 4 * b;
+        double spread = size * bone[1], shortfall = size * bone[0] - g[3];
+        for (int r = 0; r < 3; r++) shortfall += g[r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
         for (int c = b; c < k->bones; c++) {
-            const int *others = k->ends + 2 * c;
-            const double *h = k->edges + 4 * c;
-            row[c] = size * size * known[0] * k->lengths[2 * c];
-            for (int r = 0; r < 3; r++) row[c] += h[r] * (along[r * p + others[0]] - along[r * p + others[1]]);
+            const int *other_ends = k->bone_ends + 2 * c;
+            const double *h = k->bone_directions + 4 * c;
+            row[c] = size * size * bone[0] * k->bone_lengths[2 * c];
+            for (int r = 0; r < 3; r++) row[c] += h[r] * (along[r * p + other_ends[0]] - along[r * p + other_ends[1]]);
         }
-        row[b] += spread * spread + 1e-12 * k->unknown;
-        row[n] = missing;
+        row[b] += spread * spread + 1e-12 * k->unknown_variance;
+        row[n] = shortfall;
     }
 }
 
 void correct(Plan *k, Object *o, double noise) {
     int p = DOUBLES_OF(k->p), n = 2 * p, bones = DOUBLES_OF(k->bones), stride = n + bones + DOUBLES;
-    double *A = k->A, *m = k->cameras, unknown = k->unknown;
+    double *A = k->system, *m = k->point_cameras, unknown = k->unknown_variance;
     for (int i = 0; i < p; i++) {
         const float *Sigma = k->covariance + (size_t)9 * p * i;
         if (i < k->p) project(p, i, Sigma, m, A, stride);
         for (int a = 0; a < 2; a++) {
             double *row = A + (size_t)(a * p + i) * stride + a * p, *b = A + (size_t)(a * p + i) * stride + n;
             for (int j = 0; j < DOUBLES; j++) b[j] = 0;
-            if (i >= k->p) { /* No point: x = 0. */
+            if (i >= k->p) { /* Beyond the last keypoint: x = 0. */
                 for (double *entry = row + i; entry < b; entry++) *entry = 0;
                 row[i] = 1;
-                k->left[a * p + i] = 0;
+                k->difference[a * p + i] = 0;
                 continue;
             }
             for (int j = i; j < k->p; j++) row[j] += unknown;
             row[i] += o->visible[i] ? noise * noise + 1e-12 * unknown : unknown;
-            double left = o->W[2 * i + a];
-            for (int r = 0; r < 3; r++) left -= o->S[r * k->wide + i] * m[(2 * r + a) * p + i];
-            k->left[a * p + i] = b[0] = o->visible[i] ? left : 0;
+            double difference = o->W[2 * i + a];
+            for (int r = 0; r < 3; r++) difference -= o->S[r * k->stride + i] * m[(2 * r + a) * p + i];
+            k->difference[a * p + i] = b[0] = o->visible[i] ? difference : 0;
         }
     }
     solve(n, 0, stride, A);
-    errors(k, A + n, stride, 0);
+    expected_error(k, A + n, stride, 0);
     if (bones) {
-        double size = observe_bones(k, o);
-        add_columns(k, k->left, A, stride);
+        double size = measure_bones(k, o);
+        add_columns(k, k->difference, A, stride);
         add_rows(k, size, A, stride);
         solve(n + bones, n, stride, A);
-        errors(k, A + n + bones, stride, k->bones);
+        expected_error(k, A + n + bones, stride, k->bones);
     }
     for (int r = 0; r < 3; r++)
-        for (int i = 0; i < k->p; i++) o->S[r * k->wide + i] += (float)k->E[r * p + i];
+        for (int i = 0; i < k->p; i++) o->S[r * k->stride + i] += (float)k->E[r * p + i];
 }

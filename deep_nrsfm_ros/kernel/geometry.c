@@ -34,26 +34,26 @@ void transpose(rotation R, rotation out) {
         for (int j = 0; j < 3; j++) out[i][j] = R[j][i];
 }
 
-void rotate(int p, int wide, rotation A, float *S) {
+void rotate(int p, int stride, rotation A, float *S) {
     for (int i = 0; i < p; i++) {
-        double x = S[i], y = S[wide + i], z = S[2 * wide + i];
+        double x = S[i], y = S[stride + i], z = S[2 * stride + i];
         for (int r = 0; r < 3; r++)
-            S[r * wide + i] = (float)(A[r][0] * x + A[r][1] * y + A[r][2] * z);
+            S[r * stride + i] = (float)(A[r][0] * x + A[r][1] * y + A[r][2] * z);
     }
 }
 
-Moments moments(int p, const float *W, const float *P, int apart, const float *visible) {
+Moments moments(int p, const float *W, const float *P, int P_stride, const float *visible) {
     Moments m = {{0}, 0, 0, 0, 0, 0, 0};
     double n = 0;
     for (int i = 0; i < p; i++) {
         n += visible[i];
         m.mean[0] += visible[i] * W[2 * i], m.mean[1] += visible[i] * W[2 * i + 1];
-        m.mean[2] += visible[i] * P[i], m.mean[3] += visible[i] * P[apart + i];
+        m.mean[2] += visible[i] * P[i], m.mean[3] += visible[i] * P[P_stride + i];
     }
     for (int c = 0; c < 4; c++) m.mean[c] /= fmax(n, 1);
     for (int i = 0; i < p; i++) {
         double a = W[2 * i] - m.mean[0], b = W[2 * i + 1] - m.mean[1], v = visible[i];
-        double c = P[i] - m.mean[2], d = P[apart + i] - m.mean[3];
+        double c = P[i] - m.mean[2], d = P[P_stride + i] - m.mean[3];
         m.WxWx += v * a * a, m.WyWy += v * b * b, m.WxWy += v * a * b;
         m.PP += v * (c * c + d * d), m.WP += v * (a * c + b * d);
     }

@@ -7,7 +7,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#include "observation.h"
+#include "point_cloud.h"
 #include "plan.h"
 #include "training_module.h"
 
@@ -45,7 +45,7 @@ static const char *plan_fill(Plan *k, const Py_buffer *arrays) {
     return NULL;
 }
 
-/* plan(header int32, floats float32, doubles float64) -> capsule; CompiledBackend says what is in them. */
+/* plan(header int32, floats float32, doubles float64) -> capsule; CompiledBackend lays them out. */
 static PyObject *plan(PyObject *Py_UNUSED(module), PyObject *args) {
     static const ArrayArgument expected[3] = {{"header", INT32, 0}, {"floats", FLOAT32, 0}, {"doubles", FLOAT64, 0}};
     PyObject *objects[3];
@@ -77,8 +77,8 @@ static int lengths_match(int count, const Py_buffer *arrays, const Py_ssize_t *s
    not_lifted): fill the last seven: the arrays of `lifting.Lifted`, float32, and not_lifted (n,) of bool.
 
    The GIL is held: a lift takes less than waiting for the GIL does, and the scratch memory of a plan serves one
-   lift at a time. The flag makes sure of that also where an object's buffer method lifts with the same plan. */
-static PyObject *lift_objects(PyObject *Py_UNUSED(module), PyObject *args) {
+   lift at a time. The flag makes keypoint_confidence of that also where an object's buffer method lifts with the same plan. */
+static PyObject *lift_entry(PyObject *Py_UNUSED(module), PyObject *args) {
     static const ArrayArgument expected[9] = {
         {"points", FLOAT32, 0},    {"confidence", FLOAT32, 0}, {"shapes", FLOAT32, 1},
         {"rotations", FLOAT32, 1}, {"scale", FLOAT32, 1},      {"translation", FLOAT32, 1},
@@ -116,18 +116,18 @@ static int add_steps(Py_ssize_t n, Py_ssize_t step, Py_ssize_t *sum) {
     return step >= 0 && !__builtin_mul_overflow(n - 1, step, &bytes) && !__builtin_add_overflow(*sum, bytes, sum);
 }
 
-/* observe(data, (messages, message_step), (objects, keypoints), (object_step, point_step), (x, y, confidence),
-   farthest, least, points, confidence): fill the last two, (messages objects, keypoints, 2) and without the 2.
+/* decode_keypoints(data, (messages, message_step), (objects, keypoints), (object_step, point_step), (x, y, confidence),
+   max_coordinate, min_confidence, points, confidence): fill the last two, (messages objects, keypoints, 2) and without the 2.
 
    Steps and offsets are in bytes; an offset of confidence below 0: there is none. */
-static PyObject *observe_raw(PyObject *Py_UNUSED(module), PyObject *args) {
+static PyObject *decode_keypoints_entry(PyObject *Py_UNUSED(module), PyObject *args) {
     static const ArrayArgument expected[3] = {{"data", BYTES, 0}, {"points", FLOAT32, 1}, {"confidence", FLOAT32, 1}};
     PyObject *objects[3];
     Py_buffer arrays[3];
     Py_ssize_t messages, message_step, n, q, object_step, point_step, offset[3], count, end = 0;
-    float farthest, least;
-    if (!parse_arguments(args, "O(nn)(nn)(nn)(nnn)ffOO:observe", &objects[0], &messages, &message_step, &n, &q,
-                         &object_step, &point_step, &offset[0], &offset[1], &offset[2], &farthest, &least,
+    float max_coordinate, min_confidence;
+    if (!parse_arguments(args, "O(nn)(nn)(nn)(nnn)ffOO:decode_keypoints", &objects[0], &messages, &message_step, &n, &q,
+                         &object_step, &point_step, &offset[0], &offset[1], &offset[2], &max_coordinate, &min_confidence,
                          &objects[1], &objects[2]))
         return NULL;
     if (!get_arrays(3, expected, objects, arrays)) return NULL;
@@ -140,9 +140,9 @@ static PyObject *observe_raw(PyObject *Py_UNUSED(module), PyObject *args) {
         sound = add_steps(messages, message_step, &end) && add_steps(n, object_step, &end) &&
                 add_steps(q, point_step, &end) && !__builtin_add_overflow(end, (Py_ssize_t)sizeof(float), &end) &&
                 end <= arrays[0].len;
-        Places places = {n, q, {offset[0], offset[1], offset[2]}, point_step, object_step};
+        CloudLayout layout = {n, q, {offset[0], offset[1], offset[2]}, point_step, object_step};
         for (Py_ssize_t m = 0; sound && m < messages; m++)
-            observe_keypoints((const char *)arrays[0].buf + m * message_step, &places, farthest, least,
+            decode_keypoints((const char *)arrays[0].buf + m * message_step, &layout, max_coordinate, min_confidence,
                               (float *)arrays[1].buf + 2 * m * n * q, (float *)arrays[2].buf + m * n * q);
     }
     release_arrays(3, arrays);
@@ -168,9 +168,9 @@ static int module_exec(PyObject *module) {
 }
 
 static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
-                                {"lift", lift_objects, METH_VARARGS, NULL},
+                                {"lift", lift_entry, METH_VARARGS, NULL},
                                 TRAINING_METHODS,
-                                {"observe", observe_raw, METH_VARARGS, NULL},
+                                {"decode_keypoints", decode_keypoints_entry, METH_VARARGS, NULL},
                                 {"choose_vectors", choose, METH_O, NULL},
                                 {NULL, NULL, 0, NULL}};
 static PyModuleDef_Slot slots[] = {{Py_mod_exec, (void *)module_exec}, {0, NULL}};

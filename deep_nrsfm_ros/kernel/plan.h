@@ -1,7 +1,12 @@
-/* What a lifter knows before it sees any keypoints, and where it computes; `compiled.py` fills it.
+/* A plan: a lifter's constants in the kernel's layout, and the memory that it computes with.
 
-   Shapes are stored with the points last, S (3, p), so that every layer is one `product`. Rows of S
-   are `wide` apart, p filled up to FLOATS. Symbols as in the package's legend.
+   CompiledBackend in lifting/compiled_backend.py fills it. Symbols as in the paper: p keypoints, W (p, 2)
+   normalised keypoints, S shape, M (3, 2) camera, R (3, 3) rotation from object to camera axes, Psi (3 k, 2)
+   block code, psi (k) code.
+
+   Shapes are stored with the keypoints last, S (3, p), so that every layer is one `product`. Rows of S are
+   `stride` apart, p filled up to a multiple of FLOATS. Files carry the names of the Python modules that compute
+   the same: lift.c that of numpy_backend.py.
 */
 #ifndef PLAN_H
 #define PLAN_H
@@ -11,31 +16,43 @@
 #include "algebra.h"
 #include "geometry.h"
 
-/* An object that is being lifted. */
+/* An object that is lifted. */
 typedef struct {
-    const float *given, *confidence; /* (p, 2), (p) */
-    float *points, *mask;            /* what the network sees, (p, 2) of (p) */
-    float *visible;                  /* (p), 1 or 0 */
-    float *W, *S;                    /* (p, 2), (3, wide) in camera axes */
-    double gain, unit, origin[2], seen, residual;
+    const float *image_points, *confidence; /* (p, 2), (p): the arguments of `lift` */
+    float *input, *input_mask;              /* (p, 2), (p): what the network reads, refilled round by round */
+    float *visible;                         /* (p), 1 or 0 */
+    float *W, *S;                           /* (p, 2), (3, stride) in camera axes */
+    double gain;                            /* p / number of keypoints in the input */
+    double unit, origin[2];                 /* image = unit W + origin */
+    double visible_count, residual;
     camera M;
     rotation R;
 } Object;
 
 typedef struct {
-    int p, wide, layers, turns, mirrored, whitened, rms, corrected, refill, reference[2], min_visible, bones;
-    const int *widths, *partners, *ends;
+    int p, stride, layers, rotations, refill_rounds, reference[2], min_visible, bones;
+    int mirrored, whitened, scale_by_rms, corrected;                     /* flags */
+    const int *widths, *partners, *bone_ends;                            /* (layers), (p), (bones, 2) */
     Matrix L, L_inverse, encoder[MOST_LAYERS], decoder[MOST_LAYERS], code_head;
-    const float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head, *spread, *covariance;
-    const double *filling, *turn, *frame, *calibration, *lengths;
-    double noise, length, unknown, nearest, residual_spread, least_residual;
+    const float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head;
+    const float *error_std, *covariance;                                 /* (p), (p, 3, 3, p) in DOUBLES */
+    const double *completion, *image_rotations, *object_frame;           /* (p, p), (rotations, 2, 2), (3, 3) */
+    const double *calibration, *bone_lengths;                            /* (5), (bones, 2) length and deviation */
+    double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, residual_offset;
     void *constants, *scratch; /* the memory of all above, and of all below */
     int busy;                  /* whether a lift computes in the scratch memory */
-    /* Scratch, for `block` objects at a time. */
-    int block, *missing;
-    Object *objects, **some;
-    float *x, *V, *Psi[2], *psi[2], *shapes;
-    double *M, *cameras, *seen, *E, *A, *left, *edges, *along, *residual;
+    /* Scratch memory, for `block` objects at a time. Rows of doubles are filled up to multiples of DOUBLES. */
+    int block, *missing;          /* (p) keypoints that are not in the input */
+    Object *objects, **incomplete; /* (block): all, and those with missing keypoints */
+    float *x, *V;                 /* input of the network, and its product with the first dictionary */
+    float *Psi[2], *psi[2];       /* codes of two neighbouring layers */
+    float *shapes;                /* (mirrored + 1, n, rotations, 3, stride) of n objects */
+    double *cameras, *residuals;  /* (mirrored + 1, n, rotations, 3, 2), (mirrored + 1, rotations) */
+    double *point_cameras, *E;    /* (3, 2, p) projection of each keypoint, (3, p) errors of the shape */
+    double *system, *difference;  /* A x = b of the correction, W less the projection of S (2, p) */
+    double *bone_directions;      /* (bones, 4) unit vectors and lengths */
+    double *bone_covariance;      /* (bones, 3, p) of the growth of a bone and the errors */
+    double *spread;               /* (DOUBLES, 2, p) of bones and keypoints in the image */
 } Plan;
 
 /* Limits of a plan, as those of a network in algebra.h. */
@@ -55,26 +72,30 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
 /* Point `k` at its scratch memory, NULL to compute only its size in bytes. Returns 0 if that overflows. */
 int lay_out_scratch(Plan *k, char *memory, size_t *size);
 
-/* network.py: set `filled` to the points, the missing filled in. */
-void complete(Plan *k, const Object *o, float *filled);
+/* Set `filled` (p, 2) to the input, with the missing keypoints that fit the network's prior. */
+void complete_points(Plan *k, const Object *o, float *filled);
 
-/* normaliser.py: set W and what leads back to the image. */
-void observe(Plan *k, Object *o);
+/* Set W, gain, unit and origin from the input. */
+void normalise(Plan *k, Object *o);
 
-/* network.py: set `shapes` (n, turns, 3, wide) and the cameras M (n, turns) of n objects by turns of
-   their input; `across`: of its mirror image. */
-void forward(Plan *k, int n, Object *const *objects, int across, float *shapes, camera *M);
+/* Set shapes (n, rotations, 3, stride) and cameras (n, rotations) of n objects from the rotations of W, or of its
+   mirror image. */
+void forward(Plan *k, int n, Object *const *objects, int mirrored, float *shapes, camera *cameras);
 
-/* bones.py: set the edges (bones, 4) of S + E, unit vectors and lengths; return the size of the object. */
-double observe_bones(Plan *k, const Object *o);
+/* Set the directions and lengths of the bones of S + E; return the size of the object, relative to the bone
+   lengths of the plan. */
+double measure_bones(Plan *k, const Object *o);
 
-/* correction.py: move S, in the axes of the object, towards the visible of W. `cameras` (3, 2, p), p in
-   DOUBLES: those of each point. */
+/* Move S, in object axes, by its expected error given W, the point cameras and the bone lengths. `noise`: standard
+   deviation of W. */
 void correct(Plan *k, Object *o, double noise);
 
-/* fitting.py, Fit.__call__: lift n objects into the arrays of `lifting.Lifted`; set `lost` (n) where there
-   is nothing to lift. */
+/* Lift n objects.
+
+   points (n, p, 2), confidence (n, p). Outputs, as in `lifting.Lifted`: shapes (n, p, 3), rotations (n, 3, 3),
+   scale (n), translation (n, 2), residual (n), confidence (n, p); not_lifted (n) is 1 where too few keypoints
+   are visible or all lie on one line. An object's result does not depend on the others. */
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
-          float *const lifted[6], char *lost);
+          float *const outputs[6], char *not_lifted);
 
 #endif

@@ -39,17 +39,17 @@ const char *check_header(const int *h, ptrdiff_t length) {
     return NULL;
 }
 
-/* Items of an array that are not taken; `short_of`: more were requested than there are. */
+/* Items of an array that are not taken; `exceeded`: more were requested than there are. */
 typedef struct {
     size_t left;
-    int short_of;
+    int exceeded;
 } Items;
 
 /* Take rows x columns items; return how many, 0 if there are fewer. */
 static size_t take(Items *items, size_t rows, size_t columns) {
     size_t count;
     if (__builtin_mul_overflow(rows, columns, &count) || count > items->left) {
-        items->short_of = 1;
+        items->exceeded = 1;
         return 0;
     }
     items->left -= count;
@@ -67,43 +67,43 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     const float *f = floats;
     const double *d = doubles;
     Items f_items = {n_floats, 0}, d_items = {n_doubles, 0};
-    k->p = *h++, k->layers = *h++, k->turns = *h++, k->mirrored = *h++, k->whitened = *h++;
-    k->rms = *h++, k->corrected = *h++, k->refill = *h++, k->reference[0] = *h++;
+    k->p = *h++, k->layers = *h++, k->rotations = *h++, k->mirrored = *h++, k->whitened = *h++;
+    k->scale_by_rms = *h++, k->corrected = *h++, k->refill_rounds = *h++, k->reference[0] = *h++;
     k->reference[1] = *h++, k->min_visible = *h++, k->bones = *h++;
-    int p = k->p, wide = k->wide = FLOATS_OF(p), last;
+    int p = k->p, stride = k->stride = FLOATS_OF(p), last;
     k->widths = h, h += k->layers;
     k->partners = h, h += p;
-    k->ends = h;
+    k->bone_ends = h;
     f = matrix(&k->L, p, p, f, &f_items);
     f = matrix(&k->L_inverse, p, p, f, &f_items);
     for (int i = 0; i < k->layers; i++) {
         int to = k->widths[i], from = i ? k->widths[i - 1] : 0;
         f = matrix(&k->encoder[i], i ? from : p, i ? to : 3 * FLOATS_OF(to), f, &f_items);
         k->b[i] = f, f += take(&f_items, FLOATS_OF(to), 1);
-        f = matrix(&k->decoder[i], to, i ? from : 3 * wide, f, &f_items);
+        f = matrix(&k->decoder[i], to, i ? from : 3 * stride, f, &f_items);
         k->b_[i] = f, f += take(&f_items, k->decoder[i].n, 1);
     }
     last = k->widths[k->layers - 1];
     f = matrix(&k->code_head, 6 * FLOATS_OF(last), last, f, &f_items);
     k->camera_head = f, f += take(&f_items, last, 1);
-    k->spread = f, f += take(&f_items, p, 1);
+    k->error_std = f, f += take(&f_items, p, 1);
     k->covariance = f, take(&f_items, 9 * DOUBLES_OF(p), DOUBLES_OF(p));
-    k->filling = d, d += take(&d_items, p, p);
-    k->turn = d, d += take(&d_items, k->turns, 4);
-    k->frame = d, d += take(&d_items, 9, 1);
+    k->completion = d, d += take(&d_items, p, p);
+    k->image_rotations = d, d += take(&d_items, k->rotations, 4);
+    k->object_frame = d, d += take(&d_items, 9, 1);
     k->calibration = d, d += take(&d_items, 5, 1);
-    k->lengths = d, d += take(&d_items, k->bones, 2);
+    k->bone_lengths = d, d += take(&d_items, k->bones, 2);
     take(&d_items, 6, 1);
-    if (f_items.short_of || f_items.left) return "the array of float32 has another length";
-    if (d_items.short_of || d_items.left) return "the array of float64 has another length";
-    k->noise = *d++, k->length = *d++, k->unknown = *d++, k->nearest = *d++;
-    k->residual_spread = *d++, k->least_residual = *d++;
+    if (f_items.exceeded || f_items.left) return "the array of float32 has another length";
+    if (d_items.exceeded || d_items.left) return "the array of float64 has another length";
+    k->noise = *d++, k->reference_length = *d++, k->unknown_variance = *d++, k->min_relative_depth = *d++;
+    k->residual_scale = *d++, k->residual_offset = *d++;
     const double *scalars = &d[-6];
     for (int i = 0; i < 6; i++)
         if (!(scalars[i] >= 0 && scalars[i] < INFINITY)) return "a variance or length is negative or not finite";
-    if (!k->nearest || !k->residual_spread || !k->least_residual) return "a divisor is zero";
+    if (!k->min_relative_depth || !k->residual_scale || !k->residual_offset) return "a divisor is zero";
     for (int i = 0; i < 2 * k->bones; i++)
-        if (!(k->lengths[i] > 0 && k->lengths[i] < INFINITY)) return "the length of a bone is not positive and finite";
+        if (!(k->bone_lengths[i] > 0 && k->bone_lengths[i] < INFINITY)) return "the length of a bone is not positive and finite";
     return NULL;
 }
 
@@ -125,39 +125,39 @@ static void *room(Arena *arena, size_t item, size_t rows, size_t columns) {
 }
 
 int lay_out_scratch(Plan *k, char *memory, size_t *size) {
-    int n = k->block = 6 * k->turns < MAX_ROWS ? MAX_ROWS / (6 * k->turns) : 1;
-    size_t p = k->p, wide = k->wide, turned = (size_t)n * k->turns, all = k->turns * (1 + k->mirrored);
+    int n = k->block = 6 * k->rotations < MAX_ROWS ? MAX_ROWS / (6 * k->rotations) : 1;
+    size_t p = k->p, stride = k->stride, rotated = (size_t)n * k->rotations, all = k->rotations * (1 + k->mirrored);
     size_t even = DOUBLES_OF(k->p), bones = DOUBLES_OF(k->bones), system = 2 * even + bones;
-    size_t widest = 3 * wide;
+    size_t widest = 3 * stride;
     for (int i = 0; i < k->layers; i++)
         if ((size_t)FLOATS_OF(k->widths[i]) > widest) widest = FLOATS_OF(k->widths[i]);
     Arena arena = {memory, 0, 0}, *a = &arena;
-    k->x = room(a, sizeof(float), 4 * n, wide);
+    k->x = room(a, sizeof(float), 4 * n, stride);
     k->V = room(a, sizeof(float), 6 * n, widest);
-    k->Psi[0] = room(a, sizeof(float), 6 * turned, widest);
-    k->Psi[1] = room(a, sizeof(float), 6 * turned, widest);
-    k->psi[0] = room(a, sizeof(float), turned, widest);
-    k->psi[1] = room(a, sizeof(float), turned, widest);
-    k->shapes = room(a, sizeof(float), 3 * n * all, wide);
-    k->M = room(a, sizeof(double), n * all, 6);
-    k->residual = room(a, sizeof(double), all, 1);
-    k->cameras = room(a, sizeof(double), 6, even);
-    k->seen = room(a, sizeof(double), 2 * DOUBLES, even);
+    k->Psi[0] = room(a, sizeof(float), 6 * rotated, widest);
+    k->Psi[1] = room(a, sizeof(float), 6 * rotated, widest);
+    k->psi[0] = room(a, sizeof(float), rotated, widest);
+    k->psi[1] = room(a, sizeof(float), rotated, widest);
+    k->shapes = room(a, sizeof(float), 3 * n * all, stride);
+    k->cameras = room(a, sizeof(double), n * all, 6);
+    k->residuals = room(a, sizeof(double), all, 1);
+    k->point_cameras = room(a, sizeof(double), 6, even);
+    k->spread = room(a, sizeof(double), 2 * DOUBLES, even);
     k->E = room(a, sizeof(double), 3, even);
-    k->A = room(a, sizeof(double), system, system + DOUBLES);
-    k->left = room(a, sizeof(double), 2, even);
-    k->edges = room(a, sizeof(double), bones, 4);
-    k->along = room(a, sizeof(double), 3 * even, bones);
+    k->system = room(a, sizeof(double), system, system + DOUBLES);
+    k->difference = room(a, sizeof(double), 2, even);
+    k->bone_directions = room(a, sizeof(double), bones, 4);
+    k->bone_covariance = room(a, sizeof(double), 3 * even, bones);
     k->missing = room(a, sizeof(int), p, 1);
-    k->some = room(a, sizeof(Object *), n, 1);
+    k->incomplete = room(a, sizeof(Object *), n, 1);
     k->objects = room(a, sizeof(Object), n, 1);
     Object unused, *o = memory ? k->objects : &unused;
     for (int i = 0; i < n; i++, o += memory != NULL) {
-        o->points = room(a, sizeof(float), p, 2);
-        o->mask = room(a, sizeof(float), p, 1);
+        o->input = room(a, sizeof(float), p, 2);
+        o->input_mask = room(a, sizeof(float), p, 1);
         o->visible = room(a, sizeof(float), p, 1);
         o->W = room(a, sizeof(float), p, 2);
-        o->S = room(a, sizeof(float), 3, wide);
+        o->S = room(a, sizeof(float), 3, stride);
     }
     *size = arena.size;
     return !arena.overflow;

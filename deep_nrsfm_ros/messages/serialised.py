@@ -104,7 +104,7 @@ class SerialisedFormat(NamedTuple):
         cloud, shape = self.cloud, (messages * self.cloud.height, self.cloud.width)
         points, confidence = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
         x, y, *confidence_offset = (self.start + offset for offset in cloud.offsets)
-        kernel._kernel.observe(
+        kernel._kernel.decode_keypoints(
             data,
             (messages, self.length),
             (cloud.height, cloud.width),

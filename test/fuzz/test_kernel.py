@@ -103,8 +103,8 @@ def lift(spoiler: Spoiler, network: Sizes | None = None, made: object = None) ->
     return [made, floats(spoiler, n, p, 2), confidence, spoiler.choice((False, True)), *arrays]
 
 
-def observe(spoiler: Spoiler) -> Arguments:
-    """Return arguments of `observe`."""
+def decode_keypoints(spoiler: Spoiler) -> Arguments:
+    """Return arguments of `decode_keypoints`."""
     messages, n, q = (spoiler.choice((0, 1, 2, 5)) for _ in range(3))
     point_step, between = spoiler.choice((8, 12, 13, 32)), spoiler.choice((0, 7))
     object_step = q * point_step + between
@@ -159,7 +159,7 @@ def network_backward(
 ENTRY_POINTS: dict[str, Callable[[Spoiler], Arguments]] = {
     "plan": plan,
     "lift": lift,
-    "observe": observe,
+    "decode_keypoints": decode_keypoints,
     "choose_vectors": lambda spoiler: [spoiler.choice((16, 32, 64))],
     "worker_pool": worker_pool,
     "activations_per_frame": lambda s: [COMPILED.worker_pool(*worker_pool(s))],

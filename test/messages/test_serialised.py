@@ -168,18 +168,20 @@ def test_bytes_between_numbers_do_not_matter() -> None:
     ],
 )
 def test_nothing_is_read_beyond_the_data(
-    messages: tuple[int, int], steps: tuple[int, int], offsets: tuple[int, ...], room: int
+    messages: tuple[int, int], steps: tuple[int, int], offsets: tuple[int, int, int], room: int
 ) -> None:
     from deep_nrsfm_ros.kernel import _kernel
 
     points, confidence = np.empty((4, 2, 2), np.float32), np.empty((4, 2), np.float32)
-    _kernel.observe(
+    _kernel.decode_keypoints(
         *(bytes(96), (2, 48), (2, 2), (24, 12), (0, 4, 8), 1e9, 0.1, points, confidence)
     )
     assert not points.any() and not confidence.any()
     confidence = np.empty((room, 2), np.float32)
     with pytest.raises(ValueError, match="do not fit the data"):
-        _kernel.observe(bytes(96), messages, (2, 2), steps, offsets, 1e9, 0.1, points, confidence)
+        _kernel.decode_keypoints(
+            bytes(96), messages, (2, 2), steps, offsets, 1e9, 0.1, points, confidence
+        )
 
 
 def test_makes_that_take_turns_are_all_remembered_but_not_without_end() -> None:
