@@ -78,8 +78,8 @@ class Session:
         folder = self.output / "models" / f"{title.replace(' ', '-')}-{_hash(dataset, preset)}"
         folder.mkdir(parents=True, exist_ok=True)
         steps = preset.recipe.steps
-        wanted = sorted({-(-steps * i // SNAPSHOTS) for i in range(1, SNAPSHOTS + 1)})
-        paths = {step: folder / f"{step:07}{MODEL_SUFFIX}" for step in wanted}
+        snapshot_steps = sorted({-(-steps * i // SNAPSHOTS) for i in range(1, SNAPSHOTS + 1)})
+        paths = {step: folder / f"{step:07}{MODEL_SUFFIX}" for step in snapshot_steps}
         if not all(path.exists() for path in paths.values()):
             self._train(title, dataset, preset, paths, folder / "checkpoint")
         return [load_model(path) for path in paths.values()]
@@ -131,21 +131,23 @@ def _hash(dataset: Dataset, preset: Preset) -> str:
     return digest.hexdigest()[:10]
 
 
-def in_pairs(columns: Iterable[str]) -> list[str]:
+def with_proper(columns: Iterable[str]) -> list[str]:
     """Return the columns of `across`."""
     return [name for column in columns for name in (column, f"{column} proper")]
 
 
-def across(tests: Mapping[str, tuple[Model, Dataset]], options: LiftingOptions) -> dict[str, float]:
+def errors_by_column(
+    tests: Mapping[str, tuple[Model, Dataset]], options: LiftingOptions
+) -> dict[str, float]:
     """Return shape error and proper error (%) of a model on a test for each column."""
     row: dict[str, float] = {}
     for column, (model, dataset) in tests.items():
-        found = figures(evaluate(model, dataset, options))
-        row |= {column: found["shape %"], f"{column} proper": found["proper %"]}
+        errors = figures(evaluate(model, dataset, options))
+        row |= {column: errors["shape %"], f"{column} proper": errors["proper %"]}
     return row
 
 
-def command(
+def run_program(
     benchmark: Callable[[Session], Table],
     description: str | None,
     subjects: Sequence[str],
@@ -161,11 +163,11 @@ def command(
     parser.add_argument("--steps", type=int, help="train for so many steps only: a quick look")
     parser.add_argument("--stride", type=int, default=1, help="take every n-th frame only")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
-    given = parser.parse_args(argv)
-    torch.set_num_threads(given.threads)
+    args = parser.parse_args(argv)
+    torch.set_num_threads(args.threads)
     session = Session(
-        *(given.data, given.output, tuple(given.subjects), tuple(given.seeds)),
-        *(given.steps, given.stride),
+        *(args.data, args.output, tuple(args.subjects), tuple(args.seeds)),
+        *(args.steps, args.stride),
     )
     try:
         table = benchmark(session)

@@ -24,7 +24,7 @@ CACHE = Path(".cache")
 LIMBS = [MEDIAPIPE33.index(joint) for joint in JOINTS]
 
 
-class Seen(NamedTuple):
+class PoseDetections(NamedTuple):
     """What MediaPipe made of the f images of a video; NaN and confidence 0 where nobody was."""
 
     points: Floats  # (f, 33, 2) pixels
@@ -42,8 +42,8 @@ class Scene(NamedTuple):
     camera: str
     intrinsics: Intrinsics
     truth: Floats
-    seen: Seen
-    given: View | None
+    mediapipe: PoseDetections
+    detections: View | None
 
 
 def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]:
@@ -51,26 +51,26 @@ def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]
     wheel = fetch_wheel(CACHE)
     session = read_session(wheel)
     cameras = [view.camera for view in session.views]
-    moving = watch_trial(wheel, "Balancing", output)
+    moving = detect_trial(wheel, "Balancing", output)
     balancing = [
         Scene(view.camera.name, view.camera.intrinsics, view.truth, moving[view.camera.name], view)
         for view in session.views
     ]
-    still = watch_trial(wheel, "Static", output)
+    still = detect_trial(wheel, "Static", output)
     standing = [still[camera.name] for camera in cameras]
     plain = zip(cameras, standing, strict=True)
-    points = np.stack([camera.undistort(seen.points[:, LIMBS]) for camera, seen in plain])
-    weights = np.stack([seen.confidence[:, LIMBS] for seen in standing]).astype(float)
-    world, missed = triangulate([c.without_lens() for c in cameras], points, weights)
+    points = np.stack([camera.undistort(mediapipe.points[:, LIMBS]) for camera, mediapipe in plain])
+    weights = np.stack([mediapipe.confidence[:, LIMBS] for mediapipe in standing]).astype(float)
+    world, reprojection = triangulate([c.without_lens() for c in cameras], points, weights)
     truths = [
-        Scene(camera.name, camera.intrinsics, camera.to_camera(world), seen, None)
-        for camera, seen in zip(cameras, standing, strict=True)
+        Scene(camera.name, camera.intrinsics, camera.to_camera(world), mediapipe, None)
+        for camera, mediapipe in zip(cameras, standing, strict=True)
     ]
-    pixels = float(np.nanmean(np.linalg.norm(missed, axis=-1)))
+    pixels = float(np.nanmean(np.linalg.norm(reprojection, axis=-1)))
     return balancing, truths, (session.pixels[0], pixels)
 
 
-def watch_trial(wheel: Path, trial: str, output: Path) -> dict[str, Seen]:
+def detect_trial(wheel: Path, trial: str, output: Path) -> dict[str, PoseDetections]:
     """Return what MediaPipe sees in the videos of a trial; what is in the output is not run again.
 
     Raises ValueError where MediaPipe is wanted and is not installed.
@@ -80,26 +80,30 @@ def watch_trial(wheel: Path, trial: str, output: Path) -> dict[str, Seen]:
     for camera, video in extract_videos(wheel, trial, folder).items():
         kept, partial = folder / f"{camera}.npz", folder / f"{camera}_partial.npz"
         if not kept.exists():
-            np.savez(partial, **watch(video)._asdict())
+            np.savez(partial, **detect_video(video)._asdict())
             partial.replace(kept)
         with np.load(kept) as arrays:
-            found[camera] = Seen(*(arrays[name] for name in Seen._fields))
+            found[camera] = PoseDetections(*(arrays[name] for name in PoseDetections._fields))
     return found
 
 
-def watch(video: Path) -> Seen:
+def detect_video(video: Path) -> PoseDetections:
     """Run MediaPipe on a video."""
     try:
         from examples.mediapipe_detector import LANDMARKS, Detector, images
     except ImportError as error:
         raise ValueError(f"{error}; `make demo-live` installs MediaPipe") from None
     detect = Detector()
-    nobody = (np.full((LANDMARKS, 2), np.nan), np.zeros(LANDMARKS), np.full((LANDMARKS, 3), np.nan))
+    no_person = (
+        np.full((LANDMARKS, 2), np.nan),
+        np.zeros(LANDMARKS),
+        np.full((LANDMARKS, 3), np.nan),
+    )
 
     def frames() -> Iterator[tuple[Floats, Floats, Floats, float]]:
         for _, image in tqdm(images(str(video)), desc=f"MediaPipe on {video.name}"):
             begin = time.perf_counter()
-            found = detect(image) or nobody
+            found = detect(image) or no_person
             yield *found, time.perf_counter() - begin
 
-    return Seen(*(np.array(part) for part in zip(*frames(), strict=True)))
+    return PoseDetections(*(np.array(part) for part in zip(*frames(), strict=True)))

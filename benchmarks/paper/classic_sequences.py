@@ -12,7 +12,7 @@ from tqdm import tqdm
 from benchmarks.baselines.batches import RANKS
 from benchmarks.baselines.methods import block_matrix, em_ppca, rigid
 from benchmarks.data.mat_files import read_sequence
-from benchmarks.harness import LIFTING_LEGEND, Session, command
+from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, figures
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -61,7 +61,7 @@ def in_camera_axes(S: Floats, W: Floats) -> Floats:
     return turned
 
 
-def in_object_axes(model: Model, dataset: Dataset, options: LiftingOptions) -> Floats:
+def lift_in_object_axes(model: Model, dataset: Dataset, options: LiftingOptions) -> Floats:
     """Return the lifted shapes (f, p, 3) of all frames in the model's object frame."""
     lifted = Lifter(model, options).lift(dataset.points, dataset.visible.astype(np.float32))
     return np.nan_to_num(lifted.scale[:, None, None] * lifted.shapes @ lifted.rotations)
@@ -70,7 +70,7 @@ def in_object_axes(model: Model, dataset: Dataset, options: LiftingOptions) -> F
 def best_rank(name: str, dataset: Dataset) -> tuple[int, Floats]:
     """Return the rank that suits a baseline best, by the ground truth, and its shapes."""
     solved = ((K, BASELINES[name](dataset.points, K)) for K in tqdm(RANKS, name, leave=False))
-    return min(solved, key=lambda found: shape_errors(found[1], _truth(dataset)).shape)
+    return min(solved, key=lambda errors: shape_errors(errors[1], _truth(dataset)).shape)
 
 
 def reconstructions(
@@ -80,7 +80,7 @@ def reconstructions(
     for seed in session.seeds:
         model = session.trained(f"{name} seed {seed}", dataset, session.preset("default", seed))
         for lifting, options in LIFTING.items():
-            yield f"default recipe, {lifting}", seed, in_object_axes(model, dataset, options)
+            yield f"default recipe, {lifting}", seed, lift_in_object_axes(model, dataset, options)
     yield "rigid factorisation (Tomasi-Kanade)", None, rigid(dataset.points)
     for baseline in BASELINES:
         rank, S = best_rank(baseline, dataset)
@@ -122,7 +122,7 @@ def _truth(dataset: Dataset) -> Floats:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command; `--subjects` are sequences here."""
-    command(benchmark, __doc__, SEQUENCES, argv)
+    run_program(benchmark, __doc__, SEQUENCES, argv)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
-from benchmarks.harness import Session, command
+from benchmarks.harness import Session, run_program
 from benchmarks.paper.ablation import STEPS, trained
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, evaluate
@@ -112,7 +112,7 @@ def scatter(clouds: Mapping[str, Mapping[str, Sequence[Point]]], figure: Figure)
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from benchmarks.harness import LIFTING_LEGEND, Session, command
+from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, figures
 
@@ -28,21 +28,23 @@ def benchmark(session: Session) -> Table:
     )
     for subject in session.subjects:
         dataset = session.mocap([subject], "train")
-        tests = {told: session.mocap([subject], split) for split, told in _SPLITS.items()}
+        tests = {
+            description: session.mocap([subject], split) for split, description in _SPLITS.items()
+        }
         for seed in session.seeds:
             title = f"{subject} default seed {seed}"
             model = session.trained(title, dataset, session.preset("default", seed))
             for tested_on, test in tests.items():
                 for lifted in _LIFTED:
-                    found = figures(evaluate(model, test, LIFTING[lifted]))
-                    shown = {name: found[name] for name in _SHOWN}
+                    errors = figures(evaluate(model, test, LIFTING[lifted]))
+                    shown = {name: errors[name] for name in _SHOWN}
                     table.add((subject, tested_on, lifted, f"seed {seed}"), shown, seed)
     return table
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv, seeds=SEEDS)
+    run_program(benchmark, __doc__, SUBJECTS, argv, seeds=SEEDS)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from benchmarks.baselines.batches import BASELINES, solve
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
 from benchmarks.data.mat_files import observed, read_category
 from benchmarks.data.synthetic_furniture import CATEGORIES
-from benchmarks.harness import LIFTING_LEGEND, Session, command
+from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, figures
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -89,7 +89,7 @@ def _shown(errors: ShapeErrors) -> dict[str, float]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command; `--subjects` are categories here."""
-    command(benchmark, __doc__, (FACES, *CATEGORIES), argv)
+    run_program(benchmark, __doc__, (FACES, *CATEGORIES), argv)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.harness import LIFTING_LEGEND, Session, command
+from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, figures, reconstruct
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -88,7 +88,7 @@ def errors(model: Model, test: Dataset, options: LiftingOptions) -> dict[str, fl
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.data.pose2sim_scenes import LIMBS, Scene, scenes
-from benchmarks.harness import Session, command
+from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.pose2sim import JOINTS
@@ -108,29 +108,33 @@ def figures(system: str, scene: Scene, lifter: Lifter, mean: Floats) -> dict[str
 
     mean: (12, 3) the mean shape.
     """
-    seen, given, truth = scene.seen, scene.given, scene.truth
+    mediapipe, detections, truth = scene.mediapipe, scene.detections, scene.truth
     if system == MEAN_SHAPE:
         row = scores(np.broadcast_to(mean, truth.shape), truth)
         return {name: row[name] for name in ("frames", "PA mm")}
     intrinsics = scene.intrinsics if system.endswith(WITH_INTRINSICS) else None
     if system == WORLD:
-        shapes, seconds = seen.world[:, LIMBS], seen.seconds
+        shapes, seconds = mediapipe.world[:, LIMBS], mediapipe.seconds
     elif system.startswith(ON_MEDIAPIPE):
-        shapes, seconds = lift(lifter, MEDIAPIPE33, seen.points, seen.confidence, intrinsics)
-    elif given is not None:
-        shapes, seconds = lift(lifter, BODY25B, given.points, given.confidence, intrinsics)
+        shapes, seconds = lift(
+            lifter, MEDIAPIPE33, mediapipe.points, mediapipe.confidence, intrinsics
+        )
+    elif detections is not None:
+        shapes, seconds = lift(
+            lifter, BODY25B, detections.points, detections.confidence, intrinsics
+        )
     else:
         return {}
     row = scores(shapes, truth) | {"ms": 1e3 * float(np.median(seconds))}
-    return row if given is not None else row | {"jitter deg": jitter(shapes)}
+    return row if detections is not None else row | {"jitter deg": jitter(shapes)}
 
 
 def scores(shapes: Floats, truth: Floats) -> dict[str, float]:
     """Return those of the FIGURES that shapes and truth (f, 12, 3) tell."""
-    found = np.isfinite(shapes).all((1, 2)) & np.isfinite(truth).all((1, 2))
-    error = camera_errors(shapes[found], truth[found])
+    valid = np.isfinite(shapes).all((1, 2)) & np.isfinite(truth).all((1, 2))
+    error = camera_errors(shapes[valid], truth[valid])
     return {
-        "frames": float(found.sum()),
+        "frames": float(valid.sum()),
         "PA mm": error.aligned,
         "camera mm": error.in_camera,
         "rotation deg": error.rotation,
@@ -151,12 +155,12 @@ def lift(
     """
     values = np.concatenate([points, confidence[..., None]], -1)
     layout = lifter.model.layout
-    found = to_observation(values, InputOptions().min_confidence)
-    mapped = zip(*KeypointMap(detector, layout)(found.points, found.confidence), strict=True)
+    valid = to_observation(values, InputOptions().min_confidence)
+    mapped = zip(*KeypointMap(detector, layout)(valid.points, valid.confidence), strict=True)
     shapes, seconds = [], []
-    for one in mapped:
+    for keypoints in mapped:
         begin = time.perf_counter()
-        frame = one[0][None], one[1][None]
+        frame = keypoints[0][None], keypoints[1][None]
         lifted = lift_perspective(lifter, intrinsics, *frame) if intrinsics else lifter(*frame)
         shapes.append(lifted.shapes[0])
         seconds.append(time.perf_counter() - begin)
@@ -189,7 +193,7 @@ def draw(table: Table, figure: Figure) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

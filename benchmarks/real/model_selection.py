@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.real.mediapipe_comparison import SUBJECTS
-from benchmarks.robustness.smoothing import VIDEO, Clip, filmed
+from benchmarks.robustness.smoothing import VIDEO, Clip, video_clip
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.mocap import read_trials, trials
 from deep_nrsfm_ros.data.pose2sim import JOINTS
@@ -35,13 +35,13 @@ Floats = NDArray[Any]
 HELD_OUT = ("03", "131")
 STRIDE = 20
 VIDEO_STRIDE = 5
-SURE = 0.5  # confidence of the joints that are measured
-FACING = 0.65  # torso lengths between the shoulders of who faces the camera
+MIN_CONFIDENCE = 0.5  # confidence of the joints that are measured
+MIN_SHOULDER_WIDTH = 0.65  # torso lengths between the shoulders of who faces the camera
 CAMERA = Intrinsics((1600.0, 1600.0), (960.0, 540.0))
 NOISE = 0.04  # of a frame's size
 MISSING = 0.05  # of the joints
 _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip", "nose")
-_CAPTURED = ("lclavicle", "rclavicle", "lhipjoint", "rhipjoint")
+_CMU_TRUNK = ("lclavicle", "rclavicle", "lhipjoint", "rhipjoint")
 LEGEND = f"""hips, shoulders: distance of left and right in torso lengths, 90th percentile over the
     frames; nose: its height above the neck along the torso, median; CMU: the first trials of the
     nine subjects that `human` was trained on
@@ -51,7 +51,7 @@ the others: CMU {" and ".join(HELD_OUT)}, whom no model saw, before a perspectiv
     joints missing; 12 limb joints, means of the two; errors as in real_detections"""
 
 
-class Seen(NamedTuple):
+class Observations(NamedTuple):
     """What a camera sees of n people."""
 
     points: Floats  # (n, 17, 2) pixels
@@ -70,54 +70,56 @@ def proportions(X: Floats) -> dict[str, float]:
         name: float(np.percentile(np.linalg.norm(gap, axis=1) / torso, 90))
         for name, gap in across.items()
     }
-    if X.shape[1] > len(_CAPTURED):
+    if X.shape[1] > len(_CMU_TRUNK):
         row["nose"] = float(np.median(((X[:, 4] - neck) * up).sum(1) / torso**2))
     return row
 
 
-def facing(clip: Clip) -> Floats:
+def facing_trunks(clip: Clip) -> Floats:
     """Return the trunk and nose (n, 5, 2) of who faces the camera."""
     places = [HUMAN17.index(joint) for joint in _TRUNK]
-    X = clip.points[:, places][(clip.confidence[:, places] > SURE).all(1)].astype(float)
-    wide = [proportions(one[None])["shoulders"] > FACING for one in X]
-    chosen: Floats = X[wide]
+    X = clip.points[:, places][(clip.confidence[:, places] > MIN_CONFIDENCE).all(1)].astype(float)
+    facing_camera = [proportions(person[None])["shoulders"] > MIN_SHOULDER_WIDTH for person in X]
+    chosen: Floats = X[facing_camera]
     return chosen
 
 
-def captured(paths: Sequence[Path], layout: KeypointLayout) -> Floats:
+def read_shapes(paths: Sequence[Path], layout: KeypointLayout) -> Floats:
     """Return the shapes (n, p, 3) of trials in metres, y up."""
     shapes = read_trials(paths, layout, stride=STRIDE).shapes
     assert shapes is not None
     return shapes
 
 
-def as_filmed(shapes: Floats, rng: np.random.Generator) -> Seen:
+def simulate_camera(shapes: Floats, rng: np.random.Generator) -> Observations:
     """Return what a camera would see of shapes (n, 17, 3) in metres, y up."""
     n = len(shapes)
     roll, tilt = rng.normal(0, 8, n), rng.normal(12, 10, n)
-    turns = np.column_stack((roll, tilt, rng.uniform(0, 360, n)))
-    R = Rotation.from_euler("ZXY", turns, degrees=True).as_matrix()
+    angles = np.column_stack((roll, tilt, rng.uniform(0, 360, n)))
+    R = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
     depth = rng.uniform(3, 5, n)
     place = np.column_stack((rng.normal(0, 0.15, (n, 2)) * depth[:, None], depth))
     X = (shapes * [1, -1, -1]) @ R.swapaxes(1, 2) + place[:, None]
     W = CAMERA.pixels(X[..., :2] / X[..., 2:])
     size = (W - W.mean(1, keepdims=True)).std((1, 2), keepdims=True)
     W = W + NOISE * size * rng.standard_normal(W.shape)
-    found = rng.random(W.shape[:2]) >= MISSING
+    visible = rng.random(W.shape[:2]) >= MISSING
     limbs = [HUMAN17.index(joint) for joint in JOINTS]
-    return Seen(W.astype(np.float32), found.astype(np.float32), 1000 * X[:, limbs])
+    return Observations(W.astype(np.float32), visible.astype(np.float32), 1000 * X[:, limbs])
 
 
-def errors(lifter: Lifter, seen: Seen, *, intrinsics: bool) -> dict[str, float]:
+def errors(lifter: Lifter, observations: Observations, *, intrinsics: bool) -> dict[str, float]:
     """Return the errors of a lifter that is told the camera's intrinsics or not."""
     limbs = [HUMAN17.index(joint) for joint in JOINTS]
 
     def placed(points: Floats, confidence: Floats) -> Lifted:
         return lift_perspective(lifter, CAMERA, points, confidence)
 
-    shapes = lift_all(placed if intrinsics else lifter.lift, seen.points, seen.confidence).shapes
-    found = np.isfinite(shapes).all((1, 2))
-    error = camera_errors(shapes[found][:, limbs], seen.truth[found])
+    shapes = lift_all(
+        placed if intrinsics else lifter.lift, observations.points, observations.confidence
+    ).shapes
+    visible = np.isfinite(shapes).all((1, 2))
+    error = camera_errors(shapes[visible][:, limbs], observations.truth[visible])
     return {
         "PA mm": error.aligned,
         "camera mm": error.in_camera,
@@ -138,30 +140,30 @@ def show(title: str, rows: Mapping[str, Mapping[str, float]]) -> None:
 
 def benchmark(lifters: Mapping[str, Lifter], data: Path) -> None:
     """Print both tables."""
-    video, folder = filmed(data / VIDEO), data / "cmu"
+    video, folder = video_clip(data / VIDEO), data / "cmu"
     trunk = [HUMAN17.index(joint) for joint in _TRUNK]
-    raw = [CMU31.index(joint) for joint in _CAPTURED]
+    raw = [CMU31.index(joint) for joint in _CMU_TRUNK]
     first = [trials(folder, subject)[0] for subject in SUBJECTS]
     show(
         "people",
         {
-            "OpenPose on a video, facing the camera": proportions(facing(video)),
-            "CMU, as captured": proportions(captured(first, CMU31)[:, raw]),
-            "CMU, as `human17`": proportions(captured(first, HUMAN17)[:, trunk]),
+            "OpenPose on a video, facing the camera": proportions(facing_trunks(video)),
+            "CMU, as captured": proportions(read_shapes(first, CMU31)[:, raw]),
+            "CMU, as `human17`": proportions(read_shapes(first, HUMAN17)[:, trunk]),
         },
     )
-    most = (video.confidence > 0).sum(1) >= 12
-    points, confidence = (part[most][::VIDEO_STRIDE] for part in video[:2])
-    held_out = [captured(trials(folder, subject), HUMAN17) for subject in HELD_OUT]
-    seen = [as_filmed(shapes, np.random.default_rng(1)) for shapes in held_out]
+    nearly_complete = (video.confidence > 0).sum(1) >= 12
+    points, confidence = (part[nearly_complete][::VIDEO_STRIDE] for part in video[:2])
+    held_out = [read_shapes(trials(folder, subject), HUMAN17) for subject in HELD_OUT]
+    observations = [simulate_camera(shapes, np.random.default_rng(1)) for shapes in held_out]
     rows: dict[str, dict[str, float]] = {}
     for name, lifter in lifters.items():
         lifted = lift_all(lifter.lift, points, confidence)
         rows[name] = {"residual": float(np.nanmedian(lifted.residual))}
-        for told, word in ((False, ""), (True, ", intrinsics")):
-            each = [errors(lifter, one, intrinsics=told) for one in seen]
+        for with_intrinsics, suffix in ((False, ""), (True, ", intrinsics")):
+            each = [errors(lifter, person, intrinsics=with_intrinsics) for person in observations]
             rows[name] |= {
-                f"{key}{word}": float(np.mean([e[key] for e in each])) for key in each[0]
+                f"{key}{suffix}": float(np.mean([e[key] for e in each])) for key in each[0]
             }
     show("model", rows)
     print(LEGEND)
@@ -173,12 +175,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("models", nargs="*", default=["human"], help="models of `human17`")
     parser.add_argument("--data", type=Path, required=True, help="holds cmu/ and detections/")
     add_arguments(parser, LiftingOptions)
-    given = parser.parse_args(argv)
-    options = override(LiftingOptions(), given)
+    args = parser.parse_args(argv)
+    options = override(LiftingOptions(), args)
     folders = model_folders(default_models_dir())
     try:
-        models = {name: load_model(find_model(name, folders)) for name in given.models}
-        benchmark({name: Lifter(model, options) for name, model in models.items()}, given.data)
+        models = {name: load_model(find_model(name, folders)) for name in args.models}
+        benchmark({name: Lifter(model, options) for name, model in models.items()}, args.data)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)

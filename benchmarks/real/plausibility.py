@@ -35,20 +35,20 @@ _COLOURS = {"left": "tab:blue", "right": "tab:red"}
 
 def figures(S: Floats, visible: NDArray[np.bool_]) -> dict[str, float]:
     """Return the FIGURES of people S (f, p, 3) in camera axes, any unit, in the layout human17."""
-    front = _front(S)
-    nose = _before(_joint(S, "nose") - _joint(S, "neck"), front)
+    forward = _forward_direction(S)
+    nose = _in_front(_joint(S, "nose") - _joint(S, "neck"), forward)
     knees, toes = [], []
     for side in SIDES:
         leg = [f"{side}_{part}" for part in ("hip", "knee", "ankle", "big_toe")]
         hip, knee, ankle, toe = (_joint(S, name) for name in leg)
-        seen = np.stack([visible[:, HUMAN17.index(name)] for name in leg], 1)
-        bent = seen[:, :3].all(1) & (_angle(knee - hip, ankle - knee) >= BENT)
-        knees.append(_before(knee - (hip + ankle) / 2, front)[bent])
-        toes.append(_before(toe - ankle, front)[seen[:, 2:].all(1)])
+        visible_joints = np.stack([visible[:, HUMAN17.index(name)] for name in leg], 1)
+        bent = visible_joints[:, :3].all(1) & (_angle(knee - hip, ankle - knee) >= BENT)
+        knees.append(_in_front(knee - (hip + ankle) / 2, forward)[bent])
+        toes.append(_in_front(toe - ankle, forward)[visible_joints[:, 2:].all(1)])
     shares = (nose, np.concatenate(knees), np.concatenate(toes))
     X = centre(S)
     depth = np.sqrt((X[..., 2] ** 2).mean() / (X**2).sum(2).mean())
-    values = (*map(_share, shares), 100 * _spread(S, visible), 100 * float(depth))
+    values = (*map(_percent, shares), 100 * _spread(S, visible), 100 * float(depth))
     return dict(zip(FIGURES, values, strict=True))
 
 
@@ -63,8 +63,8 @@ def draw(
         row[0].set_ylabel(name if view is None else f"{name}\nfrom {view}", fontsize="small")
         for axis, i in zip(row, frames, strict=True):
             if view is None:
-                seen = dataset.visible[i, :, None]
-                _person(axis, np.where(seen, dataset.points[i], np.nan))
+                visible_joints = dataset.visible[i, :, None]
+                _person(axis, np.where(visible_joints, dataset.points[i], np.nan))
                 axis.set_title(f"object {i}", fontsize="small")
             else:
                 x, y, z = lifted[name][i].T
@@ -89,15 +89,15 @@ def _joint(S: Floats, name: str) -> Floats:
     return joint
 
 
-def _front(S: Floats) -> Floats:
+def _forward_direction(S: Floats) -> Floats:
     """Return where people (f, p, 3) face by trunk alone: across the hips' line and the spine."""
     left = _joint(S, "left_hip") - _joint(S, "right_hip")
-    front: Floats = np.cross(left, _joint(S, "neck") - _joint(S, "mid_hip"))
-    return front
+    forward: Floats = np.cross(left, _joint(S, "neck") - _joint(S, "mid_hip"))
+    return forward
 
 
-def _before(X: Floats, front: Floats) -> NDArray[np.bool_]:
-    ahead: NDArray[np.bool_] = (X * front).sum(-1) > 0
+def _in_front(X: Floats, forward: Floats) -> NDArray[np.bool_]:
+    ahead: NDArray[np.bool_] = (X * forward).sum(-1) > 0
     return ahead
 
 
@@ -108,15 +108,15 @@ def _angle(a: Floats, b: Floats) -> Floats:
     return degrees
 
 
-def _share(yes: NDArray[np.bool_]) -> float:
-    return 100 * float(yes.mean()) if len(yes) else float("nan")
+def _percent(condition: NDArray[np.bool_]) -> float:
+    return 100 * float(condition.mean()) if len(condition) else float("nan")
 
 
 def _spread(S: Floats, visible: NDArray[np.bool_]) -> float:
     edges = HUMAN17.edge_indices()
     a, b = np.array(edges).T
-    found = relative_lengths(S, edges)
-    seen = visible[:, a] & visible[:, b]
-    found[~seen] = np.nan
-    low, middle, high = np.nanpercentile(found[:, seen.any(0)], (16, 50, 84), axis=0)
+    lengths = relative_lengths(S, edges)
+    visible_joints = visible[:, a] & visible[:, b]
+    lengths[~visible_joints] = np.nan
+    low, middle, high = np.nanpercentile(lengths[:, visible_joints.any(0)], (16, 50, 84), axis=0)
     return float(np.mean((high - low) / 2 / middle))

@@ -29,7 +29,7 @@ from benchmarks.real import plausibility
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, lifter
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, read_split
-from deep_nrsfm_ros.commands.evaluate import figures as errors_in_words
+from deep_nrsfm_ros.commands.evaluate import figures as error_figures
 from deep_nrsfm_ros.data.bags import Frame, frames, read_bags, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.openpose import read_people
@@ -51,7 +51,7 @@ TOPIC = "/keypoints"
 VIDEO = "detections/long_video_body25.jsonl.gz"
 VIDEO_RATE, CMU_RATE = 30.0, 120.0
 EXCAVATOR = Path(__file__).parents[2] / "config/layouts/excavator.yaml"
-WORK, WORK_LATER = 6000, 1500
+TRAINING_FRAMES, TEST_FRAMES = 6000, 1500
 """Frames of the machine to learn from, and of other work to lift."""
 STEPS = {"video": 30_000, "layout_loss": 6000, "tuned": 100, "machine": 8000, "mocap": 3000}
 QUALITY = {
@@ -62,7 +62,7 @@ _SHOWN = {name: CONVENTIONS[name] for name in ("shape %", "proper %", "mirrored 
 _LAYOUT_LOSS = ("--bone-length-weight", "3", "--handedness-weight", "1", "--depth-penalty", "0.1")
 _DRAWN = 8
 _AT_ONCE = 256
-UNTOUCHED = {
+NO_CURATION = {
     "train.min_change": "0.0",
     "train.outlier_threshold": "0.0",
     "train.min_visible": "0",
@@ -93,21 +93,21 @@ class Session(NamedTuple):
             print(f"{write_bag(path, TOPIC, messages())} messages in {path}", flush=True)
         return path
 
-    def named(self, title: str, kind: str) -> tuple[str, int]:
+    def name_and_steps(self, title: str, kind: str) -> tuple[str, int]:
         """Return name and steps of a training."""
         steps = self.steps or STEPS[kind]
-        every = f"_every_{self.stride}" if kind == "mocap" and self.stride > 1 else ""
-        return f"{title}_{steps}{every}", steps
+        suffix = f"_every_{self.stride}" if kind == "mocap" and self.stride > 1 else ""
+        return f"{title}_{steps}{suffix}", steps
 
-    def trained(self, title: str, kind: str, *words: str) -> Model:
+    def trained(self, title: str, kind: str, *arguments: str) -> Model:
         """Return the model that the program `train` makes, told by `words` what else to do."""
-        name, steps = self.named(title, kind)
+        name, steps = self.name_and_steps(title, kind)
         path = self.models / f"{name}{MODEL_SUFFIX}"
-        unfinished = look(self.models, name)
-        if unfinished or not path.exists():
-            words = (*words, "--steps", str(steps), "--threads", "1")
-            words = ("--resume",) if unfinished else words
-            command = [sys.executable, "-m", "deep_nrsfm_ros.commands.train", *words]
+        record = look(self.models, name)
+        if record or not path.exists():
+            arguments = (*arguments, "--steps", str(steps), "--threads", "1")
+            arguments = ("--resume",) if record else arguments
+            command = [sys.executable, "-m", "deep_nrsfm_ros.commands.train", *arguments]
             subprocess.run([*command, "--name", name, "--output", str(self.models)], check=True)
         return load_model(path)
 
@@ -115,8 +115,8 @@ class Session(NamedTuple):
 def video(session: Session) -> Table:
     """Train on the detections of a real video, with and without the shipped model's knowledge."""
     bag = session.bag("video_bag", partial(_people, session.data / VIDEO))
-    words = ("--bag", str(bag), "--keypoint-layout", BODY25.name)
-    alone = (*words, "--object", HUMAN17.name)
+    arguments = ("--bag", str(bag), "--keypoint-layout", BODY25.name)
+    alone = (*arguments, "--object", HUMAN17.name)
     shipped = load_model(find_model("human", model_folders(session.models)))
     models = {
         "this video alone": session.trained("video", "video", *alone),
@@ -124,17 +124,19 @@ def video(session: Session) -> Table:
             "video_layout_loss", "layout_loss", *alone, *_LAYOUT_LOSS
         ),
         "the same, longer": session.trained("video_layout_loss", "video", *alone, *_LAYOUT_LOSS),
-        "human, tuned to it": session.trained("tuned", "tuned", *words, "--from", "human"),
+        "human, tuned to it": session.trained("tuned", "tuned", *arguments, "--from", "human"),
         "human": shipped,
     }
-    seen = read_bags([bag], BODY25, HUMAN17, ReadOptions(TOPIC, min_confidence=0.1)).dataset
+    dataset = read_bags([bag], BODY25, HUMAN17, ReadOptions(TOPIC, min_confidence=0.1)).dataset
     lifted = {
-        name: lift_all(Lifter(model).lift, seen.points, seen.visible.astype(np.float32))
+        name: lift_all(Lifter(model).lift, dataset.points, dataset.visible.astype(np.float32))
         for name, model in models.items()
     }
-    there = np.flatnonzero(~np.isnan([one.residual for one in lifted.values()]).any(0))
-    shapes = {name: one.shapes[there] for name, one in lifted.items()}
-    kept = seen[there]
+    lifted_by_all = np.flatnonzero(
+        ~np.isnan([result.residual for result in lifted.values()]).any(0)
+    )
+    shapes = {name: result.shapes[lifted_by_all] for name, result in lifted.items()}
+    kept = dataset[lifted_by_all]
     legend = {
         "residual %": "relative reprojection error, median of the objects",
         "mirrored to human %": "objects that are more like the mirror image of what the model "
@@ -143,21 +145,21 @@ def video(session: Session) -> Table:
         "its layout heeded": f"this video alone, with `{' '.join(_LAYOUT_LOSS)}`: its training was "
         "told what faces, knees, toes and bones measure, so that these say little of it",
     }
-    chosen = np.linspace(0, len(there) - 1, _DRAWN).astype(int).tolist()
+    chosen = np.linspace(0, len(lifted_by_all) - 1, _DRAWN).astype(int).tolist()
     table = Table(
         "from_video",
-        f"A real video of {len(seen)} people in {bag.name}",
+        f"A real video of {len(dataset)} people in {bag.name}",
         ("lifted by", "steps"),
         (*plausibility.FIGURES, "residual %", "mirrored to human %", *QUALITY),
         plausibility.FIGURES | legend | QUALITY,
         lambda _, figure: plausibility.draw(figure, kept, shapes, chosen),
     )
     for name, model in models.items():
-        like = align(centre(shapes["human"]), centre(shapes[name]), allow_reflection=True)
+        alignment = align(centre(shapes["human"]), centre(shapes[name]), allow_reflection=True)
         row = {
             **plausibility.figures(shapes[name], kept.visible),
-            "residual %": 100 * float(np.median(lifted[name].residual[there])),
-            "mirrored to human %": 100 * float(like.mirrored.mean()),
+            "residual %": 100 * float(np.median(lifted[name].residual[lifted_by_all])),
+            "mirrored to human %": 100 * float(alignment.mirrored.mean()),
         }
         table.add((name, str(model.provenance["step"])), row | _quality(model))
     flat = plausibility.figures(shapes["human"] * [1, 1, 0], kept.visible)
@@ -168,13 +170,13 @@ def video(session: Session) -> Table:
 def machine(session: Session) -> Table:
     """Train on an excavator at work, described by its layout file; lift other work of it."""
     recordings = {
-        "excavator_bag": excavator.record(WORK, 0),
-        "excavator_later_bag": excavator.record(WORK_LATER, 1),
+        "excavator_bag": excavator.record(TRAINING_FRAMES, 0),
+        "excavator_later_bag": excavator.record(TEST_FRAMES, 1),
     }
     layout = find_layout("--object", str(EXCAVATOR))
-    bags = {name: session.bag(name, partial(_work, one)) for name, one in recordings.items()}
-    words = ("--bag", str(bags["excavator_bag"]), "--object", str(EXCAVATOR))
-    model = session.trained("excavator", "machine", *words)
+    bags = {name: session.bag(name, partial(_work, result)) for name, result in recordings.items()}
+    arguments = ("--bag", str(bags["excavator_bag"]), "--object", str(EXCAVATOR))
+    model = session.trained("excavator", "machine", *arguments)
     legend = {
         "metres": "mean distance of points, aligned by a proper rotation only: the output is in "
         f"metres, as the layout file gives a length; the machine is about {_size(recordings)}",
@@ -192,19 +194,19 @@ def machine(session: Session) -> Table:
         bars("shape %", "proper %"),
     )
     for name, recording in recordings.items():
-        seen = read_bags([bags[name]], layout, layout, ReadOptions(TOPIC)).dataset
-        confidence = seen.visible.astype(np.float32)
+        dataset = read_bags([bags[name]], layout, layout, ReadOptions(TOPIC)).dataset
+        confidence = dataset.visible.astype(np.float32)
         truth = centre(recording.truth)
         shapes = {
-            "this machine's model": lift_all(Lifter(model).lift, seen.points, confidence).shapes,
-            "the same, camera known": _at_place(model, seen.points, confidence),
+            "this machine's model": lift_all(Lifter(model).lift, dataset.points, confidence).shapes,
+            "the same, camera known": _at_place(model, dataset.points, confidence),
         }
-        labels = (name, str(len(seen)))
-        for way, S in shapes.items():
+        labels = (name, str(len(dataset)))
+        for method, S in shapes.items():
             distances = np.linalg.norm(align(S, truth).aligned - truth, axis=2)
             row = _errors(S, truth) | {"metres": float(distances.mean())}
-            table.add((*labels, way, str(model.provenance["step"])), row | _quality(model))
-        table.add((*labels, "rigid", ""), _errors(rigid(seen.points), truth))
+            table.add((*labels, method, str(model.provenance["step"])), row | _quality(model))
+        table.add((*labels, "rigid", ""), _errors(rigid(dataset.points), truth))
     return table
 
 
@@ -213,12 +215,14 @@ def mocap(session: Session) -> Table:
     folder = session.data / "cmu"
     truth = read_split(folder, ["01"], "train", CMU31, stride=session.stride)
     bag = session.bag(f"cmu01_{session.stride}_bag", lambda: _frames(truth, CMU_RATE))
-    every = ("--stride", str(session.stride))
-    words = ("--cmu", str(folder), "--subjects", "01", "--object", CMU31.name, *every)
+    suffix = ("--stride", str(session.stride))
+    arguments = ("--cmu", str(folder), "--subjects", "01", "--object", CMU31.name, *suffix)
     models = {
-        "train --cmu": session.trained("direct", "mocap", *words),
-        "~/train, as the motion capture is": _served(session, "served", bag, UNTOUCHED),
-        "~/train, curated": _served(session, "curated", bag, {}),
+        "train --cmu": session.trained("direct", "mocap", *arguments),
+        "~/train, as the motion capture is": _trained_by_service(
+            session, "served", bag, NO_CURATION
+        ),
+        "~/train, curated": _trained_by_service(session, "curated", bag, {}),
     }
     table = Table(
         "from_mocap",
@@ -229,19 +233,23 @@ def mocap(session: Session) -> Table:
         bars("shape %", "proper %"),
     )
     for name, model in models.items():
-        for way in ("network alone", "as shipped"):
-            found = errors_in_words(evaluate(model, truth, LIFTING[way]))
+        for method in ("network alone", "as shipped"):
+            results = error_figures(evaluate(model, truth, LIFTING[method]))
             trained = (str(model.provenance[key]) for key in ("frames", "step"))
-            table.add((name, *trained, way), {key: found[key] for key in _SHOWN} | _quality(model))
+            table.add(
+                (name, *trained, method), {key: results[key] for key in _SHOWN} | _quality(model)
+            )
     return table
 
 
-def _served(session: Session, title: str, bag: Path, options: Mapping[str, str]) -> Model:
+def _trained_by_service(
+    session: Session, title: str, bag: Path, options: Mapping[str, str]
+) -> Model:
     """Return the model that a lifter trains in a process of its own when it is asked to."""
-    name, steps = session.named(title, "mocap")
+    name, steps = session.name_and_steps(title, "mocap")
     path = session.models / f"{name}{MODEL_SUFFIX}"
-    unfinished = look(session.models, name)
-    if path.exists() and not unfinished:
+    record = look(session.models, name)
+    if path.exists() and not record:
         return load_model(path)
     parameters = {
         "model": "cmu31",
@@ -251,7 +259,7 @@ def _served(session: Session, title: str, bag: Path, options: Mapping[str, str])
         "train.object": CMU31.name,
         "train.name": name,
         "train.steps": steps,
-        "train.resume": str(unfinished is not None).lower(),
+        "train.resume": str(record is not None).lower(),
         **options,
     }
     answers = session.output / f"{name}_answers"
@@ -292,18 +300,18 @@ def _at_place(model: Model, points: Floats, confidence: Floats) -> Floats:
     """Return the shapes (f, p, 3), centred, that a lifter with camera_info makes of points."""
     lifter = Lifter(model)
     parts = np.array_split(np.arange(len(points)), max(1, len(points) // _AT_ONCE))
-    found = [lift_perspective(lifter, excavator.CAMERA, points[i], confidence[i]) for i in parts]
-    return centre(np.concatenate([one.shapes for one in found]))
+    results = [lift_perspective(lifter, excavator.CAMERA, points[i], confidence[i]) for i in parts]
+    return centre(np.concatenate([result.shapes for result in results]))
 
 
 def _size(recordings: dict[str, excavator.Recording]) -> str:
-    spans = np.concatenate([np.ptp(one.truth, axis=1).max(1) for one in recordings.values()])
+    spans = np.concatenate([np.ptp(result.truth, axis=1).max(1) for result in recordings.values()])
     return f"{spans.mean():.0f} m across"
 
 
 def _errors(S: Floats, truth: Floats) -> dict[str, float]:
-    found = errors_in_words(shape_errors(S, truth))
-    return {name: found[name] for name in _SHOWN}
+    results = error_figures(shape_errors(S, truth))
+    return {name: results[name] for name in _SHOWN}
 
 
 def _quality(model: Model) -> dict[str, float]:
@@ -322,15 +330,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks/from_bags"))
     parser.add_argument("--steps", type=int, help="for all trainings: a quick look")
     parser.add_argument("--stride", type=int, default=1, help="take every n-th CMU frame only")
-    given = parser.parse_args(argv)
-    session = Session(given.data, given.output, given.steps, given.stride)
+    args = parser.parse_args(argv)
+    session = Session(args.data, args.output, args.steps, args.stride)
     # A domain of its own, and never beyond this machine.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(random.randrange(1, 102))
     try:
-        if unknown := set(given.parts) - set(PARTS):
+        if unknown := set(args.parts) - set(PARTS):
             raise ValueError(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
-        for name in given.parts or PARTS:
+        for name in args.parts or PARTS:
             table = PARTS[name](session)
             print(table.markdown(), flush=True)
             table.write(session.output)

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.harness import Session, command
+from benchmarks.harness import Session, run_program
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.commands.evaluate import read_split
@@ -65,7 +65,7 @@ FIGURES = (
 ALL = "all"
 
 
-class Rated(NamedTuple):
+class Predictions(NamedTuple):
     """k points of n objects: what was told of them, and how far off they are."""
 
     confidence: Floats  # (n, k)
@@ -73,41 +73,41 @@ class Rated(NamedTuple):
     log_odds_terms: Floats  # (n, k, 5) of which the log odds are a sum, ordered as `Calibration`
 
 
-class Witness(NumpyBackend):
+class EvidenceRecorder(NumpyBackend):
     """Keeps the terms of the log odds (n, p, 5) of what it has lifted, a part for each call."""
 
     def __init__(self, constants: LifterConstants) -> None:
         """Take model and options."""
         super().__init__(constants)
-        self.kept: list[Floats] = []
+        self.recorded: list[Floats] = []
 
     def keypoint_confidence(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
         """Return the confidence, and keep what it comes from."""
         visible = confidence > 0
-        known = log_odds_terms(visible, residual, self.relative_error_std(S))
-        self.kept.append(np.concatenate([known, ~visible[..., None]], 2))
+        valid = log_odds_terms(visible, residual, self.relative_error_std(S))
+        self.recorded.append(np.concatenate([valid, ~visible[..., None]], 2))
         return super().keypoint_confidence(confidence, residual, S)
 
 
-class Observed(Lifter):
+class RecordingLifter(Lifter):
     """A lifter as shipped, with a witness."""
 
     def __init__(self, model: Model) -> None:
         """Take the model."""
         super().__init__(model)
-        self.backend = self.witness = Witness(self.constants)
+        self.backend = self.recorder = EvidenceRecorder(self.constants)
 
-    def take(self) -> Floats:
+    def take_evidence(self) -> Floats:
         """Return the terms that were kept since the last call."""
-        kept, self.witness.kept = np.concatenate(self.witness.kept), []
-        return kept
+        recorded, self.recorder.recorded = np.concatenate(self.recorder.recorded), []
+        return recorded
 
 
 def benchmark(session: Session) -> Table:
     """Fit the calibration to the first subject and rate it on the others and on real detections."""
     fitted_to, *others = session.subjects
     folders = model_folders(default_models_dir())
-    lifters = [Observed(load_model(find_model(name, folders))) for name in MODELS]
+    lifters = [RecordingLifter(load_model(find_model(name, folders))) for name in MODELS]
     fitted = fit([on_mocap(session, lifter, fitted_to, 0) for lifter in lifters])
     table = Table(
         "confidence_calibration",
@@ -116,8 +116,8 @@ def benchmark(session: Session) -> Table:
         FIGURES,
         LEGEND
         | {
-            f"fitted to subject {fitted_to}": _words(fitted),
-            "shipped, and rated here": _words(CALIBRATED),
+            f"fitted to subject {fitted_to}": _as_text(fitted),
+            "shipped, and rated here": _as_text(CALIBRATED),
         },
         draw,
     )
@@ -132,17 +132,17 @@ def benchmark(session: Session) -> Table:
     return table
 
 
-def on_mocap(session: Session, lifter: Observed, subject: str, seed: int) -> Rated:
+def on_mocap(session: Session, lifter: RecordingLifter, subject: str, seed: int) -> Predictions:
     """Lift a subject's frames, seen and spoiled at random, and compare with the truth."""
     layout, rng = lifter.model.layout, np.random.default_rng(seed)
     stride = session.stride if session.stride > 1 else STRIDE
     truth = read_split(session.data / "cmu", [subject], "all", layout, stride=stride).shapes
     assert truth is not None
-    T, points, confidence = seen(truth, rng)
-    return rated(lifter, points, confidence, T, np.arange(len(layout)))
+    T, points, confidence = project(truth, rng)
+    return compare(lifter, points, confidence, T, np.arange(len(layout)))
 
 
-def seen(truth: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+def project(truth: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
     """Return shapes (n, p, 3) as random cameras see them: turned; points; confidence, 0 or 1."""
     n, p, _ = truth.shape
     T = centre(truth @ rotation_from_camera(random_cameras(n, rng)).swapaxes(1, 2))
@@ -151,39 +151,50 @@ def seen(truth: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Float
     place[:, 0, :2] = np.tan(np.radians(rng.uniform(-ASIDE, ASIDE, (n, 2)) / np.sqrt(2)))
     at = T + rng.uniform(*DISTANCE, (n, 1, 1)) * place / np.linalg.norm(place, axis=2)[..., None]
     W = at[..., :2] / at[..., 2:]
-    spoil = rng.choice(NOISE, n) * radius(centre(W))
-    W += spoil[:, None, None] * rng.standard_normal(W.shape) / np.sqrt(2)
+    noise = rng.choice(NOISE, n) * radius(centre(W))
+    W += noise[:, None, None] * rng.standard_normal(W.shape) / np.sqrt(2)
     visible = rng.random((n, p)) >= rng.choice(HIDDEN, n)[:, None]
     return T, W.astype(np.float32), visible.astype(np.float32)
 
 
-def on_detections(lifter: Observed, wheel: Path) -> Rated:
+def on_detections(lifter: RecordingLifter, wheel: Path) -> Predictions:
     """Lift the real detections of the four pose2sim cameras and compare with the truth."""
     to_model = KeypointMap(BODY25B, lifter.model.layout)
     limbs = np.array([lifter.model.layout.index(joint) for joint in JOINTS])
     parts = []
     for view in read_session(wheel).views:
-        known = np.isfinite(view.truth).all((1, 2))
-        points, confidence = to_model(view.points[known], view.confidence[known])
-        parts.append(rated(lifter, points, confidence, view.truth[known], limbs))
-    return Rated(*map(np.concatenate, zip(*parts, strict=True)))
+        valid = np.isfinite(view.truth).all((1, 2))
+        points, confidence = to_model(view.points[valid], view.confidence[valid])
+        parts.append(compare(lifter, points, confidence, view.truth[valid], limbs))
+    return Predictions(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def rated(
-    lifter: Observed, points: Floats, confidence: Floats, truth: Floats, which: NDArray[np.int64]
-) -> Rated:
+def compare(
+    lifter: RecordingLifter,
+    points: Floats,
+    confidence: Floats,
+    truth: Floats,
+    keypoints: NDArray[np.int64],
+) -> Predictions:
     """Lift points (n, p, 2) and compare k of them with the truth (n, k, 3), in camera axes."""
     lifted = lift_all(lifter.lift, points, confidence)
-    kept = lifter.take()
-    done = ~np.isnan(lifted.residual)
-    S, T = centre(lifted.shapes[done][:, which].astype(float)), centre(truth[done])
+    recorded = lifter.take_evidence()
+    lifted_objects = ~np.isnan(lifted.residual)
+    S, T = (
+        centre(lifted.shapes[lifted_objects][:, keypoints].astype(float)),
+        centre(truth[lifted_objects]),
+    )
     scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
-    size = 2 * radius(lifted.shapes[done]) * radius(T) / radius(S)
+    size = 2 * radius(lifted.shapes[lifted_objects]) * radius(T) / radius(S)
     error = np.linalg.norm(scale[:, None, None] * S - T, axis=2) / size[:, None]
-    return Rated(lifted.confidence[done][:, which], error, kept[done][:, which])
+    return Predictions(
+        lifted.confidence[lifted_objects][:, keypoints],
+        error,
+        recorded[lifted_objects][:, keypoints],
+    )
 
 
-def fit(parts: Sequence[Rated]) -> Calibration:
+def fit(parts: Sequence[Predictions]) -> Calibration:
     """Return the calibration under which what happened is likeliest: logistic regression.
 
     Takes points that were surely seen or surely missing: of confidence 1 or 0.
@@ -200,20 +211,23 @@ def fit(parts: Sequence[Rated]) -> Calibration:
 
 def reliability(confidence: Floats, error: Floats) -> Iterable[tuple[str, dict[str, float]]]:
     """Return the `FIGURES` of each bin of confidence (n, k), then over all."""
-    hit, share = error < CORRECT_DISTANCE, np.clip((confidence * BINS).astype(int), 0, BINS - 1)
-    off = 0.0
+    correct, bin_index = (
+        error < CORRECT_DISTANCE,
+        np.clip((confidence * BINS).astype(int), 0, BINS - 1),
+    )
+    calibration_error = 0.0
     for i in range(BINS):
-        inside = share == i
+        inside = bin_index == i
         if inside.sum() < _FEWEST:
             continue
-        figures = _means(inside.mean(), confidence[inside], hit[inside], error[inside])
-        off += inside.mean() * abs(figures["confidence %"] - figures["near %"])
+        figures = _means(inside.mean(), confidence[inside], correct[inside], error[inside])
+        calibration_error += inside.mean() * abs(figures["confidence %"] - figures["near %"])
         yield f"{i / BINS:g} to {(i + 1) / BINS:g}", figures
     ranks = {
         "rank points": spearman(confidence.ravel(), error.ravel()),
         "rank objects": spearman(confidence.mean(1), error.mean(1)),
     }
-    yield ALL, _means(1.0, confidence, hit, error) | {"off %": off} | ranks
+    yield ALL, _means(1.0, confidence, correct, error) | {"off %": calibration_error} | ranks
 
 
 def spearman(a: Floats, b: Floats) -> float:
@@ -238,13 +252,15 @@ def draw(table: Table, figure: Figure) -> None:
     left.legend(fontsize="small")
 
 
-def _add(table: Table, lifter: Observed, on: str, found: Rated) -> None:
-    for label, figures in reliability(found.confidence, found.error):
-        table.add((lifter.model.name, on, label), figures)
+def _add(table: Table, lifter: RecordingLifter, test_data: str, predictions: Predictions) -> None:
+    for label, figures in reliability(predictions.confidence, predictions.error):
+        table.add((lifter.model.name, test_data, label), figures)
 
 
-def _means(share: float, confidence: Floats, hit: Floats, error: Floats) -> dict[str, float]:
-    values = (share, confidence.mean(), hit.mean(), error.mean())
+def _means(
+    bin_index: float, confidence: Floats, correct: Floats, error: Floats
+) -> dict[str, float]:
+    values = (bin_index, confidence.mean(), correct.mean(), error.mean())
     return {name: 100 * float(v) for name, v in zip(FIGURES, values, strict=False)}
 
 
@@ -254,13 +270,13 @@ def radius(S: Floats) -> Floats:
     return radius
 
 
-def _words(found: Calibration) -> str:
-    return ", ".join(f"{name}={value:.2f}" for name, value in found._asdict().items())
+def _as_text(predictions: Calibration) -> str:
+    return ", ".join(f"{name}={value:.2f}" for name, value in predictions._asdict().items())
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import Session, command
+from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.curation import Curation
@@ -17,9 +17,9 @@ from deep_nrsfm_ros.data.outliers import find_outliers
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 
 SUBJECTS = ("01", "05", "49", "127")
-SHARE = 0.05
+CORRUPTED_FRACTION = 0.05
 NOISE = 0.01
-VISIBLE_SWAP = 0.3
+MIN_SWAP = 0.3
 SWAPS = (
     ("wrist",),
     ("elbow", "wrist"),
@@ -34,13 +34,13 @@ FIGURES = {
     "clean frames %": "frames left alone in which a point was hidden",
     "jumps %": "points thrown off by 0.7 to 3 RMS radii that were hidden",
     "swaps %": "frames with swapped limbs in which a point was hidden, of those in which the swap "
-    f"moved a point by more than {VISIBLE_SWAP} RMS radii",
+    f"moved a point by more than {MIN_SWAP} RMS radii",
     "swapped points %": "of the points so moved, those that were hidden; the others lost a "
     "neighbour instead",
 }
 
 
-class Spoiled(NamedTuple):
+class Corrupted(NamedTuple):
     """Points (f, p, 2), and by how much, in RMS radii, each was moved (f, p) by which mistake."""
 
     points: NDArray[np.float32]
@@ -62,11 +62,11 @@ def benchmark(session: Session) -> Table:
         folder = session.data / "cmu"
         dataset = read_split(folder, [subject], "train", HUMAN17, stride=session.stride)
         for seed in session.seeds:
-            table.add((subject,), found(dataset, spoil(dataset, seed)), seed)
+            table.add((subject,), detection_rates(dataset, corrupt(dataset, seed)), seed)
     return table
 
 
-def spoil(dataset: Dataset, seed: int) -> Spoiled:
+def corrupt(dataset: Dataset, seed: int) -> Corrupted:
     """Return noisy points of which SHARE of the frames jump or swap, in turn."""
     rng = np.random.default_rng(seed)
     P = dataset.points.astype(np.float64)
@@ -74,7 +74,7 @@ def spoil(dataset: Dataset, seed: int) -> Spoiled:
     size = np.sqrt(((P - P.mean(1, keepdims=True)) ** 2).sum(2).mean(1))
     P += NOISE * size[:, None, None] * rng.standard_normal(P.shape)
     jumped, swapped = P.copy(), P.copy()
-    chosen = rng.choice(f, int(SHARE * f), replace=False)
+    chosen = rng.choice(f, int(CORRUPTED_FRACTION * f), replace=False)
     for i in chosen[::2]:
         angle, far = rng.uniform(0, 2 * np.pi), size[i] * rng.uniform(0.7, 3)
         jumped[i, rng.integers(p)] += far * np.array([np.cos(angle), np.sin(angle)])
@@ -83,24 +83,24 @@ def spoil(dataset: Dataset, seed: int) -> Spoiled:
             sides = [dataset.layout.index(f"{side}_{part}") for side in ("left", "right")]
             swapped[i, sides] = P[i, sides[::-1]]
     moves = (np.linalg.norm(X - P, axis=2) / size[:, None] for X in (jumped, swapped))
-    return Spoiled((jumped + swapped - P).astype(np.float32), *moves)
+    return Corrupted((jumped + swapped - P).astype(np.float32), *moves)
 
 
-def found(dataset: Dataset, spoiled: Spoiled) -> dict[str, float]:
+def detection_rates(dataset: Dataset, corrupted: Corrupted) -> dict[str, float]:
     """Return the FIGURES of curation's default."""
-    hidden, _ = find_outliers(spoiled.points, dataset.visible, Curation().outlier_threshold)
-    jumps, swaps = spoiled.jumps > 0, spoiled.swaps > VISIBLE_SWAP
-    clean = ~((spoiled.jumps > 0) | (spoiled.swaps > 0)).any(1)
-    shares = (
+    hidden, _ = find_outliers(corrupted.points, dataset.visible, Curation().outlier_threshold)
+    jumps, swaps = corrupted.jumps > 0, corrupted.swaps > MIN_SWAP
+    clean = ~((corrupted.jumps > 0) | (corrupted.swaps > 0)).any(1)
+    rates = (
         *(hidden[clean], hidden[clean].any(1)),
         *(hidden[jumps], hidden[swaps.any(1)].any(1), hidden[swaps]),
     )
-    return {name: 100 * float(share.mean()) for name, share in zip(FIGURES, shares, strict=True)}
+    return {name: 100 * float(rate.mean()) for name, rate in zip(FIGURES, rates, strict=True)}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import Session, across, command, in_pairs
+from benchmarks.harness import Session, errors_by_column, run_program, with_proper
 from benchmarks.table import Table, lines
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, figures
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -19,7 +19,7 @@ from deep_nrsfm_ros.nrsfm.network import reconstruct
 
 SUBJECTS = ("01",)
 COUNTS = (0, 1, 3, 6, 9)
-EVERY = 5
+TEST_STRIDE = 5
 """Trained on all frames, tested on every so many-th of them."""
 LIMBS = {
     "arm": ("humerus", "radius", "wrist", "hand", "fingers", "thumb"),
@@ -41,7 +41,7 @@ LEGEND = {
     "expected": "they go where the second moment of the keypoints expects them; the lifted shape "
     "is corrected by the points that are seen",
     "refilled": f"they then follow the lifted shape, {LiftingOptions().refill} rounds",
-    "figures": f"shape error in % of every {EVERY}th frame, over all points: "
+    "figures": f"shape error in % of every {TEST_STRIDE}th frame, over all points: "
     f"{CONVENTIONS['shape %']}",
     "proper": CONVENTIONS["proper %"],
 }
@@ -54,57 +54,57 @@ def benchmark(session: Session) -> Table:
         "missing_keypoints",
         "Missing points",
         ("subject", "trained", "lifting"),
-        in_pairs(columns),
+        with_proper(columns),
         LEGEND,
         lines(columns, "missing points", "shape error %"),
     )
     for subject in session.subjects:
         dataset = session.mocap([subject], "train")
-        seen = dataset[slice(None, None, EVERY)]
-        tests = {column: hidden(seen, column) for column in columns}
+        encoded = dataset[slice(None, None, TEST_STRIDE)]
+        tests = {column: hide(encoded, column) for column in columns}
         for trained, recipe in TRAINED.items():
             for seed in session.seeds:
                 preset = session.preset("default", seed, **recipe)
                 name = "masked" if recipe else "default"
                 model = session.trained(f"{subject} {name} seed {seed}", dataset, preset)
-                row = zero_filled(model, tests)
+                row = zero_fill_errors(model, tests)
                 table.add((subject, trained, ZERO_FILL), row, seed)
                 for lifting, options in LIFTING.items():
-                    row = across({c: (model, test) for c, test in tests.items()}, options)
+                    row = errors_by_column({c: (model, test) for c, test in tests.items()}, options)
                     table.add((subject, trained, lifting), row, seed)
     return table
 
 
-def zero_filled(model: Model, tests: Mapping[str, Dataset]) -> dict[str, float]:
+def zero_fill_errors(model: Model, tests: Mapping[str, Dataset]) -> dict[str, float]:
     """Return the errors (%) of the network alone with zeros for what is missing."""
     row: dict[str, float] = {}
     for column, test in tests.items():
-        seen = model.normaliser.encode(test.points, test.visible[..., None].astype(np.float32))
-        S, _ = reconstruct(model.network, seen.W * seen.gain)
+        encoded = model.normaliser.encode(test.points, test.visible[..., None].astype(np.float32))
+        S, _ = reconstruct(model.network, encoded.W * encoded.gain)
         assert test.shapes is not None
-        found = figures(shape_errors(S, test.shapes))
-        row |= {column: found["shape %"], f"{column} proper": found["proper %"]}
+        errors = figures(shape_errors(S, test.shapes))
+        row |= {column: errors["shape %"], f"{column} proper": errors["proper %"]}
     return row
 
 
-def hidden(dataset: Dataset, what: str, seed: int = 0) -> Dataset:
+def hide(dataset: Dataset, column: str, seed: int = 0) -> Dataset:
     """Return the dataset without so many points a frame, or without a limb of `LIMBS`."""
     rng = np.random.default_rng(seed)
     f, p = dataset.visible.shape
     visible: NDArray[np.bool_] = np.ones((f, p), bool)
-    if what in LIMBS:
-        sides = [[dataset.layout.index(side + part) for part in LIMBS[what]] for side in "lr"]
-        gone = np.array(sides)[rng.integers(2, size=f)]
+    if column in LIMBS:
+        sides = [[dataset.layout.index(side + part) for part in LIMBS[column]] for side in "lr"]
+        hidden = np.array(sides)[rng.integers(2, size=f)]
     else:
-        gone = rng.random((f, p)).argsort(1)[:, : int(what)]
-    np.put_along_axis(visible, gone, False, 1)
+        hidden = rng.random((f, p)).argsort(1)[:, : int(column)]
+    np.put_along_axis(visible, hidden, False, 1)
     points = np.where(visible[..., None], dataset.points, np.float32(0))
     return dataclasses.replace(dataset, points=points, visible=visible)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

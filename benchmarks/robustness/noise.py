@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from benchmarks.baselines.batches import BASELINES, solve
-from benchmarks.harness import LIFTING_LEGEND, Session, across, command, in_pairs
+from benchmarks.harness import LIFTING_LEGEND, Session, errors_by_column, run_program, with_proper
 from benchmarks.table import Table, lines
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -21,7 +21,7 @@ LIFTING: dict[str, Callable[[float], LiftingOptions]] = {
     "as shipped": lambda ratio: LiftingOptions(),
     "noise known": lambda ratio: LiftingOptions(noise=max(ratio, LiftingOptions().noise)),
 }
-EVERY = 5
+TEST_STRIDE = 5
 """Trained on all frames, tested on every so many-th of them."""
 TRAINED: dict[str, dict[str, float]] = {
     "default": {},
@@ -35,12 +35,12 @@ LEGEND = {
     "network alone": LIFTING_LEGEND["network alone"],
     "as shipped": f"corrected for keypoints of {LiftingOptions().noise:.0%} noise",
     "noise known": "corrected for keypoints as noisy as they are (option `noise`)",
-    "N %": f"shape error of every {EVERY}th frame: {CONVENTIONS['shape %']}",
+    "N %": f"shape error of every {TEST_STRIDE}th frame: {CONVENTIONS['shape %']}",
     "N % proper": CONVENTIONS["proper %"],
 }
 
 
-def disturbed(dataset: Dataset, ratio: float, seed: int = 0) -> Dataset:
+def add_noise(dataset: Dataset, ratio: float, seed: int = 0) -> Dataset:
     """Return the dataset with Gaussian noise of `ratio` times the norm of each (centred) frame."""
     if not ratio:
         return dataset
@@ -57,14 +57,14 @@ def benchmark(session: Session) -> Table:
         "noise",
         "Noise",
         ("subject", "trained", "lifting"),
-        in_pairs(RATIOS),
+        with_proper(RATIOS),
         LEGEND,
         lines(list(RATIOS), "noise", "shape error %"),
     )
     for subject in session.subjects:
         clean = session.mocap([subject], "train")
-        seen = clean[slice(None, None, EVERY)]
-        tests = {name: disturbed(seen, ratio) for name, ratio in RATIOS.items()}
+        test_frames = clean[slice(None, None, TEST_STRIDE)]
+        tests = {name: add_noise(test_frames, ratio) for name, ratio in RATIOS.items()}
         for trained, recipe in TRAINED.items():
             for seed in session.seeds:
                 title = f"{subject} {trained} seed {seed}"
@@ -72,19 +72,19 @@ def benchmark(session: Session) -> Table:
                 for lifting, options in LIFTING.items():
                     row: dict[str, float] = {}
                     for name, ratio in RATIOS.items():
-                        row |= across({name: (model, tests[name])}, options(ratio))
+                        row |= errors_by_column({name: (model, tests[name])}, options(ratio))
                     table.add((subject, trained, lifting), row, seed)
         solved = {name: solve(session, name, clean).errors for name in BASELINES}
         name = min(solved, key=lambda name: solved[name].shape)
-        found = 100 * solved[name].shape, 100 * solved[name].proper
-        row = dict(zip(in_pairs(["0 %"]), found, strict=True))
+        errors = 100 * solved[name].shape, 100 * solved[name].proper
+        row = dict(zip(with_proper(["0 %"]), errors, strict=True))
         table.add((subject, f"best baseline: {name}", ""), row)
     return table
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

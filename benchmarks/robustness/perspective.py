@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import Session, command
+from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -63,47 +63,47 @@ def benchmark(session: Session) -> Table:
         folder = session.data / "cmu"
         dataset = read_split(folder, [subject], "all", model.layout, stride=session.stride)
         for seed in session.seeds:
-            scene = stage(dataset, seed)
+            scene = random_scene(dataset, seed)
             for word, intrinsics in {"without": None, "with": CAMERA}.items():
-                table.add((subject, word), found(model, scene, intrinsics), seed)
+                table.add((subject, word), lifting_errors(model, scene, intrinsics), seed)
     return table
 
 
-def stage(dataset: Dataset, seed: int) -> Scene:
+def random_scene(dataset: Dataset, seed: int) -> Scene:
     """Turn every frame at random and put it somewhere before the camera."""
     rng = np.random.default_rng(seed)
     shapes = centre(np.asarray(dataset.shapes, np.float64))
     pair = dataset.layout.reference
     assert pair, f"layout {dataset.layout.name!r} has no reference pair"
     a, b = (shapes[:, dataset.layout.index(name)] for name in pair)
-    turns = rotation_from_camera(random_cameras(len(shapes), rng)).astype(np.float64)
+    rotations = rotation_from_camera(random_cameras(len(shapes), rng)).astype(np.float64)
     places = np.ones((len(shapes), 1, 3))
     places[:, 0, :2] = rng.uniform(-SPREAD, SPREAD, (len(shapes), 2))
-    before = shapes @ turns.swapaxes(1, 2) + DISTANCE * places
-    pixels = CAMERA.pixels(before[..., :2] / before[..., 2:])
+    placed = shapes @ rotations.swapaxes(1, 2) + DISTANCE * places
+    pixels = CAMERA.pixels(placed[..., :2] / placed[..., 2:])
     size = np.sqrt((centre(pixels) ** 2).mean((1, 2), keepdims=True))
     pixels = pixels + NOISE * size * rng.standard_normal(pixels.shape)
     length = float(np.linalg.norm(a - b, axis=1).mean())
-    return Scene(before, pixels.astype(np.float32), length)
+    return Scene(placed, pixels.astype(np.float32), length)
 
 
-def found(model: Model, scene: Scene, intrinsics: Intrinsics | None) -> dict[str, float]:
+def lifting_errors(model: Model, scene: Scene, intrinsics: Intrinsics | None) -> dict[str, float]:
     """Return the figures of one way of lifting."""
     lifter = Lifter(model, LiftingOptions(reference_length=scene.reference_length))
-    certain = np.ones(scene.pixels.shape[:2], np.float32)
+    confidence = np.ones(scene.pixels.shape[:2], np.float32)
     if intrinsics is None:
-        shapes: NDArray[Any] = lift_all(lifter.lift, scene.pixels, certain).shapes
+        shapes: NDArray[Any] = lift_all(lifter.lift, scene.pixels, confidence).shapes
         places = {}
     else:
-        parts = np.array_split(np.arange(len(certain)), len(certain) // 64 + 1)
+        parts = np.array_split(np.arange(len(confidence)), len(confidence) // 64 + 1)
         shapes = np.concatenate(
             [
-                lift_perspective(lifter, intrinsics, scene.pixels[i], certain[i]).shapes
+                lift_perspective(lifter, intrinsics, scene.pixels[i], confidence[i]).shapes
                 for i in parts
             ]
         )
-        apart = np.linalg.norm(shapes.mean(1) - scene.shapes.mean(1), axis=1)
-        places = {"place mm": 1000 * float(apart.mean())}
+        distances = np.linalg.norm(shapes.mean(1) - scene.shapes.mean(1), axis=1)
+        places = {"place mm": 1000 * float(distances.mean())}
     errors = camera_errors(shapes, 1000 * scene.shapes)
     values = (errors.aligned, errors.in_camera, errors.rotation, 100 * errors.mirrored)
     return dict(zip(FIGURES, values, strict=False)) | places
@@ -111,7 +111,7 @@ def found(model: Model, scene: Scene, intrinsics: Intrinsics | None) -> dict[str
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import Session, command
+from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
@@ -32,11 +32,11 @@ SUBJECTS = ("03",)
 VIDEO = "detections/long_video_body25.jsonl.gz"
 VIDEO_RATE = 30.0
 MIN_CONFIDENCE = 0.1
-CAPTURED = 120.0
+CMU_RATE = 120.0
 NOISE = 0.02  # of the RMS radius, as the lifter takes it to be
-HELD = 300  # frames of one pose
+STILL_FRAMES = 300  # frames of one pose
 LENGTH = 1200  # frames of motion capture
-STEPS = (1, 2, 4)  # every so many of them
+STRIDES = (1, 2, 4)  # every so many of them
 FIGURES = {
     "rotation deg": "rotation of the object from one frame to the next, median",
     "points %": "movement of its points, in the camera's axes, in RMS radii, median over frames",
@@ -72,37 +72,39 @@ def benchmark(session: Session) -> Table:
     )
     for name, clip in clips(session).items():
         lifted = lift_all(lifter.lift, clip.points, clip.confidence)
-        for word, options in FILTERS.items():
-            steady = steadied(lifted, clip.rate, options)
-            table.add((name, word), figures(lifted, steady, clip))
+        for state, options in FILTERS.items():
+            smoothed_frames = smoothed(lifted, clip.rate, options)
+            table.add((name, state), figures(lifted, smoothed_frames, clip))
     return table
 
 
 def clips(session: Session) -> dict[str, Clip]:
     """Return a held-out subject's motion, at two rates, and what real detections there are."""
-    found = {}
+    result = {}
     for subject in session.subjects:
-        motion = walk(session, subject)
-        for step in STEPS:
-            rate = CAPTURED / step
-            found[f"CMU {subject}, {rate:.0f} Hz"] = seen(motion[::step], rate)
-            clean = seen(motion[::step], rate, noise=0.0)
-            found[f"CMU {subject} without noise, {rate:.0f} Hz"] = clean
-        found[f"CMU {subject} held still, {rate:.0f} Hz"] = seen(motion[[0] * HELD], rate)
+        motion = walking_motion(session, subject)
+        for step in STRIDES:
+            rate = CMU_RATE / step
+            result[f"CMU {subject}, {rate:.0f} Hz"] = simulate_clip(motion[::step], rate)
+            clean = simulate_clip(motion[::step], rate, noise=0.0)
+            result[f"CMU {subject} without noise, {rate:.0f} Hz"] = clean
+        result[f"CMU {subject} held still, {rate:.0f} Hz"] = simulate_clip(
+            motion[[0] * STILL_FRAMES], rate
+        )
     wheel, video = CACHE / WHEEL, session.data / VIDEO
     if wheel.exists():
         to_model = KeypointMap(BODY25B, HUMAN17)
         for view in read_session(wheel).views:
             clip = Clip(*to_model(view.points, view.confidence), RATE, view.truth)
-            found[f"pose2sim {view.camera.name}, {RATE:.0f} Hz"] = clip
+            result[f"pose2sim {view.camera.name}, {RATE:.0f} Hz"] = clip
     else:
         print(f"no {wheel}, so nothing is said of pose2sim; `make demo` fetches it")
     if video.exists():
-        found[f"{VIDEO}, {VIDEO_RATE:.0f} Hz"] = filmed(video)
-    return found
+        result[f"{VIDEO}, {VIDEO_RATE:.0f} Hz"] = video_clip(video)
+    return result
 
 
-def walk(session: Session, subject: str) -> Floats:
+def walking_motion(session: Session, subject: str) -> Floats:
     """Return the first trial of a subject (f, 17, 3) in mm, seen a little from above."""
     folder = session.data / "cmu"
     skeleton = read_asf(folder / subject / f"{subject}.asf")
@@ -112,7 +114,7 @@ def walk(session: Session, subject: str) -> Floats:
     return np.asarray(S @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]]))
 
 
-def seen(S: Floats, rate: float, noise: float = NOISE) -> Clip:
+def simulate_clip(S: Floats, rate: float, noise: float = NOISE) -> Clip:
     """Return what a detector would see of a motion S (f, 17, 3)."""
     rng = np.random.default_rng(0)
     size = np.sqrt((S * S).sum(2).mean())
@@ -123,7 +125,7 @@ def seen(S: Floats, rate: float, noise: float = NOISE) -> Clip:
     )
 
 
-def filmed(video: Path) -> Clip:
+def video_clip(video: Path) -> Clip:
     """Return the largest person in each frame of a video's detections."""
     points, confidence = [], []
     with gzip.open(video, "rt") as lines:
@@ -137,66 +139,66 @@ def filmed(video: Path) -> Clip:
     return Clip(*to_model(np.array(points), np.array(confidence)), VIDEO_RATE)
 
 
-def steadied(lifted: Lifted, rate: float, options: SmoothingOptions) -> Lifted:
+def smoothed(lifted: Lifted, rate: float, options: SmoothingOptions) -> Lifted:
     """Return one object's frames (n = f), as a filter answers them one by one."""
-    steady = Smoother(options)
-    answers = [
-        steady(Lifted(*(part[i : i + 1] for part in lifted)), ("0",), i / rate)[0]
+    smoothed_frames = Smoother(options)
+    outputs = [
+        smoothed_frames(Lifted(*(part[i : i + 1] for part in lifted)), ("0",), i / rate)[0]
         for i in range(len(lifted.residual))
     ]
-    return Lifted(*(np.concatenate(parts) for parts in zip(*answers, strict=True)))
+    return Lifted(*(np.concatenate(parts) for parts in zip(*outputs, strict=True)))
 
 
-def figures(lifted: Lifted, steady: Lifted, clip: Clip) -> dict[str, float]:
+def figures(lifted: Lifted, smoothed_frames: Lifted, clip: Clip) -> dict[str, float]:
     """Return the `FIGURES` of the answers `steady` of a filter to what was lifted."""
-    S, R = steady.shapes.astype(float), steady.rotations
+    S, R = smoothed_frames.shapes.astype(float), smoothed_frames.rotations
     S = S / np.sqrt((S * S).sum(2).mean(1))[:, None, None]
-    turns = rotation_angles(R[1:] @ R[:-1].swapaxes(1, 2))
+    angles = rotation_angles(R[1:] @ R[:-1].swapaxes(1, 2))
     shown: dict[str, float] = {
-        "rotation deg": float(np.nanmedian(turns)),
-        "points %": 100 * _middle(np.diff(S, axis=0)),
-        "shake %": 100 * _middle(np.diff(S, 2, axis=0)),
+        "rotation deg": float(np.nanmedian(angles)),
+        "points %": 100 * _median_length(np.diff(S, axis=0)),
+        "shake %": 100 * _median_length(np.diff(S, 2, axis=0)),
     }
     if not clip.noisy:
-        shown["lag ms"] = 1000 * lag(lifted.shapes, steady.shapes, clip.rate)
+        shown["lag ms"] = 1000 * lag(lifted.shapes, smoothed_frames.shapes, clip.rate)
     if clip.truth is not None:
-        shown |= errors(steady.shapes, clip.truth)
+        shown |= errors(smoothed_frames.shapes, clip.truth)
     return {name: float(value) for name, value in shown.items()}
 
 
 def errors(shapes: Floats, truth: Floats) -> Mapping[str, float]:
     """Return the errors of shapes (f, 17, 3) against the truth (f, 12, 3) in mm."""
     limbs = [HUMAN17.index(joint) for joint in JOINTS]
-    known = np.isfinite(truth).all((1, 2)) & np.isfinite(shapes).all((1, 2))
-    S, T = centre(shapes[known][:, limbs].astype(float)), centre(truth[known])
+    valid = np.isfinite(truth).all((1, 2)) & np.isfinite(shapes).all((1, 2))
+    S, T = centre(shapes[valid][:, limbs].astype(float)), centre(truth[valid])
     scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
-    apart = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
-    return {"error mm": procrustes_distances(S, T).mean(), "camera mm": apart.mean()}
+    distances = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
+    return {"error mm": procrustes_distances(S, T).mean(), "camera mm": distances.mean()}
 
 
 def lag(before: Floats, after: Floats, rate: float) -> float:
     """Return by how many seconds `after` (f, p, 3) comes later than `before`."""
-    known = np.isfinite(before).all((1, 2)) & np.isfinite(after).all((1, 2))
-    times = np.arange(len(before))[known] / rate
-    a, b = (X[known].reshape(known.sum(), -1) for X in (before, after))
-    inner = times >= times[0] + _LAGS[-1]
-    off = []
+    valid = np.isfinite(before).all((1, 2)) & np.isfinite(after).all((1, 2))
+    times = np.arange(len(before))[valid] / rate
+    a, b = (X[valid].reshape(valid.sum(), -1) for X in (before, after))
+    interior = times >= times[0] + _LAGS[-1]
+    residuals = []
     for delay in _LAGS:
-        places = (times[inner] - delay) * rate
-        low = np.clip(np.searchsorted(times, times[inner] - delay, "right") - 1, 0, len(a) - 2)
+        places = (times[interior] - delay) * rate
+        low = np.clip(np.searchsorted(times, times[interior] - delay, "right") - 1, 0, len(a) - 2)
         share = np.clip(places - times[low] * rate, 0, 1)[:, None]
-        off.append(np.square((1 - share) * a[low] + share * a[low + 1] - b[inner]).mean())
-    return float(_LAGS[int(np.argmin(off))])
+        residuals.append(np.square((1 - share) * a[low] + share * a[low + 1] - b[interior]).mean())
+    return float(_LAGS[int(np.argmin(residuals))])
 
 
-def _middle(steps: Floats) -> float:
+def _median_length(steps: Floats) -> float:
     """Return the median over frames of the mean length of steps (f, p, 3)."""
     return float(np.nanmedian(np.linalg.norm(steps, axis=2).mean(1)))
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    command(benchmark, __doc__, SUBJECTS, argv)
+    run_program(benchmark, __doc__, SUBJECTS, argv)
 
 
 if __name__ == "__main__":

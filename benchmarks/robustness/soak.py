@@ -24,6 +24,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
+from benchmarks.speed.timing import process_memory
 from deep_nrsfm_ros.commands.demo.client import lifter
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.lifting.lifter import Lifted
@@ -36,23 +37,17 @@ WINDOW = 10.0
 SETTLED = 3  # windows after which memory shall grow no more
 RELIABLE = {"reliability": "reliable", "history": "keep_all"}
 COLUMNS = "{:>8} {:>9} {:>7} {:>9} {:>8} {:>8} {:>8} {:>8} {:>8}"
-COUNTED = ("lifted", "without objects", "rejected", "dropped")
+COUNTERS = ("lifted", "without objects", "rejected", "dropped")
 
 
-def views(f: int, rng: np.random.Generator) -> NDArray[np.floating]:
+def random_views(f: int, rng: np.random.Generator) -> NDArray[np.floating]:
     """Return (f, 17, 2) pixels of a made-up object that deforms, seen by random cameras."""
     shapes = centre(rng.standard_normal((P, 3)) + 0.3 * rng.standard_normal((f, P, 3)))
-    seen: NDArray[np.floating] = 100 * (shapes @ random_cameras(f, rng)) + [320, 240]
-    return seen
+    pixels: NDArray[np.floating] = 100 * (shapes @ random_cameras(f, rng)) + [320, 240]
+    return pixels
 
 
-def memory(pid: int) -> float:
-    """Return the resident memory of a process in MB."""
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
-
-
-class Soak:
+class SoakClient:
     """A client that sends at a rate and measures the answers."""
 
     def __init__(self, points: NDArray[np.floating], rate: float) -> None:
@@ -65,22 +60,22 @@ class Soak:
             PointCloud2, "keypoints", QoSProfile(depth=1000)
         )
         self._node.create_subscription(
-            PointCloud2, "/lifter/points", self._take, QoSProfile(depth=1000)
+            PointCloud2, "/lifter/points", self._receive, QoSProfile(depth=1000)
         )
-        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._note, 10)
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._store_report, 10)
         self._messages = [_message(view) for view in points]
         self._period, self.sent, self.answered = 1 / rate, 0, 0
         self._number, self._last = 0, -1
         self._waiting: dict[int, float] = {}
         self._latencies: list[float] = []
-        self._reports, self._said = 0, dict.fromkeys(COUNTED, 0)
+        self._reports, self._reported = 0, dict.fromkeys(COUNTERS, 0)
         self._base = self.settle()
         self.sent = self.answered = 0
 
     @property
-    def counted(self) -> dict[str, int]:
+    def counters(self) -> dict[str, int]:
         """What the lifter has said since the start, by `COUNTED`."""
-        return {name: self._said[name] - self._base[name] for name in COUNTED}
+        return {name: self._reported[name] - self._base[name] for name in COUNTERS}
 
     def send(self, seconds: float) -> NDArray[np.floating]:
         """Send for so long; return the latencies (k) in ms of what was answered meanwhile."""
@@ -107,7 +102,7 @@ class Soak:
                 break
         before = self._reports
         self._spin(lambda: self._reports >= before + 2, seconds)  # the first may be of earlier
-        return dict(self._said)
+        return dict(self._reported)
 
     def call(self, service: str) -> str:
         """Call a service and return its answer; raise RuntimeError if it refuses."""
@@ -142,7 +137,7 @@ class Soak:
             self._executor.spin_once(timeout_sec=0.1)
         return condition()
 
-    def _take(self, message: PointCloud2) -> None:
+    def _receive(self, message: PointCloud2) -> None:
         """Note an answer; what was sent before it and has none will have none."""
         self._last = message.header.stamp.sec
         sent = self._waiting.get(self._last)
@@ -152,10 +147,10 @@ class Soak:
             self.answered += 1
             self._latencies.append((time.perf_counter() - sent) * 1e3)
 
-    def _note(self, message: DiagnosticArray) -> None:
+    def _store_report(self, message: DiagnosticArray) -> None:
         """Note what the lifter says of itself."""
-        said = {pair.key: pair.value for status in message.status for pair in status.values}
-        self._said = {name: int(said[f"messages {name}"]) for name in COUNTED}
+        reported = {pair.key: pair.value for status in message.status for pair in status.values}
+        self._reported = {name: int(reported[f"messages {name}"]) for name in COUNTERS}
         self._reports += 1
 
 
@@ -163,15 +158,15 @@ def _message(view: NDArray[np.floating]) -> PointCloud2:
     """Return keypoints (17, 2) as a message of its own."""
     zeros = np.zeros(1, np.float32)
     points = np.concatenate([view, np.zeros((P, 1))], -1)[None].astype(np.float32)
-    seen = Lifted(points, zeros, zeros, zeros, zeros, confidence=np.ones((1, P), np.float32))
-    return deserialize_message(point_cloud(Header(), seen), PointCloud2)
+    pixels = Lifted(points, zeros, zeros, zeros, zeros, confidence=np.ones((1, P), np.float32))
+    return deserialize_message(point_cloud(Header(), pixels), PointCloud2)
 
 
-def soak(given: argparse.Namespace, folder: Path) -> bool:
+def soak(args: argparse.Namespace, folder: Path) -> bool:
     """Run; return whether every message was counted and memory stayed."""
     rng = np.random.default_rng(0)
-    write_bag(folder / "bag", "/keypoints", frames(views(500, rng), np.ones((500, P))))
-    overrides = RELIABLE if given.reliable else {}
+    write_bag(folder / "bag", "/keypoints", frames(random_views(500, rng), np.ones((500, P))))
+    overrides = RELIABLE if args.reliable else {}
     parameters = {
         **{f"qos_overrides./keypoints.subscription.{k}": v for k, v in overrides.items()},
         "models_dir": str(folder / "models"),
@@ -179,7 +174,7 @@ def soak(given: argparse.Namespace, folder: Path) -> bool:
         "train.steps": 1_000_000,
         "train.activate": "false",
     }
-    titles = (
+    headings = (
         "minute",
         "training",
         "sent",
@@ -190,35 +185,39 @@ def soak(given: argparse.Namespace, folder: Path) -> bool:
         "max ms",
         "MB",
     )
-    print(COLUMNS.format(*titles))
-    grown, training = 0.0, False
+    print(COLUMNS.format(*headings))
+    growth, training = 0.0, False
     with lifter(parameters, folder / "log") as process:
-        client, windows = Soak(views(100, rng), given.rate), round(given.minutes * 60 / WINDOW)
+        client, windows = (
+            SoakClient(random_views(100, rng), args.rate),
+            round(args.minutes * 60 / WINDOW),
+        )
         settled = 0.0
         for i in range(windows):
-            wanted = bool(4 * i // windows % 2)  # off, on, off, on
-            if wanted != training:
-                client.call("/lifter/train" if wanted else "/lifter/cancel_training")
-                training = wanted
-            sent, answered, dropped = client.sent, client.answered, client.counted["dropped"]
+            should_train = bool(4 * i // windows % 2)  # off, on, off, on
+            if should_train != training:
+                client.call("/lifter/train" if should_train else "/lifter/cancel_training")
+                training = should_train
+            sent, answered, dropped = client.sent, client.answered, client.counters["dropped"]
             ms = client.send(WINDOW)
-            now = memory(process.pid)
+            now = process_memory(process.pid)
             settled = now if i == min(SETTLED, windows - 1) else settled
-            grown = now - settled if settled else 0.0
+            growth = now - settled if settled else 0.0
             figures = (*np.percentile(ms, (50, 99)), ms.max(), now)
-            lost = client.counted["dropped"] - dropped
-            counts = (client.sent - sent, client.answered - answered, lost)
+            new_dropped = client.counters["dropped"] - dropped
+            counts = (client.sent - sent, client.answered - answered, new_dropped)
             row = (f"{(i + 1) * WINDOW / 60:.1f}", "on" if training else "off", *counts)
             print(COLUMNS.format(*row, *(f"{figure:.2f}" for figure in figures)), flush=True)
         client.settle()
         client.close()
-    uncounted = client.sent - sum(client.counted.values())
-    said = ", ".join(f"{count} {name}" for name, count in client.counted.items())
+    uncounted = client.sent - sum(client.counters.values())
+    reported = ", ".join(f"{count} {name}" for name, count in client.counters.items())
     print(
-        f"{client.sent} sent: {said}, {uncounted} not counted; {client.answered} answers came back"
+        f"{client.sent} sent: {reported}, {uncounted} not counted; "
+        f"{client.answered} answers came back"
     )
-    print(f"memory grew by {grown:.1f} MB")
-    return not uncounted and grown < given.growth
+    print(f"memory grew by {growth:.1f} MB")
+    return not uncounted and growth < args.growth
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -230,9 +229,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--reliable", action="store_true", help="queue what comes while another is lifted"
     )
     parser.add_argument("--growth", type=float, default=5.0, help="MB that memory may grow")
-    given = parser.parse_args(argv)
+    args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder:
-        sys.exit(0 if soak(given, Path(folder)) else 1)
+        sys.exit(0 if soak(args, Path(folder)) else 1)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How fast bags become a dataset, against rosbags that only decodes their messages."""
+"""Messages per second read from bags into a dataset, against rosbags alone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.speed.timing import arguments, by_turns, on_one_thread, show
+from benchmarks.speed.timing import interleaved, print_and_write, require_one_thread, speed_parser
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.bags import STORAGES, frames, read_bags, write_bag
 from deep_nrsfm_ros.data.read_options import ReadOptions
@@ -23,7 +23,7 @@ _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 def decode(bag: Path) -> int:
-    """Decode every message of a bag, and keep none; return how many there are."""
+    """Decode every message of a bag without keeping it; return the number of messages."""
     count = 0
     with Reader(bag) as reader:
         for connection, _, raw in reader.messages():
@@ -32,17 +32,17 @@ def decode(bag: Path) -> int:
     return count
 
 
-def benchmark(given: Namespace) -> Iterator[Table]:
-    """Write a bag of each storage and read it, by turns."""
-    messages, rounds = (500, 1) if given.quick else (50_000, 5)
+def benchmark(args: Namespace) -> Iterator[Table]:
+    """Write a bag of each storage and read it by both readers, interleaved."""
+    messages, rounds = (500, 1) if args.quick else (50_000, 5)
     table = Table(
         "bag_reading",
         f"Reading a bag of {messages} PointCloud2 messages of {len(CMU31)} keypoints",
         ("storage", "by"),
         ("messages/s", "share"),
         {
-            BARE: "Reader.messages and deserialize_cdr, nothing kept",
-            OURS: "into a dataset: decoded, checked, mapped to a layout",
+            BARE: "Reader.messages and deserialize_cdr; results are discarded",
+            OURS: "into a dataset: decoded, checked and mapped to a layout",
             "share": f"of the messages/s of {BARE}",
         },
         bars("messages/s"),
@@ -53,8 +53,8 @@ def benchmark(given: Namespace) -> Iterator[Table]:
         for storage in STORAGES:
             bag = Path(folder) / storage
             write_bag(bag, TOPIC, frames(points, np.ones(points.shape[:2])), storage)
-            took = by_turns(readers(bag), rounds, 0, warm_up=1)
-            rates = {by: messages / np.median(seconds) for by, seconds in took.items()}
+            durations = interleaved(readers(bag), rounds, 0, warm_up=1)
+            rates = {by: messages / np.median(seconds) for by, seconds in durations.items()}
             for by, rate in rates.items():
                 figures = {"messages/s": float(rate), "share": float(rate / rates[BARE])}
                 table.add((storage, by), figures)
@@ -62,7 +62,7 @@ def benchmark(given: Namespace) -> Iterator[Table]:
 
 
 def readers(bag: Path) -> dict[str, Callable[[], int]]:
-    """Return both ways to read a bag; each returns how many messages it read."""
+    """Return reader -> function that reads the bag and returns the number of messages."""
 
     def ours() -> int:
         return read_bags([bag], CMU31, CMU31, ReadOptions(TOPIC)).messages
@@ -72,10 +72,10 @@ def readers(bag: Path) -> dict[str, Callable[[], int]]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    given = arguments(__doc__).parse_args(argv)
-    show(benchmark(given), given.output)
+    args = speed_parser(__doc__).parse_args(argv)
+    print_and_write(benchmark(args), args.output)
 
 
 if __name__ == "__main__":
-    on_one_thread()
+    require_one_thread()
     main()

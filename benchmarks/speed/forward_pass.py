@@ -1,4 +1,4 @@
-"""One pass of the network: compiled and in NumPy, against torch and ONNX Runtime."""
+"""One pass of the network, compiled and in NumPy, against torch and ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from benchmarks.speed.plain_torch import PlainNetwork
-from benchmarks.speed.timing import arguments, by_turns, on_one_thread, show
+from benchmarks.speed.timing import interleaved, print_and_write, require_one_thread, speed_parser
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.model_files.folders import model_folders
@@ -27,22 +27,22 @@ BATCHES = (1, 100)
 OURS = "ours, compiled"
 ONNX = "ONNX Runtime"
 LEGEND = {
-    "p50 us": "median of a call, one thread",
-    "ratio": f"to {OURS}: above 1 is slower than ours",
-    OURS: "one pass as the lifter makes it, which normalises, checks and rates its result as well: "
-    "the whole Lifter but for further turns and the correction",
-    "NumPy": "our code on arrays, the pass alone: the lifter's way where nothing could be compiled",
-    "torch eager, torch.jit": "our code on tensors, without gradient; traced",
-    "torch eager, convolutions": "each layer as the paper writes it, the camera by an SVD",
-    ONNX: "our code, exported by torch.onnx; `pip install '.[speed]'` brings it",
-    "Lifter": "the whole call, with the three turns of the input and the correction",
+    "p50 us": "median time of a call, one thread",
+    "ratio": f"to {OURS}; above 1 is slower",
+    OURS: "one pass as the lifter makes it, with normalisation, checks and confidence; without "
+    "test-time rotations and correction",
+    "NumPy": "our code on arrays, the pass alone; the lifter uses it where there was no compiler",
+    "torch eager, torch.jit": "our code on tensors, without gradient; the same traced",
+    "torch eager, convolutions": "each layer as the paper writes it, the camera from an SVD",
+    ONNX: "our code, exported by torch.onnx; install with `pip install '.[speed]'`",
+    "Lifter": "the whole call, with three test-time rotations and the correction",
     "paper": "the paper's 12 dictionaries with random weights; default: the model cmu31",
 }
 Call = Callable[[], object]
 
 
 class _Module(nn.Module):
-    """Our code as a module of torch."""
+    """Our network as a torch module."""
 
     def __init__(self, net: Network) -> None:
         super().__init__()
@@ -54,40 +54,40 @@ class _Module(nn.Module):
 
 
 def passes(net: Network, W: NDArray[np.float32]) -> dict[str, Call]:
-    """Return what computes the same: shapes and cameras of W (b, p, 2); ONNX if it is there."""
+    """Return name -> function that computes shapes and cameras of W (b, p, 2)."""
     x, ours, convolutions = torch.from_numpy(W), _Module(net).eval(), PlainNetwork(net).eval()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch.jit is on its way out; still the fastest in torch
+        warnings.simplefilter("ignore")  # torch.jit is deprecated but the fastest in torch
         traced: Any = torch.jit.freeze(torch.jit.trace(ours, (x,)))
-    found: dict[str, Call] = {
+    calls: dict[str, Call] = {
         "NumPy": lambda: forward(net, W),
         "torch eager": lambda: ours(x),
         "torch eager, convolutions": lambda: convolutions(x),
         "torch.jit": lambda: traced(x),
     }
     if session := _onnx_session(ours, x):
-        found[ONNX] = lambda: session.run(None, {"W": W})
-    return found
+        calls[ONNX] = lambda: session.run(None, {"W": W})
+    return calls
 
 
 def _onnx_session(module: nn.Module, x: Tensor) -> Any:
-    """Return the module in ONNX Runtime, None where that is not installed."""
+    """Return an ONNX Runtime session of the module, None if it is not installed."""
     try:
         import onnxruntime
-        import onnxscript  # noqa: F401  the exporter's
+        import onnxscript  # noqa: F401  needed by the exporter
     except ModuleNotFoundError:
         return None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporter about itself
+        warnings.simplefilter("ignore")  # warnings of the exporter
         path = Path(folder) / "network.onnx"
         torch.onnx.export(module, (x,), path, dynamo=True, input_names=["W"], verbose=False)
         return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
 
 def models() -> dict[str, Model]:
-    """Return the models that are timed, by the name of their architecture."""
+    """Return architecture -> model to time."""
     default = load_model(find_model("cmu31", model_folders(Path("models"))))
     architecture, normaliser, _ = PRESETS["paper"]
     p = len(default.layout)
@@ -99,9 +99,9 @@ def models() -> dict[str, Model]:
 
 
 @torch.no_grad()
-def benchmark(given: Namespace) -> Iterator[Table]:
-    """Time the passes and the lifters, in turns."""
-    rounds, seconds = (1, 0.005) if given.quick else (5, 0.4)
+def benchmark(args: Namespace) -> Iterator[Table]:
+    """Time the passes and the lifters, interleaved; yield the table."""
+    rounds, seconds = (1, 0.005) if args.quick else (5, 0.4)
     table = Table(
         "forward_pass",
         "One pass of the network, and the whole Lifter",
@@ -115,11 +115,13 @@ def benchmark(given: Namespace) -> Iterator[Table]:
         for batch in BATCHES:
             W = rng.standard_normal((batch, len(model.layout), 2)).astype(np.float32)
             W -= W.mean(1, keepdims=True)
-            sure = np.ones(W.shape[:2], np.float32)
-            once = Lifter(model, LiftingOptions(test_time_rotations=1, correction="none"))
-            contenders = {OURS: _call(once, W, sure), **passes(model.network, W)}
-            contenders["Lifter"] = _call(Lifter(model), W, sure)
-            p50 = {n: 1e6 * np.median(t) for n, t in by_turns(contenders, rounds, seconds).items()}
+            confidence = np.ones(W.shape[:2], np.float32)
+            single_pass = Lifter(model, LiftingOptions(test_time_rotations=1, correction="none"))
+            contenders = {OURS: _call(single_pass, W, confidence), **passes(model.network, W)}
+            contenders["Lifter"] = _call(Lifter(model), W, confidence)
+            p50 = {
+                n: 1e6 * np.median(t) for n, t in interleaved(contenders, rounds, seconds).items()
+            }
             for by, us in p50.items():
                 figures = {"p50 us": float(us), "ratio": float(us / p50[OURS])}
                 table.add((name, str(batch), by), figures)
@@ -128,17 +130,17 @@ def benchmark(given: Namespace) -> Iterator[Table]:
     yield table
 
 
-def _call(lifter: Lifter, W: NDArray[np.float32], sure: NDArray[np.float32]) -> Call:
-    return lambda: lifter.lift(W, sure)
+def _call(lifter: Lifter, W: NDArray[np.float32], confidence: NDArray[np.float32]) -> Call:
+    return lambda: lifter.lift(W, confidence)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    given = arguments(__doc__).parse_args(argv)
+    args = speed_parser(__doc__).parse_args(argv)
     torch.set_num_threads(1)
-    show(benchmark(given), given.output)
+    print_and_write(benchmark(args), args.output)
 
 
 if __name__ == "__main__":
-    on_one_thread()
+    require_one_thread()
     main()

@@ -1,8 +1,8 @@
-"""Where the microseconds of one message go: the lifter's own functions, timed as it calls them.
+"""Time of each step of one message, in microseconds.
 
-A lifter in this process is handed serialised messages; its answers go over DDS to another
-process. What waiting for a message and taking it from DDS cost is not in it: that is the relay's
-share in `benchmarks.speed.latency`.
+A lifter in this process receives serialised messages; its answers go over DDS to another process.
+Waiting for a message and taking it from DDS are not included; `benchmarks.speed.latency` measures
+them with the relay.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from unittest import mock
 import numpy as np
 import rclpy
 
-from benchmarks.speed.round_trip import keypoints
-from benchmarks.speed.timing import arguments, fresh_domain, on_one_thread, show
+from benchmarks.speed.round_trip import serialised_keypoints
+from benchmarks.speed.timing import print_and_write, random_domain, require_one_thread, speed_parser
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.client import node
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -33,162 +33,168 @@ from deep_nrsfm_ros.node import lifter, publishing
 
 OBJECTS = (1, 5, 20)
 STEPS: dict[str, tuple[tuple[Any, str], ...]] = {
-    "read": ((MessageReader, "__call__"),),
+    "decode": ((MessageReader, "__call__"),),
     "map": ((KeypointMap, "__call__"),),
     "lift": ((lifting.Lifter, "__call__"),),
-    "steady (off)": ((Smoother, "__call__"),),
-    "build": ((publishing, "point_cloud"), (publishing, "camera_rotation")),
+    "smooth (off)": ((Smoother, "__call__"),),
+    "serialise": ((publishing, "point_cloud"), (publishing, "camera_rotation")),
 }
-"""Each step and the functions that are it, less what they call of other steps."""
-PUBLISH, REST = "publish", "the rest of the node"
-SUM, WHOLE, SHARE = "sum", "whole, nothing else timed", "sum / whole"
+"""Step -> its functions; the time of other steps that they call is subtracted."""
+PUBLISH, REST = "publish", "rest of the node"
+SUM, TOTAL, SUM_TO_TOTAL = "sum", "total, without step timers", "sum / total"
 
 
 class Stopwatch:
-    """Adds up the seconds spent in each step, without those in steps that it calls."""
+    """Sums the seconds spent in each step, without the steps that it calls.
+
+    Attributes:
+        seconds: step -> seconds.
+    """
 
     def __init__(self) -> None:
-        """Start with nothing."""
+        """Start at zero."""
         self.seconds: dict[str, float] = {}
         self._inner = [0.0]
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
-        """Count the time inside for a step."""
+        """Add the time within the context to a step."""
         self._inner.append(0.0)
         began = time.perf_counter()
         try:
             yield
         finally:
-            took = time.perf_counter() - began
-            self.seconds[step] = self.seconds.get(step, 0.0) + took - self._inner.pop()
-            self._inner[-1] += took
+            elapsed = time.perf_counter() - began
+            self.seconds[step] = self.seconds.get(step, 0.0) + elapsed - self._inner.pop()
+            self._inner[-1] += elapsed
 
-    def around(self, step: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the function, its calls timed."""
+    def wrapped(self, step: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function with timed calls."""
 
-        def call(*args: Any, **named: Any) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
             with self.timed(step):
-                return function(*args, **named)
+                return function(*args, **kwargs)
 
         return call
 
-    def watch(self, stack: ExitStack, step: str, owner: Any, name: str) -> None:
-        """Time what `owner` knows as `name` until the stack is left."""
-        patched = self.around(step, getattr(owner, name))
+    def patch(self, stack: ExitStack, step: str, owner: Any, name: str) -> None:
+        """Time the attribute `name` of `owner` until the stack closes."""
+        patched = self.wrapped(step, getattr(owner, name))
         stack.enter_context(mock.patch.object(owner, name, patched))
 
 
-class Lifter:
-    """A lifter in this process, with someone in another who listens."""
+class InProcessLifter:
+    """A lifter node in this process; another process subscribes to it."""
 
     def __init__(self) -> None:
-        """Load the model; `run` takes messages."""
+        """Create the node and load its model."""
         self._node: Any = lifter.LifterNode()
         ((self._source, _),) = self._node._keypoint_topics._subscribed.values()
         self.publishers = (self._node._points, self._node._rotation)
         self.published: list[Any] = []
 
-    def run(self, raw: bytes) -> None:
-        """Lift a message, as the executor would have the node do it."""
+    def lift(self, raw: bytes) -> None:
+        """Lift a serialised message, as the executor calls the node."""
         self._node._lift(self._source, raw)
 
-    def run_watched(self, raw: bytes, watch: Stopwatch) -> None:
-        """Lift a message, timed."""
-        with watch.timed(REST):
-            self.run(raw)
+    def lift_timed(self, raw: bytes, stopwatch: Stopwatch) -> None:
+        """Lift a serialised message with timed steps."""
+        with stopwatch.timed(REST):
+            self.lift(raw)
 
-    def meet(self) -> None:
-        """Wait until someone listens to the points."""
+    def wait_for_subscriber(self) -> None:
+        """Wait for a subscriber to the points; raise TimeoutError after 60 s."""
         deadline = time.monotonic() + 60
         while not self.publishers[0].get_subscription_count():
             if time.monotonic() > deadline:
-                raise TimeoutError("nobody listens")
+                raise TimeoutError("no subscriber within 60 s")
             time.sleep(0.05)
 
     def close(self) -> None:
-        """End it."""
+        """Destroy the node."""
         self._node.close()
         self._node.destroy_node()
 
 
-def measure(subject: Lifter, raw: bytes, rounds: int, calls: int) -> dict[str, float]:
-    """Return the microseconds of each step, of their sum and of the whole: medians over rounds."""
+def measure(
+    lifter_under_test: InProcessLifter, raw: bytes, rounds: int, calls: int
+) -> dict[str, float]:
+    """Return the microseconds of each step, of their sum and of the total: medians of rounds."""
     rows: list[dict[str, float]] = []
     for _ in range(rounds):
         began = time.perf_counter()
         for _ in range(calls):
-            subject.run(raw)
-        whole = time.perf_counter() - began
-        watch = Stopwatch()
+            lifter_under_test.lift(raw)
+        totals = time.perf_counter() - began
+        stopwatch = Stopwatch()
         with ExitStack() as stack:
             for step, functions in STEPS.items():
                 for owner, name in functions:
-                    watch.watch(stack, step, owner, name)
-            for publisher in subject.publishers:
-                watch.watch(stack, PUBLISH, publisher, "publish")
+                    stopwatch.patch(stack, step, owner, name)
+            for publisher in lifter_under_test.publishers:
+                stopwatch.patch(stack, PUBLISH, publisher, "publish")
             for _ in range(calls):
-                subject.run_watched(raw, watch)
+                lifter_under_test.lift_timed(raw, stopwatch)
         order = (*STEPS, PUBLISH, REST)
-        row = {step: 1e6 * watch.seconds[step] / calls for step in order}
-        row |= {SUM: sum(row.values()), WHOLE: 1e6 * whole / calls}
+        row = {step: 1e6 * stopwatch.seconds[step] / calls for step in order}
+        row |= {SUM: sum(row.values()), TOTAL: 1e6 * totals / calls}
         rows.append(row)
     return {step: float(np.median([row[step] for row in rows])) for step in rows[0]}
 
 
-def tabulate(found: dict[int, dict[str, float]]) -> Table:
-    """Return the table of microseconds by number of objects: step -> time."""
-    names = [f"{objects} object{'s' * (objects > 1)}" for objects in found]
+def tabulate(results: dict[int, dict[str, float]]) -> Table:
+    """Return the table of number of objects -> step -> microseconds."""
+    names = [f"{objects} object{'s' * (objects > 1)}" for objects in results]
     table = Table(
         "latency_breakdown",
-        "Where the microseconds of one message go: model cmu31, 31 keypoints",
+        "Time of each step of one message: model cmu31, 31 keypoints",
         ("step",),
         (*names, *(f"{name} %" for name in names)),
         {
-            "columns": "us, and their share of the sum, by the number of objects in a message",
-            "steps": "without what they call of other steps; mean of a run, median of the runs",
-            "read": "from serialised bytes, a message like the one before it",
-            "build": "serialised",
-            SHARE: "above 1: what the timing itself costs",
+            "columns": "microseconds and percent of the sum, by the number of objects in a message",
+            "steps": "without the steps that they call; mean of a round, median of the rounds",
+            "decode": "from serialised bytes, a message of a known kind",
+            "serialise": "the answers",
+            SUM_TO_TOTAL: "above 1: the cost of the step timers",
         },
         bars(*names),
     )
-    whole = dict(zip(names, found.values(), strict=True))
-    for step in next(iter(found.values())):
-        figures = {name: times[step] for name, times in whole.items()}
-        if step not in (SUM, WHOLE):
-            figures |= {f"{n} %": 100 * times[step] / times[SUM] for n, times in whole.items()}
+    totals = dict(zip(names, results.values(), strict=True))
+    for step in next(iter(results.values())):
+        figures = {name: times[step] for name, times in totals.items()}
+        if step not in (SUM, TOTAL):
+            figures |= {f"{n} %": 100 * times[step] / times[SUM] for n, times in totals.items()}
         table.add((step,), figures)
-    table.add((SHARE,), {name: times[SUM] / times[WHOLE] for name, times in whole.items()})
+    table.add((SUM_TO_TOTAL,), {name: times[SUM] / times[TOTAL] for name, times in totals.items()})
     return table
 
 
-def benchmark(given: Namespace) -> Iterator[Table]:
-    """Run a lifter here and someone who listens to it elsewhere."""
-    rounds, calls = (1, 5) if given.quick else (25, 100)
-    os.environ["ROS_DOMAIN_ID"] = str(fresh_domain())
+def benchmark(args: Namespace) -> Iterator[Table]:
+    """Measure a lifter in this process, with a relay node as its subscriber."""
+    rounds, calls = (1, 5) if args.quick else (25, 100)
+    os.environ["ROS_DOMAIN_ID"] = str(random_domain())
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         parameters = {"input": "/lifter/points"}
         stack.enter_context(node("benchmarks.speed.relay_node", parameters, Path(name) / "log"))
         rclpy.init(args=["--ros-args", "-p", "model:=cmu31"])
         stack.callback(rclpy.try_shutdown)
-        subject = Lifter()
-        stack.callback(subject.close)
-        subject.meet()
-        found = {}
+        lifter_under_test = InProcessLifter()
+        stack.callback(lifter_under_test.close)
+        lifter_under_test.wait_for_subscriber()
+        results = {}
         for objects in OBJECTS:
-            raw = keypoints(objects, len(CMU31))
-            subject.run(raw)  # the first call is slow
-            found[objects] = measure(subject, raw, rounds, calls)
-    yield tabulate(found)
+            raw = serialised_keypoints(objects, len(CMU31))
+            lifter_under_test.lift(raw)  # warm up
+            results[objects] = measure(lifter_under_test, raw, rounds, calls)
+    yield tabulate(results)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    given = arguments(__doc__).parse_args(argv)
-    show(benchmark(given), given.output)
+    args = speed_parser(__doc__).parse_args(argv)
+    print_and_write(benchmark(args), args.output)
 
 
 if __name__ == "__main__":
-    on_one_thread()
+    require_one_thread()
     main()

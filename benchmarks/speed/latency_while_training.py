@@ -1,10 +1,9 @@
-"""Latency of the lifter, idle and while it trains, over DDS: how much a training disturbs it."""
+"""Latency of the lifter over DDS, idle and during a training."""
 
 from __future__ import annotations
 
 import argparse
 import os
-import random
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.speed.timing import random_domain
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.layouts.presets import HUMAN17
@@ -24,7 +24,7 @@ PERCENTILES = (50.0, 99.0)
 
 
 def write_keypoints(bag: Path, rate: float, seconds: float) -> None:
-    """Write keypoints of an object that deforms at random; their values cost no time."""
+    """Write keypoints of a randomly deforming object; the values do not change the time."""
     rng = np.random.default_rng(0)
     f, p = round(rate * seconds), len(HUMAN17)
     shapes = centre(rng.standard_normal((p, 3)) + 0.3 * rng.standard_normal((f, p, 3)))
@@ -34,7 +34,7 @@ def write_keypoints(bag: Path, rate: float, seconds: float) -> None:
 
 @contextmanager
 def connected(folder: Path) -> Iterator[Client]:
-    """Yield a client of a lifter that will train on the bag in the folder, without an end."""
+    """Yield a client of a lifter whose training on the bag in `folder` does not end."""
     bag = folder / "keypoints"
     parameters = {
         "models_dir": folder,
@@ -52,9 +52,9 @@ def connected(folder: Path) -> Iterator[Client]:
 
 
 def measure(folder: Path, rounds: int) -> dict[str, list[Played]]:
-    """Play the bag so many times idle, then as often while it trains."""
+    """Play the bag `rounds` times idle, then `rounds` times during a training."""
     with connected(folder) as client:
-        client.play(CAMERA)  # the first answers are slow
+        client.play(CAMERA)  # warm up
         idle = [client.play(CAMERA) for _ in range(rounds)]
         client.train()
         while client.training["state"] != "training":
@@ -65,30 +65,28 @@ def measure(folder: Path, rounds: int) -> dict[str, list[Played]]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command; exit code 1 says that the lifter failed."""
+    """Run the command; exit code 1 if the lifter failed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rate", type=float, default=60.0, help="messages a second")
+    parser.add_argument("--rate", type=float, default=60.0, help="messages per second")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a round")
     parser.add_argument("--rounds", type=int, default=3)
-    given = parser.parse_args(argv)
-    # A domain of its own, and never beyond this machine.
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(random.randrange(1, 102))
+    args = parser.parse_args(argv)
+    os.environ["ROS_DOMAIN_ID"] = str(random_domain())
     with TemporaryDirectory() as name:
         folder = Path(name)
-        write_keypoints(folder / "keypoints", given.rate, given.seconds)
+        write_keypoints(folder / "keypoints", args.rate, args.seconds)
         try:
-            measured = measure(folder, given.rounds)
+            measured = measure(folder, args.rounds)
         except DemoError as error:
             sys.exit(f"failed: {error}\n{(folder / 'log').read_text()}")
-    found = {}
+    percentiles = {}
     print("| | sent | answered | p50 ms | p99 ms |\n|---|---|---|---|---|")
     for name, rounds in measured.items():
         latencies = 1e3 * np.concatenate([played.latencies for played in rounds])
         sent = sum(len(played.stamps) for played in rounds)
-        p50, p99 = found[name] = np.percentile(latencies, PERCENTILES)
+        p50, p99 = percentiles[name] = np.percentile(latencies, PERCENTILES)
         print(f"| {name} | {sent} | {len(latencies)} | {p50:.2f} | {p99:.2f} |")
-    ratio = found["training"] / found["idle"]
+    ratio = percentiles["training"] / percentiles["idle"]
     print(f"| training / idle | | | {ratio[0]:.2f} | {ratio[1]:.2f} |")
 
 

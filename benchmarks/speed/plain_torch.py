@@ -1,15 +1,15 @@
-"""The paper's network and losses in torch as the paper writes them: what ours is measured against.
+"""The paper's network and losses in plain torch: the reference of the benchmarks.
 
-Each layer is a convolution, or its transpose, over k blocks of 3 x 2; the camera comes from an
-SVD; autograd finds the gradient. All points are visible. Same weights, same results as
-`network.forward`.
+Each layer is a convolution, or its transpose, over k blocks of 3 x 2. The camera comes from an SVD,
+the gradient from autograd. All keypoints are visible. With the same weights the results are those
+of `network.forward`.
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F  # noqa: N812  as everybody calls it
+from torch.nn import functional as F  # noqa: N812  the usual name
 
 from deep_nrsfm_ros.nrsfm.geometry import polar
 from deep_nrsfm_ros.nrsfm.losses import frobenius
@@ -24,7 +24,7 @@ class PlainNetwork(nn.Module):
     L_inverse: Tensor
 
     def __init__(self, net: Network) -> None:
-        """Take over the weights of `net`, NumPy or torch."""
+        """Copy the weights of `net`, NumPy or torch."""
         super().__init__()
         net = net.map(torch.as_tensor)
         first, *others = net.D
@@ -58,10 +58,10 @@ class PlainNetwork(nn.Module):
 
 
 class PlainTraining:
-    """The same losses by two passes of the network, and torch's Adam."""
+    """Training by two passes of the network and torch's Adam."""
 
     def __init__(self, net: Network, points: Tensor, preset: Preset) -> None:
-        """Begin to train a `PlainNetwork` of `net` on points (f, p, 2)."""
+        """Prepare to train a `PlainNetwork` of `net` on points (f, p, 2)."""
         self.net, self.points, self.preset = PlainNetwork(net), points, preset
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=preset.recipe.learning_rate)
 
@@ -73,7 +73,7 @@ class PlainTraining:
         self.optimiser.step()
 
     def loss(self, points: Tensor) -> Tensor:
-        """Return the loss of points (b, p, 2): reprojection, and cycle where the recipe has it."""
+        """Return the loss of points (b, p, 2): reprojection and, if in the recipe, cycle."""
         W = self._normalised(points)
         S, M = self.net(W)
         residual = W - (S @ M - (S @ M).mean(-2, keepdim=True))

@@ -1,7 +1,7 @@
-"""The floor under any lifter in Python: a node that hears keypoints and sends them back.
+"""A node that publishes each message again: the lower bound of the latency of a node in Python.
 
-It receives a PointCloud2 on `keypoints` and publishes it again on ~/points, with a quaternion on
-~/camera_rotation: what ROS costs, and nothing else. The parameter `input` names another topic.
+It receives a PointCloud2 on `keypoints` and publishes it on ~/points, with a quaternion on
+~/camera_rotation. The parameter `input` names another topic.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from sensor_msgs.msg import PointCloud2
 
 
 class RelayNode(Node):
-    """Sends back what it hears."""
+    """Publishes each received message again."""
 
     def __init__(self) -> None:
-        """Begin to listen, by the quality of service of the lifter."""
+        """Subscribe with the quality of service of the lifter."""
         super().__init__("relay")
         self._points = self.create_publisher(PointCloud2, "~/points", 10)
         self._rotation = self.create_publisher(QuaternionStamped, "~/camera_rotation", 10)
@@ -41,7 +41,7 @@ def main() -> None:
     """Run the node until a signal."""
     rclpy.init()
     try:
-        # As the lifter does: rclpy.spin takes the same executor.
+        # The same executor as the lifter.
         executor = SingleThreadedExecutor()
         executor.add_node(RelayNode())
         executor.spin()

@@ -1,7 +1,7 @@
 """A node in a process of its own, and a client that sends it keypoints and times the answers.
 
-Each node has a DDS domain of its own, so that several are alive at once, measured by turns, and
-never hear each other.
+Each node has a DDS domain of its own, so that several run at once without hearing each other and
+are measured in alternating rounds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
-from benchmarks.speed.timing import environment, fresh_domain
+from benchmarks.speed.timing import environment, process_memory, random_domain
 from deep_nrsfm_ros.commands.demo.client import node
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.serialised import Header
@@ -35,16 +35,18 @@ LOSSLESS = {
     "qos_overrides./keypoints.subscription.reliability": "reliable",
     "qos_overrides./keypoints.subscription.history": "keep_all",
 }
-"""Parameters of a node that shall lose nothing."""
+"""Parameters of a node with a lossless subscription."""
 PROMPT_DISCOVERY = Path(__file__).parents[2] / "config" / "prompt_discovery.xml"
-"""By which the client makes itself known: else a start takes 3 s longer, or not, by luck."""
+"""Discovery settings of the client; without them a start sometimes takes 3 s longer."""
 
 
-class Played(NamedTuple):
-    """What came of messages that were sent at a rate.
+class RoundTrips(NamedTuple):
+    """The result of sending messages at a rate.
 
-    sent: how many. seconds: that sending took. latencies: (k,) seconds from publishing until both
-    answers were there, of those answered.
+    Attributes:
+        sent: number of messages.
+        seconds: duration of sending.
+        latencies: (k,) seconds from publishing until both answers had arrived, of the answered.
     """
 
     sent: int
@@ -52,39 +54,41 @@ class Played(NamedTuple):
     latencies: NDArray[np.float64]
 
 
-def keypoints(objects: int, p: int) -> bytes:
-    """Return a serialised message of objects of p keypoints that no model knows."""
+def serialised_keypoints(objects: int, p: int) -> bytes:
+    """Return a serialised PointCloud2 of `objects` random objects with p keypoints each."""
     rng = np.random.default_rng(0)
     shapes = centre(rng.standard_normal((objects, p, 3)))
     points = np.zeros((objects, p, 3), np.float32)
     points[..., :2] = 100 * (shapes @ random_cameras(objects, rng)) + [320, 240]
     zeros = np.zeros(objects, np.float32)
-    seen = Lifted(points, zeros, zeros, zeros, zeros, np.ones((objects, p), np.float32))
-    return point_cloud(Header(frame_id="camera"), seen)
+    message = Lifted(points, zeros, zeros, zeros, zeros, np.ones((objects, p), np.float32))
+    return point_cloud(Header(frame_id="camera"), message)
 
 
 class Client:
-    """Sends messages to one node and hears its answers, serialised: that costs the least."""
+    """Sends serialised messages to one node and receives its serialised answers."""
 
     def __init__(self, name: str, domain: int) -> None:
-        """Talk to the node called `name` in a domain."""
+        """Create the client of the node `name` in a DDS domain."""
         self._context = rclpy.Context()
         rclpy.init(
             context=self._context,
             domain_id=domain,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        # For the client alone: the node that is measured is as its users have it.
+        # For the client only: the measured node runs with the default settings.
         with environment(FASTRTPS_DEFAULT_PROFILES_FILE=str(PROMPT_DISCOVERY)):
             self._node = rclpy.create_node(f"client_of_{name}", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._publisher = self._node.create_publisher(PointCloud2, "keypoints", KEEP_ALL)
         for kind, topic in ((PointCloud2, "points"), (QuaternionStamped, "camera_rotation")):
-            self._node.create_subscription(kind, f"/{name}/{topic}", self._take, KEEP_ALL, raw=True)
+            self._node.create_subscription(
+                kind, f"/{name}/{topic}", self._receive, KEEP_ALL, raw=True
+            )
         self._number, self._answers = 0, 0
         self._sent: dict[int, float] = {}
-        self._half: set[int] = set()
+        self._half_answered: set[int] = set()
         self._latencies: list[float] = []
 
     def close(self) -> None:
@@ -94,9 +98,10 @@ class Client:
         rclpy.shutdown(context=self._context)
 
     def meet(self, raw: bytes) -> float:
-        """Send a message now and then until one is answered; return time.perf_counter() then.
+        """Send messages until one is answered; return the time.perf_counter() of the answer.
 
-        Raises TimeoutError if none is.
+        Raises:
+            TimeoutError: no answer within `DEADLINE` seconds.
         """
         deadline, answers = time.perf_counter() + DEADLINE, self._answers
         while self._answers == answers:
@@ -104,50 +109,56 @@ class Client:
                 raise TimeoutError("the node has answered nothing")
             self._send(raw)
             self._spin(time.perf_counter() + 0.01, until_answered=True)
-        met = time.perf_counter()
-        self._spin(met + 0.5)  # what is still under way
-        return met
+        answered_at = time.perf_counter()
+        self._spin(answered_at + 0.5)  # receive the remaining answers
+        return answered_at
 
-    def play(self, raw: bytes, rate: float, seconds: float, grace: float = 0.5) -> Played:
-        """Send a message `rate` times a second; hear answers until `grace` seconds after."""
+    def play(self, raw: bytes, rate: float, seconds: float, grace: float = 0.5) -> RoundTrips:
+        """Send a message `rate` times per second; receive answers until `grace` seconds later."""
         self._sent.clear()
-        self._half.clear()
+        self._half_answered.clear()
         self._latencies = []
         began = time.perf_counter()
         count = max(1, round(rate * seconds))
         for i in range(count):
             self._spin(began + i / rate)
             self._send(raw)
-        took = time.perf_counter() - began
+        duration = time.perf_counter() - began
         self._spin(time.perf_counter() + grace, until_answered=True)
-        return Played(count, took, np.array(self._latencies))
+        return RoundTrips(count, duration, np.array(self._latencies))
 
     def _send(self, raw: bytes) -> None:
-        """Publish a message with its number as the stamp, which follows four bytes of CDR."""
+        """Publish a message with its number as the stamp, which follows 4 bytes of CDR header."""
         self._number += 1
         stamped = raw[:4] + self._number.to_bytes(4, "little") + raw[8:]
         self._sent[self._number] = time.perf_counter()
         self._publisher.publish(stamped)
 
-    def _take(self, raw: bytes) -> None:
-        """Note when the second of the two answers to a message came."""
+    def _receive(self, raw: bytes) -> None:
+        """Store the latency when the second of the two answers to a message arrives."""
         number = int.from_bytes(raw[4:8], "little")
-        if number not in self._half:
-            self._half.add(number)
+        if number not in self._half_answered:
+            self._half_answered.add(number)
         elif (sent := self._sent.pop(number, None)) is not None:
             self._latencies.append(time.perf_counter() - sent)
             self._answers += 1
 
     def _spin(self, end: float, *, until_answered: bool = False) -> None:
-        """Receive until `end`, or until nothing is unanswered."""
+        """Receive until `end` or, with `until_answered`, until all messages are answered."""
         while (left := end - time.perf_counter()) > 0:
             if until_answered and not self._sent:
                 return
             self._executor.spin_once(timeout_sec=left)
 
 
-class Contender(NamedTuple):
-    """A node that runs, its client, and the seconds from its start to its first answer."""
+class RunningNode(NamedTuple):
+    """A running node.
+
+    Attributes:
+        process: the process of the node.
+        client: its client.
+        start: seconds from the start of the process to its first answer.
+    """
 
     process: subprocess.Popen[bytes]
     client: Client
@@ -155,31 +166,30 @@ class Contender(NamedTuple):
 
     def memory(self) -> float:
         """Return the node's resident memory in MB."""
-        lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
+        return process_memory(self.process.pid)
 
 
 NODES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "relay": ("benchmarks.speed.relay_node", "relay", {}),
     "lifter": ("deep_nrsfm_ros.node.lifter", "lifter", {"model": "cmu31"}),
 }
-"""What is measured: module, name of the node, parameters."""
+"""Kind of node -> module, name, parameters."""
 
 
 @contextmanager
-def started(
-    what: str, raw: bytes, folder: Path, parameters: Mapping[str, Any] | None = None
-) -> Iterator[Contender]:
-    """Yield one of `NODES` as soon as it has answered the message `raw`; its log is in `folder`."""
-    module, name, own = NODES[what]
-    domain = fresh_domain()
+def running_node(
+    kind: str, raw: bytes, folder: Path, parameters: Mapping[str, Any] | None = None
+) -> Iterator[RunningNode]:
+    """Yield one of `NODES` when it has answered the message `raw`; its log is in `folder`."""
+    module, name, defaults = NODES[kind]
+    domain = random_domain()
     client = Client(name, domain)
-    # What pip installs is compiled: so be this.
+    # Let Python write bytecode, as pip does at installation.
     variables = {"ROS_DOMAIN_ID": str(domain), "PYTHONDONTWRITEBYTECODE": None}
     try:
         with environment(**variables):
             began = time.perf_counter()
-            with node(module, own | dict(parameters or {}), folder / f"{what}.log") as process:
-                yield Contender(process, client, client.meet(raw) - began)
+            with node(module, defaults | dict(parameters or {}), folder / f"{kind}.log") as process:
+                yield RunningNode(process, client, client.meet(raw) - began)
     finally:
         client.close()

@@ -1,7 +1,7 @@
-"""What the benchmarks of speed share: contenders by turns, the machine's name, a command line.
+"""Interleaved timing, name of the machine and command line of the benchmarks of speed.
 
-A time says little on another machine, and little on this one an hour later. A ratio of two that
-were measured side by side, in rounds A B A B, says more: it is what the tables are about.
+A time depends on the machine and on its load. The ratio of two contenders that are measured side by
+side, in rounds A B A B, depends on them less.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from benchmarks.table import Table
 
 
 def machine() -> str:
-    """Return the name of the processor and how many cores this process may use."""
+    """Return the name of the processor and the number of cores available to this process."""
     names = [
         line.partition(":")[2].strip()
         for line in Path("/proc/cpuinfo").read_text().splitlines()
@@ -32,18 +32,24 @@ def machine() -> str:
     return f"{next(iter(names), 'unknown processor')}, {cores} core{'s' * (cores > 1)}"
 
 
-def by_turns(
+def interleaved(
     contenders: Mapping[str, Callable[[], object]],
     rounds: int,
     seconds: float,
     warm_up: int = 4,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the seconds (k,) that each call took, the contenders called in rounds A B A B.
+    """Time the contenders in rounds A B A B.
 
-    seconds: length of each one's turn in a round; a turn has one call at the least. warm_up: calls
-    before that are not timed; torch.jit compiles in its second and third.
+    Args:
+        contenders: name -> function to time.
+        rounds: number of rounds.
+        seconds: time for each contender in a round; at least one call is made.
+        warm_up: untimed calls at the start; torch.jit compiles in its second and third call.
+
+    Returns:
+        name -> seconds (k,) of each call.
     """
-    took: dict[str, list[float]] = {name: [] for name in contenders}
+    durations: dict[str, list[float]] = {name: [] for name in contenders}
     for call in contenders.values():
         for _ in range(warm_up):
             call()
@@ -53,37 +59,38 @@ def by_turns(
             while True:
                 began = time.perf_counter()
                 call()
-                took[name].append(time.perf_counter() - began)
+                durations[name].append(time.perf_counter() - began)
                 if time.perf_counter() >= end:
                     break
-    return {name: np.array(times) for name, times in took.items()}
+    return {name: np.array(times) for name, times in durations.items()}
 
 
-def on_one_thread() -> None:
-    """Start this program again unless NumPy has one thread, which it reads at its start alone."""
+def require_one_thread() -> None:
+    """Restart this program with one NumPy thread, which NumPy reads only at its start."""
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
         os.execv(sys.executable, sys.orig_argv)
 
 
-def fresh_domain(*others: int) -> int:
-    """Return a DDS domain at random, none of the others; let nothing leave this machine."""
+def random_domain(*others: int) -> int:
+    """Return a random DDS domain other than `others`; restrict discovery to this machine."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     return random.choice([number for number in range(1, 102) if number not in others])
 
 
 @contextmanager
 def environment(**values: str | None) -> Iterator[None]:
-    """Set variables of this process, and of those that it starts, for a while; None: unset."""
-    before = {name: os.environ.get(name) for name in values}
+    """Set environment variables within the context; a value of None unsets one."""
+    previous = {name: os.environ.get(name) for name in values}
     _set_variables(values)
     try:
         yield
     finally:
-        _set_variables(before)
+        _set_variables(previous)
 
 
 def _set_variables(values: Mapping[str, str | None]) -> None:
+    """Set each variable; None unsets it."""
     for name, value in values.items():
         if value is None:
             os.environ.pop(name, None)
@@ -91,18 +98,26 @@ def _set_variables(values: Mapping[str, str | None]) -> None:
             os.environ[name] = value
 
 
-def arguments(description: str | None) -> argparse.ArgumentParser:
-    """Return a parser with what all benchmarks of speed are told."""
+def process_memory(pid: int | str = "self", field: str = "VmRSS") -> float:
+    """Return the memory of a process in MB: VmRSS (resident) or VmHWM (peak resident)."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1024
+
+
+def speed_parser(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the options that all benchmarks of speed share."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     parser.add_argument(
-        "--quick", action="store_true", help="see that it works; the figures say nothing"
+        "--quick",
+        action="store_true",
+        help="check that it works, within seconds; the figures mean nothing",
     )
     return parser
 
 
-def show(tables: Iterable[Table], output: Path) -> None:
-    """Print and write each table as soon as it is there, the machine in its title."""
+def print_and_write(tables: Iterable[Table], output: Path) -> None:
+    """Print and write each table when it is ready, with the machine in its title."""
     for table in tables:
         table.title += f" ({machine()})"
         print(table.markdown(), flush=True)

@@ -1,4 +1,4 @@
-"""Training as the frames grow: time of curation and an epoch, and memory over the dataset's."""
+"""Time and memory of curation and one epoch against the number of frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.speed.timing import arguments, show
+from benchmarks.speed.timing import print_and_write, process_memory, speed_parser
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.curation import curate
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -25,22 +25,22 @@ EXPONENT = "exponent"
 
 
 def table(measured: Sequence[dict[str, float]]) -> Table:
-    """Return the table of what `measure` found, and the exponents of what grows."""
+    """Return the table of the results of `measure`, with the exponents of the times."""
     grows = ("curation s", "preparation s", "epoch s")
     result = Table(
         "training_scale",
-        "Training as the frames grow, the default recipe, one thread",
+        "Training against the number of frames, default recipe, one thread",
         ("frames",),
         (*grows, "dataset MB", "curation / dataset", "training / dataset"),
         {
-            "curation s": "from the dataset to one that is fit to be trained on",
-            "preparation s": "from there to the first step",
-            "epoch s": "as many steps as it takes to draw as many frames as there are",
-            "curation / dataset": "the most resident memory while it is curated, the dataset "
-            "included, less what there was before that was made, over the size of its arrays",
-            "training / dataset": "likewise of the training, which has the curated dataset; a "
-            "small training has gone before, so that libraries are not counted",
-            EXPONENT: "e of time = c frames^e, least squares of the logarithms: 1 is linear",
+            "curation s": "from the raw to the curated dataset",
+            "preparation s": "from the curated dataset to the first step",
+            "epoch s": "steps that draw as many frames as the dataset has",
+            "curation / dataset": "peak resident memory of curation, the dataset included, less "
+            "the memory before the dataset was made, over the size of its arrays",
+            "training / dataset": "the same of the training on the curated dataset; a small "
+            "training runs first, so that libraries are not counted",
+            EXPONENT: "e in time = c frames^e, least squares of the logarithms; 1 is linear",
         },
         bars("training / dataset"),
     )
@@ -58,7 +58,7 @@ def table(measured: Sequence[dict[str, float]]) -> Table:
 
 
 def measure(f: int) -> dict[str, float]:
-    """Train for an epoch on f frames in this process."""
+    """Curate and train for one epoch on f random frames; return the figures."""
     import torch
 
     from deep_nrsfm_ros.training.loop import Callbacks, train
@@ -71,78 +71,74 @@ def measure(f: int) -> dict[str, float]:
         steps = max(2, len(dataset) // base.recipe.batch)
         recipe = dataclasses.replace(base.recipe, steps=steps, seeds=1)
 
-        def note(trainer: Trainer) -> None:
+        def store_time(trainer: Trainer) -> None:
             if trainer.step in (0, steps):
                 times.append(time.perf_counter())
 
         times[:] = [time.perf_counter()]
         preset = base._replace(recipe=recipe)
-        train(dataset.points, dataset.visible, preset, callbacks=Callbacks(on_step=note))
+        train(dataset.points, dataset.visible, preset, callbacks=Callbacks(on_step=store_time))
 
-    epoch(curate(_ensemble(10 * base.recipe.batch)).dataset)
-    before = memory("VmRSS")
-    dataset = _ensemble(f)
+    epoch(curate(_random_dataset(10 * base.recipe.batch)).dataset)
+    before = process_memory()
+    dataset = _random_dataset(f)
     size = (dataset.points.nbytes + dataset.visible.nbytes) / 2**20
-    forget_peak()
+    reset_peak_memory()
     started = time.perf_counter()
     dataset = curate(dataset).dataset
-    curated, curation = time.perf_counter() - started, memory("VmHWM") - before
-    forget_peak()
+    curated, curation = time.perf_counter() - started, process_memory(field="VmHWM") - before
+    reset_peak_memory()
     epoch(dataset)
-    began, ready, done = times
+    started_at, first_step_at, ended_at = times
     return {
         "frames": f,
         "curation s": curated,
-        "preparation s": ready - began,
-        "epoch s": done - ready,
+        "preparation s": first_step_at - started_at,
+        "epoch s": ended_at - first_step_at,
         "dataset MB": size,
         "curation / dataset": curation / size,
-        "training / dataset": (memory("VmHWM") - before) / size,
+        "training / dataset": (process_memory(field="VmHWM") - before) / size,
     }
 
 
-def _ensemble(f: int) -> Dataset:
-    """Return f frames of no shape in particular."""
+def _random_dataset(f: int) -> Dataset:
+    """Return f random frames."""
     points = np.random.default_rng(0).standard_normal((f, len(CMU31), 2), dtype=np.float32)
-    return Dataset(points, np.ones(points.shape[:2], bool), CMU31, "chance")
+    return Dataset(points, np.ones(points.shape[:2], bool), CMU31, "random")
 
 
-def memory(what: str) -> float:
-    """Return this process's VmRSS (resident) or VmHWM (the most that was) in MB."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(what)) / 1024
-
-
-def forget_peak() -> None:
-    """Let VmHWM begin anew."""
+def reset_peak_memory() -> None:
+    """Reset VmHWM, the peak resident memory, of this process."""
     Path("/proc/self/clear_refs").write_text("5")
 
 
-def benchmark(given: Namespace) -> Iterator[Table]:
-    """Measure each number of frames in a process of its own."""
-    counts = [1000, 4000] if given.quick else [10_000, 100_000]
-    counts += [1_000_000] * given.long
-    found = []
+def benchmark(args: Namespace) -> Iterator[Table]:
+    """Measure each number of frames in a process of its own; yield the table."""
+    counts = [1000, 4000] if args.quick else [10_000, 100_000]
+    counts += [1_000_000] * args.long
+    measurements = []
     for count in counts:
         command = [sys.executable, "-m", "benchmarks.speed.training_scale", "--frames", str(count)]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        done = subprocess.run(
+        ended_at = subprocess.run(
             command, env=environment, stdout=subprocess.PIPE, text=True, check=True
         )
-        found.append(json.loads(done.stdout))
-    yield table(found)
+        measurements.append(json.loads(ended_at.stdout))
+    yield table(measurements)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    parser = arguments(__doc__)
-    parser.add_argument("--long", action="store_true", help="a million frames as well: minutes")
-    parser.add_argument("--frames", type=int, help="what a process of its own is asked for")
-    given = parser.parse_args(argv)
-    if given.frames:
-        print(json.dumps(measure(given.frames)))
+    parser = speed_parser(__doc__)
+    parser.add_argument(
+        "--long", action="store_true", help="a million frames as well: about two minutes more"
+    )
+    parser.add_argument("--frames", type=int, help="internal: measure this number of frames")
+    args = parser.parse_args(argv)
+    if args.frames:
+        print(json.dumps(measure(args.frames)))
     else:
-        show(benchmark(given), given.output)
+        print_and_write(benchmark(args), args.output)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Samples a second of training: ours against torch as the paper writes it, and torchrun's gain."""
+"""Training samples per second, against plain torch, and the gain from two torchrun processes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from benchmarks.speed.plain_torch import PlainTraining
-from benchmarks.speed.timing import arguments, by_turns, show
+from benchmarks.speed.timing import interleaved, print_and_write, speed_parser
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.distributed import join
@@ -25,53 +25,53 @@ P = 31
 BATCH = 64
 OURS, PLAIN = "ours", "plain torch"
 LEGEND = {
-    "samples/s": f"frames that training steps take in, batch {BATCH}; the cycle loss's are not "
-    "counted",
+    "samples/s": f"frames per second of training steps, batch {BATCH}; frames of the cycle loss "
+    "are not counted",
     "ratio": f"to {PLAIN}: above 1 is faster",
-    PLAIN: "a convolution a layer, SVD, autograd, torch.optim.Adam with a tensor a weight; the "
-    "cycle loss of the default by a second pass, where ours takes the shapes of the batch before",
-    "network": "default: the default recipe; paper: its 12 dictionaries and its loss, the batch "
-    "as above",
+    PLAIN: "one convolution per layer, SVD, autograd, torch.optim.Adam with one tensor per "
+    "weight; the cycle loss by a second pass, where ours uses the shapes of the previous batch",
+    "network": "default: the default recipe; paper: its 12 dictionaries and its loss, the same "
+    "batch",
 }
 
 
 def preset(name: str, batch: int) -> Preset:
-    """Return a preset with another batch."""
+    """Return the preset `name` with the batch size `batch`."""
     base = PRESETS[name]
     return base._replace(recipe=dataclasses.replace(base.recipe, batch=batch))
 
 
 def frames(f: int) -> FrameStore:
-    """Return f frames of no shape in particular; their values cost no time."""
+    """Return f random frames; the values do not change the time."""
     points = np.random.default_rng(0).standard_normal((f, P, 2), dtype=np.float32)
     return FrameStore.of(points, np.ones((f, P), bool))
 
 
 def contenders(name: str, data: FrameStore) -> tuple[Trainer, PlainTraining]:
-    """Return both, with the same weights."""
+    """Return our trainer and plain torch, with the same weights."""
     chosen = preset(name, BATCH)
     ours = Trainer(data, chosen, 0)
     return ours, PlainTraining(ours.net, data.points, chosen)
 
 
-def steps(given: Namespace) -> Table:
-    """Return the table of one process."""
-    rounds, seconds = (1, 0.02) if given.quick else (5, 2.0)
+def steps(args: Namespace) -> Table:
+    """Return the table of samples per second of one process."""
+    rounds, seconds = (1, 0.02) if args.quick else (5, 2.0)
     table = Table(
         "training_speed",
-        "Samples a second of one process",
+        "Training samples per second of one process",
         ("network", "threads", "by"),
         ("samples/s", "ratio"),
         LEGEND,
         bars("ratio"),
     )
-    before, data = torch.get_num_threads(), frames(200 if given.quick else 10_000)
+    before, data = torch.get_num_threads(), frames(200 if args.quick else 10_000)
     for name in PRESETS:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             ours, plain = contenders(name, data)
             calls = {PLAIN: plain.advance, OURS: ours.advance}
-            rates = {n: BATCH / t.mean() for n, t in by_turns(calls, rounds, seconds).items()}
+            rates = {n: BATCH / t.mean() for n, t in interleaved(calls, rounds, seconds).items()}
             for by, rate in rates.items():
                 figures = {"samples/s": float(rate), "ratio": float(rate / rates[PLAIN])}
                 table.add((name, str(threads), by), figures)
@@ -79,72 +79,74 @@ def steps(given: Namespace) -> Table:
     return table
 
 
-def teams() -> Table:
-    """Return the table of torchrun: the same whole batch, shared out."""
+def torchrun_table() -> Table:
+    """Return the table of one and two torchrun processes that share the same batch."""
     rounds, seconds = 3, 3.0
     table = Table(
         "torchrun",
-        "Samples a second of torchrun, the default recipe, one thread a process",
+        "Training samples per second of torchrun, the default recipe, one thread per process",
         ("batch", "processes"),
         ("samples/s", "ratio"),
-        {"samples/s": "of all together; they share the batch", "ratio": "to one process"},
+        {"samples/s": "of all processes together; they share the batch", "ratio": "to one process"},
         bars("ratio"),
     )
     for batch in (BATCH, 256, 1024):
-        found: dict[int, list[float]] = {1: [], 2: []}
+        rates_by_processes: dict[int, list[float]] = {1: [], 2: []}
         for _ in range(rounds):
-            for processes, rates in found.items():
-                rates.append(team_rate(processes, batch, seconds))
-        for processes, rates in found.items():
-            rate, alone = np.median(rates), np.median(found[1])
-            figures = {"samples/s": float(rate), "ratio": float(rate / alone)}
+            for processes, rates in rates_by_processes.items():
+                rates.append(torchrun_rate(processes, batch, seconds))
+        for processes, rates in rates_by_processes.items():
+            rate, single = np.median(rates), np.median(rates_by_processes[1])
+            figures = {"samples/s": float(rate), "ratio": float(rate / single)}
             table.add((str(batch), str(processes)), figures)
     return table
 
 
-def team_rate(processes: int, batch: int, seconds: float) -> float:
-    """Return the samples a second of so many processes."""
+def torchrun_rate(processes: int, batch: int, seconds: float) -> float:
+    """Return the samples per second of `processes` processes that share a batch."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     command += [f"--nproc-per-node={processes}", "-m", "benchmarks.speed.training_speed"]
-    command += ["--in-team", str(batch), "--seconds", str(seconds)]
+    command += ["--worker-batch", str(batch), "--seconds", str(seconds)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return float(done.stdout)
 
 
-def in_team(batch: int, seconds: float) -> None:
-    """Train as one process of a team, which torchrun has started; the first prints samples/s."""
+def torchrun_worker(batch: int, seconds: float) -> None:
+    """Train as one of the processes started by torchrun; rank 0 prints the samples per second."""
     torch.set_num_threads(1)
-    team = join()
-    trainer = Trainer(frames(10_000), preset("default", batch), 0, team=team)
-    (once,) = by_turns({"": trainer.advance}, 8, 0.0).values()
-    # All take as many steps as the first can in the time, or they would wait for each other.
-    steps = team.tell(max(1, round(seconds / float(np.median(once)))))
+    group = join()
+    trainer = Trainer(frames(10_000), preset("default", batch), 0, team=group)
+    (durations,) = interleaved({"": trainer.advance}, 8, 0.0).values()
+    # All processes take the number of steps of rank 0, or they would wait for each other.
+    steps = group.tell(max(1, round(seconds / float(np.median(durations)))))
     began = time.perf_counter()
     for _ in range(steps):
         trainer.advance()
-    if not team.rank:
+    if not group.rank:
         print(steps * batch / (time.perf_counter() - began))
-    team.leave()
+    group.leave()
 
 
-def benchmark(given: Namespace) -> Iterator[Table]:
-    """Measure steps of one process, then of two."""
-    yield steps(given)
-    if not given.quick:
-        yield teams()
+def benchmark(args: Namespace) -> Iterator[Table]:
+    """Yield the table of one process and, without --quick, the table of torchrun."""
+    yield steps(args)
+    if not args.quick:
+        yield torchrun_table()
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    parser = arguments(__doc__)
-    parser.add_argument("--in-team", type=int, metavar="BATCH", help="what torchrun starts")
-    parser.add_argument("--seconds", type=float, default=3.0, help="of it")
-    given = parser.parse_args(argv)
-    if given.in_team:
-        in_team(given.in_team, given.seconds)
+    parser = speed_parser(__doc__)
+    parser.add_argument(
+        "--worker-batch", type=int, help="internal: batch of a process started by torchrun"
+    )
+    parser.add_argument("--seconds", type=float, default=3.0, help="internal: its duration")
+    args = parser.parse_args(argv)
+    if args.worker_batch:
+        torchrun_worker(args.worker_batch, args.seconds)
     else:
-        show(benchmark(given), given.output)
+        print_and_write(benchmark(args), args.output)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks import harness
-from benchmarks.harness import Session, across, command, in_pairs
+from benchmarks.harness import Session, errors_by_column, run_program, with_proper
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -155,8 +155,8 @@ def test_across_gives_both_errors_of_every_test(
     session: Session, dataset: Dataset, preset: Preset
 ) -> None:
     model = session.trained("a title", dataset, preset)
-    row = across({"x": (model, dataset), "y": (model, dataset)}, ALONE)
-    assert list(row) == in_pairs(["x", "y"]) == ["x", "x proper", "y", "y proper"]
+    row = errors_by_column({"x": (model, dataset), "y": (model, dataset)}, ALONE)
+    assert list(row) == with_proper(["x", "y"]) == ["x", "x proper", "y", "y proper"]
     assert 0 < row["x"] <= row["x proper"] and row["x"] == row["y"]
 
 
@@ -170,7 +170,7 @@ def test_command_prints_and_writes(
         return table
 
     options = ["--data", str(data), "--output", str(tmp_path), "--seeds", "4", "5", "--steps", "6"]
-    command(benchmark, "about", ("05",), options)
+    run_program(benchmark, "about", ("05",), options)
     assert capsys.readouterr().out.strip() == (tmp_path / "t.md").read_text().strip()
     assert (tmp_path / "t.csv").exists() and (tmp_path / "t.png").exists()
 
@@ -180,5 +180,5 @@ def test_command_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixt
         raise AssertionError(session.mocap(session.subjects, "train"))
 
     with pytest.raises(SystemExit, match="2"):
-        command(benchmark, "about", ("01",), ["--data", str(tmp_path)])
+        run_program(benchmark, "about", ("01",), ["--data", str(tmp_path)])
     assert "no trials 01_*.amc" in capsys.readouterr().err

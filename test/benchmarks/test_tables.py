@@ -152,15 +152,15 @@ def test_rank_is_the_one_of_lowest_error(
 
 
 def test_noise_has_the_ratio_asked_for(dataset: Dataset) -> None:
-    added = noise.disturbed(dataset, 0.2).points - dataset.points
+    added = noise.add_noise(dataset, 0.2).points - dataset.points
     ratio = np.linalg.norm(added, axis=(1, 2)) / np.linalg.norm(dataset.points, axis=(1, 2))
     np.testing.assert_allclose(ratio, 0.2, rtol=1e-5)
-    assert noise.disturbed(dataset, 0.0) is dataset
+    assert noise.add_noise(dataset, 0.0) is dataset
 
 
 @pytest.mark.parametrize(("what", "count"), [("0", 0), ("1", 1), ("9", 9), ("arm", 6), ("leg", 4)])
 def test_hides_points(dataset: Dataset, what: str, count: int) -> None:
-    test = missing_keypoints.hidden(dataset, what)
+    test = missing_keypoints.hide(dataset, what)
     assert ((~test.visible).sum(1) == count).all()
     assert (test.points[~test.visible] == 0).all()
     np.testing.assert_array_equal(test.points[test.visible], dataset.points[test.visible])

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.data import pose2sim_scenes
-from benchmarks.data.pose2sim_scenes import LIMBS, Seen
+from benchmarks.data.pose2sim_scenes import LIMBS, PoseDetections
 from benchmarks.real import mediapipe_comparison
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.cameras import Camera
@@ -23,14 +23,14 @@ from deep_nrsfm_ros.layouts.presets import BODY25B
 FRAMES = 12
 
 
-def seen_by(camera: Camera, world: np.ndarray) -> Seen:
+def seen_by(camera: Camera, world: np.ndarray) -> PoseDetections:
     """Return what a perfect MediaPipe makes of limbs (f, 12, 3) mm: all but the rest of the 33."""
     f = len(world)
     points, confidence, shapes = np.zeros((f, 33, 2)), np.zeros((f, 33)), np.zeros((f, 33, 3))
     points[:, LIMBS], confidence[:, LIMBS] = camera.project(world), 0.9
     inside = camera.to_camera(world) / 1000
     shapes[:, LIMBS] = inside - inside.mean(1, keepdims=True)
-    return Seen(points, confidence, shapes, np.full(f, 0.1))
+    return PoseDetections(points, confidence, shapes, np.full(f, 0.1))
 
 
 @pytest.fixture
@@ -53,8 +53,8 @@ def output(
             for camera in ring:
                 path = f"Pose2Sim/Demo/S00_Demo_Session/P/T_{trial}Trial/videos/{camera.name}.mp4"
                 archive.writestr(path, "not looked at")
-                seen = seen_by(camera, moving(moments)[:, places])
-                np.savez(folder / f"{camera.name}.npz", **seen._asdict())
+                mediapipe = seen_by(camera, moving(moments)[:, places])
+                np.savez(folder / f"{camera.name}.npz", **mediapipe._asdict())
     return tmp_path / "out"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.real import model_selection
-from benchmarks.real.model_selection import CAMERA, as_filmed, facing, proportions
+from benchmarks.real.model_selection import CAMERA, facing_trunks, proportions, simulate_camera
 from benchmarks.robustness.smoothing import Clip
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.presets import HUMAN17
@@ -27,7 +27,7 @@ def test_only_who_faces_the_camera_surely_is_measured() -> None:
     points[:, places] = TRUNK
     points[1, places] *= [0.5, 1]  # seen from the side
     confidence[2, places[0]] = 0.3
-    found = facing(Clip(points, confidence, 30.0))
+    found = facing_trunks(Clip(points, confidence, 30.0))
     np.testing.assert_array_equal(found, TRUNK[None])
 
 
@@ -35,11 +35,11 @@ def test_a_camera_sees_the_truth_but_for_the_noise(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(model_selection, "NOISE", 0.0)
     rng = np.random.default_rng(0)
     shapes = 0.4 * rng.standard_normal((20, 17, 3))
-    seen = as_filmed(shapes, rng)
+    simulate_clip = simulate_camera(shapes, rng)
     limbs = [HUMAN17.index(joint) for joint in JOINTS]
-    pixels = CAMERA.pixels(seen.truth[..., :2] / seen.truth[..., 2:])
-    np.testing.assert_allclose(seen.points[:, limbs], pixels, atol=1e-2)
-    assert 0 < (seen.confidence == 0).mean() < 0.15
+    pixels = CAMERA.pixels(simulate_clip.truth[..., :2] / simulate_clip.truth[..., 2:])
+    np.testing.assert_allclose(simulate_clip.points[:, limbs], pixels, atol=1e-2)
+    assert 0 < (simulate_clip.confidence == 0).mean() < 0.15
     gaps = np.linalg.norm(shapes[:, limbs[0]] - shapes[:, limbs[5]], axis=1)
-    found = np.linalg.norm(seen.truth[:, 0] - seen.truth[:, 5], axis=1)
+    found = np.linalg.norm(simulate_clip.truth[:, 0] - simulate_clip.truth[:, 5], axis=1)
     np.testing.assert_allclose(found, 1000 * gaps, rtol=1e-6)

@@ -56,8 +56,8 @@ def test_a_bag_that_was_cut_off_is_written_anew(tmp_path: Path) -> None:
 def test_the_machine_from_bag_to_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(train_from_bags, "WORK", 200)
-    monkeypatch.setattr(train_from_bags, "WORK_LATER", 50)
+    monkeypatch.setattr(train_from_bags, "TRAINING_FRAMES", 200)
+    monkeypatch.setattr(train_from_bags, "TEST_FRAMES", 50)
     words = ["machine", "--data", "unused", "--output", str(tmp_path), "--steps", "30"]
     train_from_bags.main(words)
     table = rows(tmp_path / "from_excavator.csv")

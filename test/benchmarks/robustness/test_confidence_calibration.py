@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.robustness import confidence_calibration
-from benchmarks.robustness.confidence_calibration import ALL, Rated
+from benchmarks.robustness.confidence_calibration import ALL, Predictions
 from deep_nrsfm_ros.lifting.confidence import CORRECT_DISTANCE, Calibration
 
 
@@ -35,7 +35,7 @@ def test_the_fit_finds_what_the_chances_were_made_of() -> None:
     evidence[..., 0], evidence[..., 4] = 1, rng.random((4000, 10)) < 0.3
     hit = rng.random((4000, 10)) < 1 / (1 + np.exp(-evidence @ truth))
     error = np.where(hit, CORRECT_DISTANCE / 2, 2 * CORRECT_DISTANCE)
-    parts = [Rated(error, error[i::2], evidence[i::2]) for i in range(2)]
+    parts = [Predictions(error, error[i::2], evidence[i::2]) for i in range(2)]
     np.testing.assert_allclose(confidence_calibration.fit(parts), truth, atol=0.1)
 
 
@@ -54,7 +54,7 @@ def test_reliable_confidence_is_told_from_boasting() -> None:
 def test_cameras_keep_the_shape_and_see_it_whole() -> None:
     rng = np.random.default_rng(0)
     S = rng.standard_normal((50, 12, 3))
-    T, points, confidence = confidence_calibration.seen(S, rng)
+    T, points, confidence = confidence_calibration.project(S, rng)
     inner, before = (np.linalg.norm(X[:, :1] - X[:, 1:], axis=2) for X in (T, S))
     ratio = inner / before
     np.testing.assert_allclose(ratio, ratio[:, :1] + 0 * ratio, rtol=1e-6)

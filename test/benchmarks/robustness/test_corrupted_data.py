@@ -20,7 +20,7 @@ def people() -> Dataset:
 
 
 def test_jumps_and_swaps_are_where_they_are_said_to_be(people: Dataset) -> None:
-    bad = corrupted_data.spoil(people, 0)
+    bad = corrupted_data.corrupt(people, 0)
     assert (bad.jumps > 0).any(1).sum() == (bad.swaps > 0).any(1).sum() == 10
     assert ((bad.jumps > 0).sum(1) <= 1).all()
     assert (bad.jumps[bad.jumps > 0] > 0.69).all() and bad.jumps.max() < 3.01
@@ -32,9 +32,9 @@ def test_jumps_and_swaps_are_where_they_are_said_to_be(people: Dataset) -> None:
 
 
 def test_figures_count_points_and_frames(people: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    bad = corrupted_data.spoil(people, 0)
+    bad = corrupted_data.corrupt(people, 0)
     right = (bad.jumps > 0) | (bad.swaps > 0)
     monkeypatch.setattr(corrupted_data, "find_outliers", lambda *_: (right, None))
-    assert tuple(corrupted_data.found(people, bad).values()) == (0, 0, 100, 100, 100)
+    assert tuple(corrupted_data.detection_rates(people, bad).values()) == (0, 0, 100, 100, 100)
     monkeypatch.setattr(corrupted_data, "find_outliers", lambda *_: (~right, None))
-    assert tuple(corrupted_data.found(people, bad).values()) == (100, 100, 0, 100, 0)
+    assert tuple(corrupted_data.detection_rates(people, bad).values()) == (100, 100, 0, 100, 0)

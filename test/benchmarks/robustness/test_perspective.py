@@ -21,7 +21,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> perspective.Scene:
     shapes = centre(rng.uniform(-0.5, 0.5, (90, 17, 3))).astype(np.float32)
     flat = shapes[..., :2].copy()
     people = Dataset(flat, np.ones((90, 17), bool), HUMAN17, "made up", shapes)
-    return perspective.stage(people, 0)
+    return perspective.random_scene(people, 0)
 
 
 def test_people_stand_where_they_are_said_to_stand(scene: perspective.Scene) -> None:
@@ -44,6 +44,6 @@ def test_the_truth_has_no_error(scene: perspective.Scene, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(perspective, "lift_perspective", lift)
     monkeypatch.setattr(perspective, "Lifter", lambda *_: None)
-    found = perspective.found(None, scene, perspective.CAMERA)  # type: ignore[arg-type]
-    assert tuple(found) == tuple(perspective.FIGURES)
-    np.testing.assert_allclose(list(found.values()), 0, atol=1e-4)
+    lifting_errors = perspective.lifting_errors(None, scene, perspective.CAMERA)  # type: ignore[arg-type]
+    assert tuple(lifting_errors) == tuple(perspective.FIGURES)
+    np.testing.assert_allclose(list(lifting_errors.values()), 0, atol=1e-4)

@@ -31,7 +31,7 @@ def turning(degrees: float, frames: int = 100) -> Lifted:
 
 def test_from_end_to_end(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(smoothing, "CACHE", tmp_path)
-    monkeypatch.setattr(smoothing, "HELD", 9)
+    monkeypatch.setattr(smoothing, "STILL_FRAMES", 9)
     monkeypatch.setattr(smoothing, "_LAGS", np.array([0.0, 0.01]))
     smoothing.main(["--data", str(data), "--output", str(tmp_path)])
     rows = list(csv.DictReader((tmp_path / "smoothing.csv").open()))
@@ -63,7 +63,7 @@ def test_only_the_largest_person_of_a_video_is_followed(tmp_path: Path) -> None:
     with gzip.open(tmp_path / "video.jsonl.gz", "wt") as file:
         for people in (crowd, [], crowd[::-1]):
             file.write(json.dumps({"people": people}) + "\n")
-    clip = smoothing.filmed(tmp_path / "video.jsonl.gz")
+    clip = smoothing.video_clip(tmp_path / "video.jsonl.gz")
     assert clip.points.shape == (2, 17, 2)
     np.testing.assert_array_equal(*clip.points)
     assert np.ptp(clip.points[0]) > 5

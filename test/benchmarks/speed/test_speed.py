@@ -46,9 +46,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(PRESETS, name, preset._replace(architecture=small))
 
 
-def rows(module: ModuleType, output: Path, *arguments: str) -> list[dict[str, str]]:
+def rows(module: ModuleType, output: Path, *speed_parser: str) -> list[dict[str, str]]:
     """Run a benchmark quickly and return its first table."""
-    module.main(["--quick", "--output", str(output), *arguments])
+    module.main(["--quick", "--output", str(output), *speed_parser])
     name = module.__name__.rsplit(".", 1)[-1]
     return list(csv.DictReader((output / f"{name}.csv").open()))
 
@@ -56,7 +56,7 @@ def rows(module: ModuleType, output: Path, *arguments: str) -> list[dict[str, st
 def test_contenders_take_turns() -> None:
     order: list[str] = []
     calls = {name: lambda name=name: order.append(name) for name in "AB"}
-    took = speed.by_turns(calls, rounds=3, seconds=0.0, warm_up=2)
+    took = speed.interleaved(calls, rounds=3, seconds=0.0, warm_up=2)
     assert "".join(order) == "AABB" + "AB" * 3
     assert [len(times) for times in took.values()] == [3, 3]
 
@@ -64,7 +64,7 @@ def test_contenders_take_turns() -> None:
 def test_a_table_names_the_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = Table("t", "A title", ("a",), ("b",), {}, lambda table, figure: None)
     table.add(("x",), {"b": 1.0})
-    speed.show([table], tmp_path)
+    speed.print_and_write([table], tmp_path)
     assert f"## A title ({speed.machine()})" in capsys.readouterr().out
     assert "core" in speed.machine()
 
@@ -99,14 +99,14 @@ def test_all_passes_compute_the_same() -> None:
 def test_the_highest_rate_is_found(capacity: float, trials: int) -> None:
     search = latency.Search(100.0)
     for _ in range(trials):
-        search.tell(kept=search.rate <= capacity)
+        search.update(kept=search.rate <= capacity)
     assert capacity / 2 < search.best <= capacity
 
 
 def test_a_node_that_keeps_no_rate_has_none() -> None:
     search = latency.Search(100.0)
     for _ in range(4):
-        search.tell(kept=False)
+        search.update(kept=False)
     assert np.isnan(search.best) and 0 < search.rate < 100
 
 
@@ -120,8 +120,8 @@ def test_the_ratio_is_of_the_lifter_to_the_relay() -> None:
 def test_the_relay_answers_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "0")
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    raw = round_trip.keypoints(2, 31)
-    with round_trip.started("relay", raw, tmp_path, round_trip.LOSSLESS) as relay:
+    raw = round_trip.serialised_keypoints(2, 31)
+    with round_trip.running_node("relay", raw, tmp_path, round_trip.LOSSLESS) as relay:
         played = relay.client.play(raw, rate=50.0, seconds=0.2, grace=60.0)
         assert played.sent == len(played.latencies) == 10
         assert (played.latencies > 0).all() and relay.start > 0 and relay.memory() > 1
@@ -130,17 +130,17 @@ def test_the_relay_answers_everything(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_time_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
-    watch = latency_breakdown.Stopwatch()
+    stopwatch = latency_breakdown.Stopwatch()
 
     def spend(seconds: float) -> None:
         clock[0] += seconds
 
-    inner = watch.around("inner", spend)
-    with watch.timed("outer"):
+    inner = stopwatch.wrapped("inner", spend)
+    with stopwatch.timed("outer"):
         spend(1)
         inner(2)
         inner(4)
-    assert watch.seconds == {"outer": 1, "inner": 6}
+    assert stopwatch.seconds == {"outer": 1, "inner": 6}
 
 
 def test_every_step_has_its_functions() -> None:
@@ -153,11 +153,11 @@ def test_shares_are_of_the_sum() -> None:
         "read": 30.0,
         "network": 90.0,
         latency_breakdown.SUM: 120.0,
-        latency_breakdown.WHOLE: 100,
+        latency_breakdown.TOTAL: 100,
     }
     values = latency_breakdown.tabulate({1: times}).values()
     assert values[("read",)] == {"1 object": [30], "1 object %": [25]}
-    assert values[(latency_breakdown.SHARE,)] == {"1 object": [1.2]}
+    assert values[(latency_breakdown.SUM_TO_TOTAL,)] == {"1 object": [1.2]}
 
 
 @pytest.mark.usefixtures("few")
@@ -209,7 +209,7 @@ def test_time_to_error_compares_only_what_was_reached(
 ) -> None:
     found = rows(time_to_error, tmp_path, "--data", str(data), "--stride", "1", "--error", target)
     by = {row["recipe"]: row for row in found}
-    assert by.keys() == time_to_error.WAYS.keys()
+    assert by.keys() == time_to_error.CONTENDERS.keys()
     for row in found:
         assert row["reached"] == ("yes" if target == "1000" else "no")
         ratio = float(by["paper"]["wall s"]) / float(row["wall s"])
@@ -220,7 +220,7 @@ def test_time_to_error_compares_only_what_was_reached(
 def test_domains_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     random.seed(0)
-    assert speed.fresh_domain(*range(1, 101)) == 101
+    assert speed.random_domain(*range(1, 101)) == 101
 
 
 def test_variables_are_as_they_were_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
