@@ -29,9 +29,15 @@ DECODERS: dict[str, Callable[[bytes], Any]] = {
 BOTH = pytest.mark.parametrize("origin", DECODERS)
 
 
-def forbidden(raw: bytes) -> Any:
-    """Stand in for a decoder that must not be needed."""
-    raise AssertionError("decoded")
+class Decoder:
+    """A decoder that fails the test when it is called while it is not allowed."""
+
+    def __init__(self, origin: str) -> None:
+        self.decode, self.allowed = DECODERS[origin], True
+
+    def __call__(self, raw: bytes) -> Any:
+        assert self.allowed, "decoded"
+        return self.decode(raw)
 
 
 @st.composite
@@ -109,9 +115,10 @@ def test_short_and_long_way_end_alike(
 def test_the_second_message_of_a_make_is_not_decoded(
     origin: str, message: PointCloud2, seeds: list[int]
 ) -> None:
-    reader = MessageReader(POINT_CLOUD, DECODERS[origin])
+    decoder = Decoder(origin)
+    reader = MessageReader(POINT_CLOUD, decoder)
     reader(serialize_message(message), Q)
-    reader._decode = forbidden
+    decoder.allowed = False
     raws = [serialize_message(renewed(message, seed)) for seed in seeds]
     expected = [long_way(raw, origin, Q)[1] for raw in raws]
     assert [outcome(partial(reader, raw, Q)) for raw in raws] == [
@@ -147,9 +154,10 @@ def test_no_byte_is_overlooked(origin: str) -> None:
 
 def test_bytes_between_numbers_do_not_matter() -> None:
     raw = bytearray(plain(frame_id="a"))  # after it two bytes that senders leave to chance
-    reader = MessageReader(POINT_CLOUD, DECODERS["live"])
+    decoder = Decoder("live")
+    reader = MessageReader(POINT_CLOUD, decoder)
     reader(bytes(raw), Q)
-    reader._decode = forbidden
+    decoder.allowed = False
     raw[18:20] = b"\xab\xcd"
     assert raw[16:18] == b"a\0" and reader(bytes(raw), Q)[0] == reader(plain(frame_id="a"), Q)[0]
 
@@ -185,17 +193,20 @@ def test_nothing_is_read_beyond_the_data(
 
 
 def test_makes_that_take_turns_are_all_remembered_but_not_without_end() -> None:
-    reader = MessageReader(POINT_CLOUD, DECODERS["live"])
+    decoder = Decoder("live")
+    reader = MessageReader(POINT_CLOUD, decoder)
     raws = [plain(n, frame_id) for n in range(4) for frame_id in ("", "left", "right")]
     for raw in raws:
         reader(raw, Q)
-    reader._decode = forbidden
+    decoder.allowed = False
     for raw in raws * 2:
         reader(raw, Q)
-    reader._decode = DECODERS["live"]
-    for i in range(300):
-        reader(plain(1, f"camera {i}"), Q)
-    assert len(reader._formats) == 64
+    decoder.allowed = True
+    many = [plain(1, f"camera {i}") for i in range(300)]
+    for raw in many:
+        reader(raw, Q)
+    kept = [reader.find_format(raw, Q) is not None for raw in many]
+    assert kept == [False] * 236 + [True] * 64
     reader(plain(1, "a" * 5000), Q)  # long: not remembered
     assert not reader.find_format(plain(1, "a" * 5000), Q)
 
