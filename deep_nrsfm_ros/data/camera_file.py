@@ -1,4 +1,4 @@
-"""Camera files: a CameraInfo in YAML, as `ros2 topic echo` and camera calibration write it."""
+"""Camera files: CameraInfo in YAML, as `ros2 topic echo` and camera_calibration write it."""
 
 from __future__ import annotations
 
@@ -10,25 +10,29 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.messages.camera_info import read_camera_info
 from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 
-# The names that camera_calibration (ost.yaml) and camera_info_manager give to the matrices.
+# Names of the matrices in files of camera_calibration (ost.yaml) and camera_info_manager.
 _CALIBRATION = {
     "camera_matrix": "k",
     "distortion_coefficients": "d",
     "projection_matrix": "p",
 }
-_UNUSED = {"binning_x": 0, "binning_y": 0}
-_WHOLE = {"x_offset": 0, "y_offset": 0}
+_NO_BINNING = {"binning_x": 0, "binning_y": 0}
+_FULL_IMAGE = {"x_offset": 0, "y_offset": 0}
 
 
 class CameraFileError(ValueError):
-    """A camera file that is missing or says what no camera has: names the file and the mend."""
+    """A camera file is missing or invalid; the message names the file and the remedy."""
 
 
 def read_camera_file(path: Path, *, rectified: bool = False) -> Intrinsics:
-    """Return the intrinsics in a file; `rectified` as in `read_camera_info`.
+    """Return the intrinsics of a camera file.
 
-    The file is a CameraInfo field by field, or has the matrices by the names of
-    camera_calibration. Raises CameraFileError.
+    Args:
+        path: YAML with the fields of CameraInfo, or with the names of camera_calibration.
+        rectified: the keypoints are those of the rectified image; see `read_camera_info`.
+
+    Raises:
+        CameraFileError: the file is missing or invalid.
     """
     try:
         return read_camera_info(
@@ -38,9 +42,9 @@ def read_camera_file(path: Path, *, rectified: bool = False) -> Intrinsics:
         raise CameraFileError(f"camera file {path}: {error}") from error
 
 
-def _message(given: dict[Any, Any]) -> SimpleNamespace:
-    """Return the fields of a file as CameraInfo has them; raise ValueError for a bad one."""
-    fields = {_CALIBRATION.get(name, name): value for name, value in given.items()}
+def _message(content: dict[Any, Any]) -> SimpleNamespace:
+    """Return the content of a file with the fields of CameraInfo; raise ValueError if invalid."""
+    fields = {_CALIBRATION.get(name, name): value for name, value in content.items()}
     matrices = {}
     for name in _CALIBRATION.values():
         value = fields.get(name, [])
@@ -60,6 +64,8 @@ def _message(given: dict[Any, Any]) -> SimpleNamespace:
     return SimpleNamespace(
         **matrices,
         distortion_model=fields.get("distortion_model", ""),
-        **{name: fields.get(name, value) for name, value in _UNUSED.items()},
-        roi=SimpleNamespace(**_WHOLE | {name: roi[name] for name in _WHOLE if name in roi}),
+        **{name: fields.get(name, value) for name, value in _NO_BINNING.items()},
+        roi=SimpleNamespace(
+            **_FULL_IMAGE | {name: roi[name] for name in _FULL_IMAGE if name in roi}
+        ),
     )

@@ -1,4 +1,4 @@
-"""Detections: everyone that a recording shows, with the time of each frame."""
+"""Detections: all objects in the frames of a recording, with the time of each frame."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from deep_nrsfm_ros.lifting.observation import Observation
 
 @dataclass(frozen=True)
 class Detections:
-    """The m objects that f frames show, frame by frame, in the detector's order of q keypoints.
+    """The m objects in f frames, frame by frame, with q keypoints in the detector's order.
 
-    points: (m, q, 2), x right and y down; confidence: (m, q), 0 where missing: as `Observation`.
-    frame: (m,) int64, ascending: the place among `stamps` of the frame that shows the object.
-    identities: (m,) str: who it is, by the source; where that does not say, its place in its frame.
-    stamps: (f,) int64, ns, of all frames, those that show nobody among them.
-    frame_id: the camera, "" if it is not known.
+    Attributes:
+        points: (m, q, 2) float32 in pixels, x right and y down; 0 where missing.
+        confidence: (m, q) float32 in [0, 1]; 0 where missing.
+        frame: (m,) int64, ascending; index into `stamps` of the frame with the object.
+        identities: (m,) str, identity of the object; its index in the frame if the source has none.
+        stamps: (f,) int64 in ns, of all frames, also of those without an object.
+        frame_id: name of the camera; "" if unknown.
     """
 
     points: NDArray[np.float32]
@@ -32,7 +34,7 @@ class Detections:
     frame_id: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit each other."""
+        """Raise ValueError if the arrays do not match each other or frames are not ascending."""
         m, q = self.confidence.shape
         for name, shape in {"points": (m, q, 2), "frame": (m,), "identities": (m,)}.items():
             if getattr(self, name).shape != shape:
@@ -47,7 +49,7 @@ class Detections:
         return len(self.frame)
 
     def __getitem__(self, objects: NDArray[np.int64] | NDArray[np.bool_]) -> Detections:
-        """Return the chosen objects (in order), of the same frames."""
+        """Return the chosen objects, in ascending order; the frames remain the same."""
         return dataclasses.replace(
             self,
             points=self.points[objects],
@@ -57,14 +59,14 @@ class Detections:
         )
 
     def largest(self) -> Detections:
-        """Return the object with the largest bounding box of every frame that shows one."""
+        """Return the object with the largest bounding box of each frame that has one."""
         first, count = np.unique(self.frame, return_index=True, return_counts=True)[1:]
-        places = []
+        indices = []
         for start, number in zip(first.tolist(), count.tolist(), strict=True):
             rows = slice(start, start + number)
-            place = largest(Observation(self.points[rows], self.confidence[rows]))
-            places.append(start + (place or 0))
-        return self[np.array(places, np.int64)]
+            index = largest(Observation(self.points[rows], self.confidence[rows]))
+            indices.append(start + (index or 0))
+        return self[np.array(indices, np.int64)]
 
 
 def gather(
@@ -74,36 +76,42 @@ def gather(
     frame_id: str = "",
     identities: Sequence[str] | None = None,
 ) -> Detections:
-    """Return what each frame shows, in order, as one; `stamps` (f,) in ns.
+    """Return the observations of f frames, in order of time, as detections.
 
-    keypoints: q, for recordings that show nobody. identities: of all objects; None: those of the
-    observations, and the places of whom they do not name.
+    Args:
+        observations: one for each frame, with its objects.
+        stamps: (f,) in ns.
+        keypoints: number q of keypoints, for the case that there is no object.
+        frame_id: name of the camera.
+        identities: of all objects in order; None = those of the observations, and the index in
+            the frame for objects without one.
     """
-    seen = list(observations)
-    counts = [len(observation.confidence) for observation in seen]
-    nothing = np.empty((0, keypoints), np.float32)
-    points = np.concatenate([np.empty((0, keypoints, 2), np.float32), *(o.points for o in seen)])
-    confidence = np.concatenate([nothing, *(o.confidence for o in seen)])
+    frames = list(observations)
+    counts = [len(observation.confidence) for observation in frames]
+    empty = np.empty((0, keypoints), np.float32)
+    points = np.concatenate([np.empty((0, keypoints, 2), np.float32), *(o.points for o in frames)])
+    confidence = np.concatenate([empty, *(o.confidence for o in frames)])
     return Detections(
         points,
         confidence,
-        np.repeat(np.arange(len(seen)), counts),
-        np.asarray(_identities(seen) if identities is None else identities, str),
+        np.repeat(np.arange(len(frames)), counts),
+        np.asarray(_identities(frames) if identities is None else identities, str),
         np.asarray(stamps, np.int64),
         frame_id,
     )
 
 
-def _identities(seen: Sequence[Observation]) -> list[str]:
-    """Return who the objects of all observations are: by name, or by place in the frame."""
-    named = ((o.identities or (None,) * len(o.confidence)) for o in seen)
+def _identities(observations: Sequence[Observation]) -> list[str]:
+    """Return the identity of each object, or its index in its frame if it has none."""
     return [
         str(i) if identity is None else identity
-        for identities in named
-        for i, identity in enumerate(identities)
+        for observation in observations
+        for i, identity in enumerate(
+            observation.identities or (None,) * len(observation.confidence)
+        )
     ]
 
 
 def stamps_at(rate: float, frames: int) -> NDArray[np.int64]:
-    """Return the stamps (f,) in ns of frames that come `rate` times a second from 0."""
+    """Return the stamps (f,) in ns of `rate` frames per second, the first at 0."""
     return np.round(np.arange(frames) * (1e9 / rate)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The lifter's answers in bags: its points and camera rotations, written and read without ROS."""
+"""Bags with messages of the lifter, its points and camera rotations: read and written."""
 
 from __future__ import annotations
 
@@ -21,17 +21,20 @@ from deep_nrsfm_ros.messages.decoding import read_points
 from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_quaternion
 
 KEYPOINTS, POINTS, ROTATION = "/keypoints", "/lifter/points", "/lifter/camera_rotation"
-"""The topics of the lifter, as it is named unless somebody says otherwise."""
+"""The default topics of the lifter."""
 
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 _CLOUD, _QUATERNION = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/QuaternionStamped"
 
 
 class LiftedMessage(NamedTuple):
-    """What the lifter said of one frame: n objects of p keypoints.
+    """The messages of a lifter about one frame: n objects of p keypoints.
 
-    stamp: ns. shapes: (n, p, 3) camera axes, NaN where not lifted. confidence: (n, p).
-    rotation: (3, 3) of the first object, or None.
+    Attributes:
+        stamp: time of the frame in ns.
+        shapes: (n, p, 3) in the camera's axes, in output units; NaN where not lifted.
+        confidence: (n, p) in [0, 1].
+        rotation: (3, 3) from object to camera, of the first object; None if not recorded.
     """
 
     stamp: int
@@ -41,7 +44,7 @@ class LiftedMessage(NamedTuple):
 
 
 def has_lifted_messages(path: Path) -> bool:
-    """Tell whether a lifter's answers were recorded in the bag; raise BagError for no bag."""
+    """Return whether a bag has points of a lifter; raise BagError if it is no bag."""
     with closing(open_bag(path)) as bag:
         return any(points.total for points, _ in lifter_topics(bag))
 
@@ -51,7 +54,16 @@ def read_lifted_messages(
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     warn: Callable[[str], None] = lambda message: None,
 ) -> list[LiftedMessage]:
-    """Return the answers in a bag by time; raise BagError unless they are of one lifter."""
+    """Return the messages of a lifter in a bag, in order of time.
+
+    Args:
+        path: bag folder or file.
+        on_progress: called with the number of messages read and their total number.
+        warn: called with a sentence about each damaged part.
+
+    Raises:
+        BagError: it is no bag, or has the messages of no lifter or of several.
+    """
     with closing(open_bag(path)) as bag:
         pairs = lifter_topics(bag)
         if len(pairs) != 1:
@@ -62,55 +74,64 @@ def read_lifted_messages(
         for stamp, message in _messages(bag, rotation, warn):
             q = message.quaternion
             rotations[stamp] = rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w]))
-        answers = []
+        lifted = []
         for stamp, message in _messages(bag, points, warn):
             values = read_points(message)
             shapes, confidence = values[..., :3], values[..., 3]
-            answers.append(LiftedMessage(stamp, shapes, confidence, rotations.get(stamp)))
-            on_progress(len(answers), max(len(answers), points.total))
-    return sorted(answers, key=lambda answer: answer.stamp)
+            lifted.append(LiftedMessage(stamp, shapes, confidence, rotations.get(stamp)))
+            on_progress(len(lifted), max(len(lifted), points.total))
+    return sorted(lifted, key=lambda each: each.stamp)
 
 
 def _messages(bag: BagFile, topic: Topic, warn: Callable[[str], None]) -> list[tuple[int, Any]]:
-    """Return the stamped messages of a topic; those that cannot be read are counted and told."""
-    found: list[tuple[int, Any]] = []
+    """Return the messages of a topic with their stamps; warn about unreadable ones."""
+    messages: list[tuple[int, Any]] = []
     reason, damaged = "", 0
     for record in bag.records(topic):
         try:
             message = _STORE.deserialize_cdr(record.raw, topic.type)
-            found.append((stamp_of(message) or record.time, message))
-        except Exception as error:  # whatever bytes a bag holds, the others still count
+            messages.append((stamp_of(message) or record.time, message))
+        except Exception as error:  # damaged bytes fail in many ways; read the others
             reason, damaged = reason or repr(error), damaged + 1
     if warning := bag.warning(topic):
         warn(warning)
     if damaged:
         warn(f"{damaged} messages of {topic.name} cannot be decoded: {reason}")
-    return found
+    return messages
 
 
-def write_lifted_bag(path: Path, seen: Detections, lifted: Lifted, storage: str = "mcap") -> int:
-    """Write a bag as a recording of the lifter at work; return how many messages it has.
+def write_lifted_bag(
+    path: Path, detections: Detections, lifted: Lifted, storage: str = "mcap"
+) -> int:
+    """Write a bag like a recording of a lifter, and return the number of messages.
 
-    seen: the keypoints, on `KEYPOINTS`; lifted: what came of them, as the lifter publishes it.
-    Raises BagError if `path` exists.
+    Args:
+        path: folder of the new bag.
+        detections: m objects, written to the topic `KEYPOINTS`.
+        lifted: m lifted objects, written to `POINTS` and `ROTATION` as the lifter does.
+        storage: "sqlite3" or "mcap".
+
+    Raises:
+        BagError: `path` exists.
     """
     if path.exists():
         raise BagError(f"bag {path} exists already; choose another name or remove it")
-    count, ends = 0, np.searchsorted(seen.frame, np.arange(len(seen.stamps) + 1)).tolist()
+    count, stamps = 0, detections.stamps
+    ends = np.searchsorted(detections.frame, np.arange(len(stamps) + 1)).tolist()
     with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
         topics = {KEYPOINTS: _CLOUD, POINTS: _CLOUD, ROTATION: _QUATERNION}
         connections = {
             name: writer.add_connection(name, kind, typestore=_STORE)
             for name, kind in topics.items()
         }
-        for stamp, start, end in zip(seen.stamps.tolist(), ends, ends[1:], strict=False):
-            rows, header = slice(start, end), _header(stamp, seen.frame_id)
-            visible = seen.confidence[rows, :, None] > 0
-            keypoints = np.where(visible, seen.points[rows], np.nan)
-            messages = {KEYPOINTS: point_cloud(header, keypoints, seen.confidence[rows])}
+        for stamp, start, end in zip(stamps.tolist(), ends, ends[1:], strict=False):
+            rows, header = slice(start, end), _header(stamp, detections.frame_id)
+            confidence = detections.confidence[rows]
+            points = np.where(confidence[..., None] > 0, detections.points[rows], np.nan)
+            messages = {KEYPOINTS: point_cloud(header, points, confidence)}
             if start < end and not np.isnan(lifted.residual[rows]).all():
-                shapes, confidence = lifted.shapes[rows], lifted.confidence[rows]
-                messages[POINTS] = point_cloud(header, shapes, confidence)
+                shapes = lifted.shapes[rows]
+                messages[POINTS] = point_cloud(header, shapes, lifted.confidence[rows])
                 if not np.isnan(lifted.residual[start]):
                     messages[ROTATION] = _rotation(header, lifted.rotations[start])
             for name, message in messages.items():
@@ -121,7 +142,7 @@ def write_lifted_bag(path: Path, seen: Detections, lifted: Lifted, storage: str 
 
 
 def _header(stamp: int, frame_id: str) -> Any:
-    """Return a header of a stamp in ns."""
+    """Return a std_msgs/Header with a stamp in ns."""
     time = _STORE.types["builtin_interfaces/msg/Time"](*divmod(stamp, 1_000_000_000))
     return _STORE.types["std_msgs/msg/Header"](time, frame_id)
 

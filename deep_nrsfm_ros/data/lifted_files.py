@@ -1,4 +1,4 @@
-"""Lifted recordings as files, of a kind that their names tell: npz, JSON, or a bag."""
+"""Lifted recordings as files: .npz, .json or a bag, by the suffix of the name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DIGITS = 6  # of numbers in JSON
 
 
 def check_output(path: Path) -> None:
-    """Raise ValueError unless `write_recording` would know what to write, and where."""
+    """Raise ValueError if `write_recording` cannot write to a path: its suffix or its folder."""
     if path.suffix not in (".npz", ".json", ""):
         raise ValueError(
             f"{path} has the suffix {path.suffix!r}; expected .npz, .json, or none for a bag"
@@ -30,9 +30,16 @@ def check_output(path: Path) -> None:
 
 
 def write_recording(path: Path, recording: Recording, model: str) -> None:
-    """Write what was lifted with `model`; a file is replaced by a whole one or not at all.
+    """Write a recording to a file or bag. A file that exists is replaced atomically.
 
-    Raises ValueError as `check_output` does, and OSError.
+    Args:
+        path: .npz, .json, or a name without suffix for a bag.
+        recording: detections and lifted shapes.
+        model: name of the model that lifted them.
+
+    Raises:
+        ValueError: see `check_output`.
+        OSError: the file cannot be written.
     """
     check_output(path)
     if path.suffix == ".npz":
@@ -46,7 +53,7 @@ def write_recording(path: Path, recording: Recording, model: str) -> None:
 
 
 def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Write a file beside `path`, then put it in its place."""
+    """Write a temporary file next to `path`, and rename it to `path`."""
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with partial.open("wb") as file:
@@ -57,12 +64,12 @@ def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
 
 
 def _arrays(recording: Recording, model: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an npz: those of `Lifted` (m, ...) and what they are of."""
-    seen, target = recording.detections, recording.target
+    """Return the arrays of an .npz: those of `Lifted` (m, ...), the detections and the layout."""
+    detections, target = recording.detections, recording.target
     return recording.lifted._asdict() | {
-        "frame": seen.frame,
-        "identities": seen.identities,
-        "stamps": seen.stamps,
+        "frame": detections.frame,
+        "identities": detections.identities,
+        "stamps": detections.stamps,
         "names": np.array(target.keypoints),
         "edges": np.array(target.edge_indices(), np.int64).reshape(-1, 2),
         "model": np.array(model),
@@ -70,14 +77,16 @@ def _arrays(recording: Recording, model: str) -> dict[str, NDArray[Any]]:
 
 
 def _document(recording: Recording, model: str) -> dict[str, Any]:
-    """Return the same, frame by frame, for JSON; objects that were not lifted are left out."""
-    seen, target, sound = recording.detections, recording.target, recording.is_lifted
+    """Return the JSON document, frame by frame, without objects that were not lifted."""
+    detections, target = recording.detections, recording.target
     frames: list[dict[str, Any]] = [
-        {"stamp": stamp, "objects": []} for stamp in seen.stamps.tolist()
+        {"stamp": stamp, "objects": []} for stamp in detections.stamps.tolist()
     ]
-    for i in np.flatnonzero(sound).tolist():
-        one = {name: _plain(values[i]) for name, values in recording.lifted._asdict().items()}
-        frames[seen.frame[i]]["objects"].append({"identity": str(seen.identities[i]), **one})
+    for i in np.flatnonzero(recording.is_lifted).tolist():
+        fields = {name: _plain(values[i]) for name, values in recording.lifted._asdict().items()}
+        frames[detections.frame[i]]["objects"].append(
+            {"identity": str(detections.identities[i]), **fields}
+        )
     return {
         "model": model,
         "keypoints": list(target.keypoints),
@@ -87,6 +96,6 @@ def _document(recording: Recording, model: str) -> dict[str, Any]:
 
 
 def _plain(values: NDArray[Any]) -> Any:
-    """Return numbers as JSON has them, None for NaN."""
+    """Return rounded numbers as nested lists, None for NaN."""
     rounded = np.round(np.asarray(values, np.float64), _DIGITS)
     return np.where(np.isfinite(rounded), rounded, np.array(None, object)).tolist()

@@ -1,7 +1,7 @@
-"""CMU motion capture: ASF skeletons and AMC motions into datasets.
+"""CMU motion capture: ASF skeletons and AMC motions to datasets.
 
-Forward kinematics after the ASF/AMC definition: each bone turns about its own `axis` frame C by
-the angles L of its degrees of freedom, so its world rotation is R_parent C L C^-1.
+Forward kinematics of the ASF/AMC definition: each bone rotates in its own `axis` frame C by the
+angles L of its degrees of freedom, so that its rotation to the world is R_parent C L C^-1.
 """
 
 from __future__ import annotations
@@ -20,20 +20,28 @@ from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
 METRES = 0.0254 / 0.45
-"""Metres per ASF length unit (1/0.45 inch)."""
+"""Metres per ASF length unit, which is 1/0.45 inch."""
 HEIGHT_18 = 1 / 0.869
-"""Factor that makes the CMU rest skeleton 1.8 m high, the paper's convention for centimetres."""
+"""Factor that makes the CMU rest skeleton 1.8 m high, for the paper's errors in cm (tab:nrsfm)."""
 
 
 @dataclass(frozen=True)
 class Bone:
-    """One bone of the rest pose; its keypoint is its end."""
+    """One bone of the rest pose; its keypoint is at its end.
+
+    Attributes:
+        name: e.g. "lfemur".
+        parent: name of the bone at whose end it begins, or "root".
+        offset: (3,) from its beginning to its end in the rest pose, in metres.
+        axis: (3, 3) rotation C of the bone's frame.
+        dof: degrees of freedom, e.g. ("rx", "rz").
+    """
 
     name: str
     parent: str
-    offset: NDArray[np.float64]  # (3,) metres, direction x length
-    axis: NDArray[np.float64]  # (3, 3) the frame C
-    dof: tuple[str, ...]  # e.g. ("rx", "rz")
+    offset: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    dof: tuple[str, ...]
 
 
 Skeleton = tuple[Bone, ...]
@@ -41,30 +49,36 @@ Skeleton = tuple[Bone, ...]
 
 @dataclass(frozen=True)
 class Motion:
-    """World positions and orientations of the 31 keypoints of CMU31 in one trial."""
+    """The motion of one trial of f frames.
 
-    joints: NDArray[np.float32]  # (f, 31, 3) metres, y up
-    head: NDArray[np.float32]  # (f, 3, 3) rotation of the head bone's frame to the world
+    Attributes:
+        joints: (f, 31, 3) positions of the keypoints of CMU31 in metres, y up.
+        head: (f, 3, 3) rotations from the head bone's frame to the world.
+    """
+
+    joints: NDArray[np.float32]
+    head: NDArray[np.float32]
 
 
 def _euler(angles: NDArray[np.float64], axes: str) -> NDArray[np.float64]:
-    """Return R (..., 3, 3) for degrees (..., len(axes)) applied about x, y, z in that order."""
+    """Return rotations (..., 3, 3) by degrees (..., len(axes)) about `axes`, the first one first."""
     R = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
     for i, name in enumerate(axes):
         a = np.radians(angles[..., i])
         u, v = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[name]
-        turn = np.broadcast_to(np.eye(3), (*a.shape, 3, 3)).copy()
-        turn[..., u, u] = turn[..., v, v] = np.cos(a)
-        turn[..., v, u] = np.sin(a)
-        turn[..., u, v] = -np.sin(a)
-        R = turn @ R
+        step = np.broadcast_to(np.eye(3), (*a.shape, 3, 3)).copy()
+        step[..., u, u] = step[..., v, v] = np.cos(a)
+        step[..., v, u] = np.sin(a)
+        step[..., u, v] = -np.sin(a)
+        R = step @ R
     return R
 
 
 def read_asf(path: Path) -> Skeleton:
-    """Read a skeleton; bones in ASF order, parents before children.
+    """Return the bones of an ASF file in its order, parents before children.
 
-    Raises ValueError naming the file when it is not an ASF skeleton.
+    Raises:
+        ValueError: the file is not an ASF skeleton.
     """
     lines = path.read_text(errors="replace").splitlines()
     try:
@@ -74,7 +88,7 @@ def read_asf(path: Path) -> Skeleton:
 
 
 def _bones(lines: Iterable[list[str]]) -> Skeleton:
-    """Return the bones of an ASF, given as the words of its lines."""
+    """Return the bones of an ASF, whose lines are given as lists of words."""
     fields: dict[str, dict[str, list[str]]] = {}
     parents: dict[str, str] = {}
     block: dict[str, list[str]] = {}
@@ -104,9 +118,14 @@ def _bones(lines: Iterable[list[str]]) -> Skeleton:
 
 
 def read_amc(path: Path, skeleton: Skeleton) -> Motion:
-    """Read a trial and run forward kinematics over all its frames at once.
+    """Return the motion of a trial: forward kinematics of all its frames.
 
-    Raises ValueError naming the file when bones or frames are missing.
+    Args:
+        path: AMC file.
+        skeleton: of the same subject.
+
+    Raises:
+        ValueError: the file is no AMC motion of this skeleton.
     """
     columns: dict[str, list[list[str]]] = {}
     for line in path.read_text(errors="replace").splitlines():
@@ -120,24 +139,24 @@ def read_amc(path: Path, skeleton: Skeleton) -> Motion:
 
 
 def _pose(skeleton: Skeleton, columns: dict[str, list[list[str]]]) -> Motion:
-    """Return the motion of a skeleton whose bones have the angles `columns`, a row a frame."""
+    """Return the motion of a skeleton; `columns` are the angles of each bone, one row per frame."""
     frames = len(columns["root"])
     root = np.array(columns["root"], float).reshape(frames, 6)
     position = {"root": METRES * root[:, :3]}
-    turn = {"root": _euler(root[:, 3:], "xyz")}
+    rotation = {"root": _euler(root[:, 3:], "xyz")}
     for bone in skeleton:
-        turn[bone.name] = turn[bone.parent]
+        rotation[bone.name] = rotation[bone.parent]
         if bone.dof:
             angles = np.array(columns[bone.name], float).reshape(frames, len(bone.dof))
             local = _euler(angles, "".join(d[1] for d in bone.dof))
-            turn[bone.name] = turn[bone.parent] @ bone.axis @ local @ bone.axis.T
-        position[bone.name] = position[bone.parent] + turn[bone.name] @ bone.offset
+            rotation[bone.name] = rotation[bone.parent] @ bone.axis @ local @ bone.axis.T
+        position[bone.name] = position[bone.parent] + rotation[bone.name] @ bone.offset
     joints = np.stack([position[name] for name in CMU31.keypoints], 1)
-    return Motion(joints.astype(np.float32), turn["head"].astype(np.float32))
+    return Motion(joints.astype(np.float32), rotation["head"].astype(np.float32))
 
 
-# HUMAN17 from CMU joints. A detector's wrist is the end of `lwrist`, not that of `lradius`; its
-# neck and mid-hip are midpoints by definition.
+# Bones whose ends are keypoints of HUMAN17. A detector's wrist is the end of `lwrist`, not of
+# `lradius`; its neck and mid-hip are midpoints.
 _HUMAN17_FROM_CMU = {
     "shoulder": "clavicle",
     "elbow": "humerus",
@@ -150,7 +169,7 @@ _HUMAN17_FROM_CMU = {
 
 
 def human17(motion: Motion) -> NDArray[np.float32]:
-    """Return the keypoints of HUMAN17 (f, 17, 3) as a detector would place them."""
+    """Return the keypoints of HUMAN17 (f, 17, 3) in metres, where a detector places them."""
     at = CMU31.index
     points: dict[str, NDArray[Any]] = {}
     for side in ("left", "right"):
@@ -159,14 +178,14 @@ def human17(motion: Motion) -> NDArray[np.float32]:
     points["neck"] = (points["left_shoulder"] + points["right_shoulder"]) / 2
     points["mid_hip"] = (points["left_hip"] + points["right_hip"]) / 2
     base, top = motion.joints[:, at("upperneck")], motion.joints[:, at("head")]
-    # The head bone's end is the crown; the nose sits 35 % up it and 0.11 m before it.
+    # The head bone ends at the crown; the nose is 35 % up the bone and 0.11 m in front of it.
     forward = motion.head @ np.array([0, 0, 0.11], np.float32)
     points["nose"] = base + np.float32(0.35) * (top - base) + forward
     return np.stack([points[name] for name in HUMAN17.keypoints], 1)
 
 
 def cmu31(motion: Motion) -> NDArray[np.float32]:
-    """Return the 31 joints (f, 31, 3) of the paper's experiments."""
+    """Return the 31 joints (f, 31, 3) of the paper's experiments in metres."""
     return motion.joints
 
 
@@ -178,14 +197,14 @@ KEYPOINTS_OF: dict[str, Callable[[Motion], NDArray[np.float32]]] = {
 
 def trials(folder: Path, subject: str) -> list[Path]:
     """Return the AMC files of a subject in trial order; raise ValueError if there are none."""
-    found = sorted((folder / subject).glob(f"{subject}_*.amc"))
-    if not found:
+    paths = sorted((folder / subject).glob(f"{subject}_*.amc"))
+    if not paths:
         raise ValueError(f"no trials {subject}_*.amc in {folder / subject}")
-    return found
+    return paths
 
 
 def protocol_split(paths: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Return (training, held-out) trials: the paper trains on the first floor(0.8 N)."""
+    """Return the paper's training trials, the first floor(0.8 N) of N, and the others."""
     cut = int(0.8 * len(paths))
     return list(paths[:cut]), list(paths[cut:])
 
@@ -198,10 +217,20 @@ def read_trials(
     stride: int = 1,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Dataset:
-    """Project each `stride`-th frame by a random orthonormal camera of its own, fixed by `seed`.
+    """Return a dataset of trials; each frame is projected by a random orthonormal camera.
 
-    Points and ground-truth shapes are centred and in metres. Trials of one subject share the
-    skeleton beside them. Raises ValueError for a layout that motion capture cannot give.
+    Points and ground-truth shapes are centred and in metres. The skeleton is the .asf file of the
+    subject, next to the trials.
+
+    Args:
+        paths: AMC files.
+        layout: CMU31 or HUMAN17.
+        seed: of the random cameras.
+        stride: take every stride-th frame.
+        on_progress: called with the number of trials done and their total number.
+
+    Raises:
+        ValueError: motion capture does not have the keypoints of the layout.
     """
     if layout.name not in KEYPOINTS_OF:
         raise ValueError(f"motion capture gives {', '.join(KEYPOINTS_OF)}, not {layout.name!r}")

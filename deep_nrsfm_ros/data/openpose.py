@@ -13,10 +13,15 @@ from deep_nrsfm_ros.lifting.observation import Observation, to_observation
 
 
 def read_people(text: str | bytes, keypoints: int, min_confidence: float = 0.0) -> Observation:
-    """Return everyone in one frame of OpenPose JSON: `{"people": [{"pose_keypoints_2d": ...}]}`.
+    """Return all people in one frame of OpenPose JSON: `{"people": [{"pose_keypoints_2d": ...}]}`.
 
-    keypoints: q of the body model, e.g. 25. Raises ValueError for JSON of another make or with
-    another number of keypoints.
+    Args:
+        text: the JSON of the frame.
+        keypoints: number q of keypoints of the body model, e.g. 25.
+        min_confidence: keypoints with a confidence below it are missing.
+
+    Raises:
+        ValueError: the text is not such JSON, or has another number of keypoints.
     """
     try:
         frame: Mapping[str, Any] = json.loads(text)
@@ -30,7 +35,7 @@ def read_people(text: str | bytes, keypoints: int, min_confidence: float = 0.0) 
 
 
 def largest(people: Observation) -> int | None:
-    """Return the place of the person with the largest bounding box, None if no one is there."""
+    """Return the index of the person with the largest bounding box; None if there is nobody."""
     areas = [_area(p[c > 0]) for p, c in zip(people.points, people.confidence, strict=True)]
     return int(np.argmax(areas)) if areas else None
 

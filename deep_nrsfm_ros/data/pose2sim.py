@@ -1,7 +1,7 @@
 """The demo session of Pose2Sim: real detections of one person by four calibrated cameras.
 
-The wheel pose2sim 0.6.0 (BSD-3) carries it. Triangulating the four views gives 3D ground truth
-for real detections in each single view.
+The session is part of the wheel pose2sim 0.6.0 (BSD-3). Triangulation of the four views gives 3D
+ground truth for the real detections of each view.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from deep_nrsfm_ros.layouts.presets import BODY25B, HUMAN17
 from deep_nrsfm_ros.lifting.observation import Observation
 
 RATE = 60.0
-"""Frames a second of the cameras."""
+"""Frames per second of the cameras."""
 JOINTS = HUMAN17.keypoints[:12]
 """The 12 limb joints of the ground truth: shoulders, elbows, wrists, hips, knees, ankles."""
 
@@ -32,18 +32,22 @@ _DETECTION = re.compile(
     r".*S00_Demo_Session/.*BalancingTrial/pose/(cam\d+)_json/cam\d+\.(\d+)\.json"
 )
 _VIDEO = re.compile(r".*S00_Demo_Session/.*_(\w+)Trial/videos/(cam\d+)\.mp4")
-_SUBPIXELS = 64  # Qualisys counts 64 to a pixel
-# How far refinement may easily go from the calibration, which also holds the free scale.
+_SUBPIXELS = 64  # Qualisys units per pixel
+# Standard deviations of the refinement around the calibration. They also fix the free scale.
 _PRIOR = np.array([0.02, 0.02, 0.02, 100, 100, 100, 2])  # rad, mm, frames
 
 
 @dataclass(frozen=True)
 class View:
-    """What one camera saw of the subject, and where the subject was.
+    """The detections of one camera, with ground truth.
 
-    camera: as refined. points: (f, 25, 2) pixels and confidence: (f, 25), layout BODY25B.
-    delay: frames by which the camera is behind the first one.
-    truth: (f, 12, 3) mm, `JOINTS` in the camera's optical frame; NaN where unknown.
+    Attributes:
+        camera: after refinement.
+        points: (f, 25, 2) in pixels, layout BODY25B.
+        confidence: (f, 25) in [0, 1].
+        delay: frames by which the camera is behind the first camera.
+        truth: (f, 12, 3) positions of `JOINTS` in the camera's optical frame, in mm; NaN where
+            unknown.
     """
 
     camera: Camera
@@ -57,8 +61,12 @@ class View:
 class Session:
     """The four views and the triangulated ground truth.
 
-    world: (f, 12, 3) mm, `JOINTS` at the times of the first camera; NaN where unknown.
-    pixels: (mean, median) reprojection error, and `pixels_given` that of the calibration as given.
+    Attributes:
+        views: one for each camera.
+        world: (f, 12, 3) positions of `JOINTS` at the times of the first camera, in mm; NaN where
+            unknown.
+        pixels: mean and median reprojection error in pixels, after refinement.
+        pixels_given: the same of the original calibration.
     """
 
     views: tuple[View, ...]
@@ -68,9 +76,10 @@ class Session:
 
 
 def read_session(wheel: Path) -> Session:
-    """Read the balancing trial from the wheel and triangulate it.
+    """Return the balancing trial of the wheel, triangulated.
 
-    Raises ValueError when the file is no wheel with the session in it.
+    Raises:
+        ValueError: the file is not the wheel pose2sim 0.6.0.
     """
     try:
         with zipfile.ZipFile(wheel) as archive:
@@ -92,17 +101,24 @@ def read_session(wheel: Path) -> Session:
     refined, delays = refine(cameras, pixels, weights)
     world, errors = _synchronous(refined, delays, pixels, weights)
     views = []
-    for camera, seen, delay in zip(refined, detections, delays.tolist(), strict=True):
+    for camera, subject, delay in zip(refined, detections, delays.tolist(), strict=True):
         truth, known = _at(world, np.isfinite(world[..., 0]) * 1.0, -delay)
         truth[known == 0] = np.nan
-        views.append(View(camera, seen.points, seen.confidence, delay, camera.to_camera(truth)))
+        truth = camera.to_camera(truth)
+        views.append(View(camera, subject.points, subject.confidence, delay, truth))
     return Session(tuple(views), world, _summary(errors), _summary(given))
 
 
 def extract_videos(wheel: Path, trial: str, folder: Path) -> dict[str, Path]:
-    """Write the videos of the "Balancing" or the "Static" trial to a folder; return camera -> file.
+    """Write the videos of a trial to a folder, and return the file of each camera.
 
-    Raises ValueError when the file is no wheel with such videos in it.
+    Args:
+        wheel: the wheel pose2sim 0.6.0.
+        trial: "Balancing" or "Static".
+        folder: is made if it does not exist.
+
+    Raises:
+        ValueError: the file is no such wheel.
     """
     folder.mkdir(parents=True, exist_ok=True)
     videos = {}
@@ -120,7 +136,7 @@ def extract_videos(wheel: Path, trial: str, folder: Path) -> dict[str, Path]:
 
 
 def _cameras(archive: zipfile.ZipFile) -> list[Camera]:
-    """Return the cameras of the Qualisys calibration file, world unit mm."""
+    """Return the cameras of the Qualisys calibration file; the world unit is mm."""
     name = next(filter(_CALIBRATION.fullmatch, archive.namelist()), None)
     if name is None:
         raise LookupError("no Calib.qca.txt of the demo session")
@@ -134,36 +150,36 @@ def _camera(name: str, node: ElementTree.Element) -> Camera:
     def values(tag: str, *keys: str) -> Array:
         return np.array([float(node.findall(tag)[0].attrib[key]) for key in keys])
 
-    turn = values("transform", *(f"r{row}{column}" for row in "123" for column in "123"))
-    place = values("transform", "x", "y", "z")
+    axes = values("transform", *(f"r{row}{column}" for row in "123" for column in "123"))
+    position = values("transform", "x", "y", "z")
     focal = values("intrinsic", "focalLengthU", "focalLengthV") / _SUBPIXELS
     center = values("intrinsic", "centerPointU", "centerPointV") / _SUBPIXELS
     lens = (f"{kind}Distortion{i}" for kind in ("radial", "tangental") for i in "12")
     width, height = values("fov_video", "right", "bottom") + 1
-    # Qualisys looks along -z with y up.
-    rotation = np.diag([1.0, -1.0, -1.0]) @ turn.reshape(3, 3)
+    # A Qualisys camera looks along -z and has y up.
+    rotation = np.diag([1.0, -1.0, -1.0]) @ axes.reshape(3, 3)
     return Camera(
         name,
         np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]]),
         values("intrinsic", *lens),
         rotation,
-        -rotation @ place,
+        -rotation @ position,
         (int(width), int(height)),
     )
 
 
 def _detections(archive: zipfile.ZipFile, camera: str) -> Observation:
     """Return the subject, the largest person, in every frame of a camera."""
-    found = {
+    files = {
         int(match[2]): match[0]
         for match in map(_DETECTION.fullmatch, archive.namelist())
         if match and match[1] == camera
     }
-    if not found:
+    if not files:
         raise LookupError(f"no detections of {camera} in the balancing trial")
-    points = np.zeros((max(found) + 1, len(BODY25B), 2), np.float32)
+    points = np.zeros((max(files) + 1, len(BODY25B), 2), np.float32)
     confidence = np.zeros(points.shape[:2], np.float32)
-    for frame, name in found.items():
+    for frame, name in files.items():
         people = read_people(archive.read(name), len(BODY25B))
         subject = largest(people)
         if subject is not None:
@@ -173,9 +189,15 @@ def _detections(archive: zipfile.ZipFile, camera: str) -> Observation:
 
 
 def refine(cameras: list[Camera], pixels: Array, weights: Array) -> tuple[list[Camera], Array]:
-    """Return the cameras and their delays (c,) in frames, fitted to what they saw.
+    """Return cameras and delays that fit the detections best; the first camera is fixed.
 
-    The first camera is held. pixels: (c, f, j, 2) undistorted; weights: (c, f, j).
+    Args:
+        cameras: c calibrated cameras.
+        pixels: (c, f, j, 2) undistorted detections of j joints in f frames.
+        weights: (c, f, j) confidences, 0 where missing.
+
+    Returns:
+        The refined cameras, and their delays (c,) in frames behind the first one.
     """
 
     def unpack(x: Array) -> tuple[list[Camera], Array]:
@@ -202,25 +224,25 @@ def refine(cameras: list[Camera], pixels: Array, weights: Array) -> tuple[list[C
 def _synchronous(
     cameras: list[Camera], delays: Array, pixels: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """Triangulate with each camera's detections moved to the times of the first one."""
+    """Triangulate, with the detections of each camera shifted to the times of the first one."""
     moved = [_at(*view) for view in zip(pixels, weights, delays, strict=True)]
-    points, sure = (np.stack(part) for part in zip(*moved, strict=True))
-    return triangulate([c.without_lens() for c in cameras], points, sure)
+    points, confidence = (np.stack(part) for part in zip(*moved, strict=True))
+    return triangulate([c.without_lens() for c in cameras], points, confidence)
 
 
 def _at(values: Array, weights: Array, delay: float) -> tuple[Array, Array]:
-    """Return values (f, ..., d) and weights (f, ...) `delay` frames later, between frames linear.
+    """Return values (f, ..., d) and weights (f, ...) `delay` frames later, interpolated linearly.
 
     The weight is 0 before the first frame, after the last and where a neighbour is missing.
     """
     times = np.arange(len(values)) + delay
     before = np.clip(np.floor(times).astype(int), 0, len(values) - 1)
     after = np.clip(np.ceil(times).astype(int), 0, len(values) - 1)
-    share = (times - before).reshape(-1, *[1] * (values.ndim - 1))
+    fraction = (times - before).reshape(-1, *[1] * (values.ndim - 1))
     inside = (times >= 0) & (times <= len(values) - 1)
-    sure = np.minimum(weights[before], weights[after])
-    sure = np.where(inside.reshape(-1, *[1] * (weights.ndim - 1)), sure, 0.0)
-    return (1 - share) * values[before] + share * values[after], sure
+    weight = np.minimum(weights[before], weights[after])
+    weight = np.where(inside.reshape(-1, *[1] * (weights.ndim - 1)), weight, 0.0)
+    return (1 - fraction) * values[before] + fraction * values[after], weight
 
 
 def _summary(errors: Array) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A recording and what came of it: 2D keypoints as seen, 3D shapes as lifted."""
+"""Recordings: 2D keypoints as detected, and the 3D shapes lifted from them."""
 
 from __future__ import annotations
 
@@ -19,15 +19,18 @@ from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.nrsfm.geometry import centre, weak_perspective
 
-_TOGETHER = 50_000_000  # ns within which an answer and keypoints are of one frame
+_MAX_DELAY = 50_000_000  # ns between the stamps of keypoints and points of one frame
 
 
 @dataclass(frozen=True)
 class Recording:
     """The m objects of a recording.
 
-    `detections` are in the layout `source`, `lifted` in the layout `target`. Objects that were
-    not lifted are NaN with confidence 0.
+    Attributes:
+        source: layout of the detections.
+        target: layout of the lifted shapes.
+        detections: the 2D keypoints.
+        lifted: the 3D shapes; NaN with confidence 0 for objects that were not lifted.
     """
 
     source: KeypointLayout
@@ -37,78 +40,96 @@ class Recording:
 
     @property
     def is_lifted(self) -> NDArray[np.bool_]:
-        """Tell (m,) which objects were lifted."""
-        sound: NDArray[np.bool_] = ~np.isnan(self.lifted.shapes.sum((1, 2)))
-        return sound
+        """Return which objects (m,) were lifted."""
+        is_lifted: NDArray[np.bool_] = ~np.isnan(self.lifted.shapes.sum((1, 2)))
+        return is_lifted
 
 
 def lift_recording(
-    seen: Detections,
+    detections: Detections,
     source: KeypointLayout,
     lifter: Lifter,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     intrinsics: Intrinsics | None = None,
 ) -> Recording:
-    """Lift everyone in `seen`, whose keypoints are those of `source`.
+    """Lift all objects of a recording.
 
-    intrinsics: of the camera, for the shapes to be at their place; None: they are centred. Raises
-    ValueError if too few of them are the model's.
+    Args:
+        detections: 2D keypoints in pixels.
+        source: their layout.
+        lifter: model and options.
+        on_progress: called with the number of objects done and their total number.
+        intrinsics: of the camera, so that shapes are at their position in front of it; None =
+            each shape is centred at the origin.
+
+    Raises:
+        ValueError: too few keypoints of the layout are keypoints of the model.
     """
     target = lifter.model.layout
-    points, confidence = KeypointMap(source, target)(seen.points, seen.confidence)
-    lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter.lift
-    return Recording(source, target, seen, lift_all(lift, points, confidence, on_progress))
+    points, confidence = KeypointMap(source, target)(detections.points, detections.confidence)
+    lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter
+    return Recording(source, target, detections, lift_all(lift, points, confidence, on_progress))
 
 
 def join_lifted_messages(
-    answers: Sequence[LiftedMessage],
-    seen: Detections | None,
+    messages: Sequence[LiftedMessage],
+    detections: Detections | None,
     source: KeypointLayout,
     target: KeypointLayout,
 ) -> Recording:
-    """Return what a lifter answered, beside the keypoints `seen` (None: they were not recorded).
+    """Return recorded messages of a lifter, joined with the keypoints that they belong to.
 
-    Keypoints and answer belong together when their stamps do, row by row. What a lifter does not
-    publish is NaN: the residual, and the rotation of all but the first object. Raises ValueError
-    if the answers are of another model than one with the layout `target`.
+    A message belongs to the frame with the nearest stamp, at most 50 ms away, and its rows to the
+    objects of that frame. What a lifter does not publish is NaN: the residual, and the rotations
+    of all objects but the first.
+
+    Args:
+        messages: lifted messages.
+        detections: the recorded keypoints; None = they were not recorded.
+        source: layout of the detections.
+        target: layout of the model that lifted them.
+
+    Raises:
+        ValueError: the messages are of a model with another number of keypoints.
     """
-    for answer in answers:
-        if answer.confidence.shape[1] != len(target):
+    for message in messages:
+        if message.confidence.shape[1] != len(target):
             raise ValueError(
-                f"the recorded points are {answer.confidence.shape[1]} an object; the model has "
+                f"the recorded points are {message.confidence.shape[1]} an object; the model has "
                 f"{len(target)} keypoints: name the model that lifted them"
             )
-    seen = _unseen(answers, len(source)) if seen is None else seen
-    m, p = len(seen), len(target)
+    if detections is None:
+        detections = _empty_detections(messages, len(source))
+    m, p = len(detections), len(target)
     shapes, rotations = np.full((m, p, 3), np.nan, np.float32), np.full((m, 3, 3), np.nan)
     confidence = np.zeros((m, p), np.float32)
-    for answer in answers:
-        rows = _rows(seen, answer)
-        shapes[rows], confidence[rows] = answer.shapes[: len(rows)], answer.confidence[: len(rows)]
-        if len(rows) and answer.rotation is not None:
-            rotations[rows[0]] = answer.rotation
-    points, known = KeypointMap(source, target)(seen.points, seen.confidence)
-    centred = centre(shapes)
-    scale, translation = weak_perspective(points, centred[..., :2], known > 0)
-    scale = np.where((known > 0).any(1), scale, np.nan).astype(np.float32)
+    for message in messages:
+        rows = _rows(detections, message)
+        n = len(rows)
+        shapes[rows], confidence[rows] = message.shapes[:n], message.confidence[:n]
+        if n and message.rotation is not None:
+            rotations[rows[0]] = message.rotation
+    points, visible = KeypointMap(source, target)(detections.points, detections.confidence)
+    scale, translation = weak_perspective(points, centre(shapes)[..., :2], visible > 0)
+    scale = np.where((visible > 0).any(1), scale, np.nan).astype(np.float32)
     unknown = np.full(m, np.nan, np.float32)
     rotations = rotations.astype(np.float32)
     lifted = Lifted(shapes, rotations, scale, translation, unknown, confidence)
-    return Recording(source, target, seen, lifted)
+    return Recording(source, target, detections, lifted)
 
 
-def _rows(seen: Detections, answer: LiftedMessage) -> NDArray[np.int64]:
-    """Return the rows of `seen` that an answer is about, in its order."""
-    if not len(seen.stamps):
+def _rows(detections: Detections, message: LiftedMessage) -> NDArray[np.int64]:
+    """Return the indices of the detections that a message belongs to, in its order."""
+    if not len(detections.stamps):
         return np.empty(0, np.int64)
-    frame = int(np.abs(seen.stamps - answer.stamp).argmin())
-    if abs(int(seen.stamps[frame]) - answer.stamp) > _TOGETHER:
+    frame = int(np.abs(detections.stamps - message.stamp).argmin())
+    if abs(int(detections.stamps[frame]) - message.stamp) > _MAX_DELAY:
         return np.empty(0, np.int64)
-    return np.flatnonzero(seen.frame == frame)[: len(answer.shapes)]
+    return np.flatnonzero(detections.frame == frame)[: len(message.shapes)]
 
 
-def _unseen(answers: Sequence[LiftedMessage], keypoints: int) -> Detections:
-    """Return frames for answers of which nobody recorded the keypoints."""
-    shown = [np.zeros((len(answer.shapes), keypoints), np.float32) for answer in answers]
-    nothing = [Observation(np.zeros((*c.shape, 2), np.float32), c) for c in shown]
-    return gather(nothing, [answer.stamp for answer in answers], keypoints)
+def _empty_detections(messages: Sequence[LiftedMessage], keypoints: int) -> Detections:
+    """Return a frame for each message, with all keypoints missing."""
+    confidences = [np.zeros((len(message.shapes), keypoints), np.float32) for message in messages]
+    empty = [Observation(np.zeros((*c.shape, 2), np.float32), c) for c in confidences]
+    return gather(empty, [message.stamp for message in messages], keypoints)
