@@ -17,8 +17,9 @@ from tqdm import tqdm
 
 from benchmarks.table import Table
 from deep_nrsfm_ros import __version__
-from deep_nrsfm_ros.commands.evaluate import evaluate, figures, read_split
+from deep_nrsfm_ros.commands.evaluate import evaluate, figures
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
@@ -120,7 +121,7 @@ def _mocap(folder: Path, subjects: tuple[str, ...], split: str, stride: int) -> 
             bar.total = total
             bar.update(done - bar.n)
 
-        return read_split(folder, subjects, split, CMU31, stride=stride, on_progress=show)
+        return read_split(TrialSelection(folder, subjects, split, stride), CMU31, show)
 
 
 def _hash(dataset: Dataset, preset: Preset) -> str:

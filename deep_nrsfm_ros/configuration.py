@@ -131,18 +131,3 @@ def override(base: Config, arguments: argparse.Namespace) -> Config:
     config: Config = dataclasses.replace(base, **values)  # type: ignore[type-var]
     check(config)
     return config
-
-
-def to_arguments(config: Any) -> list[str]:
-    """Return the command-line arguments that set every option of `config`.
-
-    The inverse of `override`: e.g. ["--steps", "3000", "--no-cycle"].
-    """
-    words = []
-    for field, kind, _ in options(type(config)):
-        name, value = field.name.replace("_", "-"), getattr(config, field.name)
-        if kind is bool:
-            words.append(f"--{name}" if value else f"--no-{name}")
-        else:
-            words += [f"--{name}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return words

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.data.pose2sim_scenes import LIMBS, Scene, scenes
 from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.commands.evaluate import read_split
+from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -73,7 +73,9 @@ def benchmark(session: Session) -> Table:
     balancing, standing, pixels = scenes(session.output)
     lifter = Lifter(load_model(find_model("human", model_folders(session.output / "models"))))
     folder = session.data / "cmu"
-    capture = read_split(folder, session.subjects, "all", HUMAN17, stride=30 * session.stride)
+    capture = read_split(
+        TrialSelection(folder, session.subjects, "all", 30 * session.stride), HUMAN17
+    )
     assert capture.shapes is not None
     mean = mean_shape(capture.shapes)[[HUMAN17.index(joint) for joint in JOINTS]]
     trials = {

@@ -28,10 +28,11 @@ from benchmarks.data import synthetic_excavator as excavator
 from benchmarks.real import plausibility
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, lifter
-from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, read_split
+from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate
 from deep_nrsfm_ros.commands.evaluate import figures as error_figures
 from deep_nrsfm_ros.data.bags import Frame, frames, read_bags, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.openpose import read_people
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.presets import BODY25, CMU31, HUMAN17
@@ -43,7 +44,7 @@ from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, find_mode
 from deep_nrsfm_ros.nrsfm.geometry import align, centre
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.training.job import ENDED
-from deep_nrsfm_ros.training.record import look
+from deep_nrsfm_ros.training.record import read_record
 
 Floats = NDArray[Any]
 
@@ -103,7 +104,7 @@ class Session(NamedTuple):
         """Return the model that the program `train` makes, told by `words` what else to do."""
         name, steps = self.name_and_steps(title, kind)
         path = self.models / f"{name}{MODEL_SUFFIX}"
-        record = look(self.models, name)
+        record = read_record(self.models, name)
         if record or not path.exists():
             arguments = (*arguments, "--steps", str(steps), "--threads", "1")
             arguments = ("--resume",) if record else arguments
@@ -213,7 +214,7 @@ def machine(session: Session) -> Table:
 def mocap(session: Session) -> Table:
     """Train on CMU 01 from a bag through ~/train, and from the motion capture directly."""
     folder = session.data / "cmu"
-    truth = read_split(folder, ["01"], "train", CMU31, stride=session.stride)
+    truth = read_split(TrialSelection(folder, ["01"], stride=session.stride), CMU31)
     bag = session.bag(f"cmu01_{session.stride}_bag", lambda: _frames(truth, CMU_RATE))
     suffix = ("--stride", str(session.stride))
     arguments = ("--cmu", str(folder), "--subjects", "01", "--object", CMU31.name, *suffix)
@@ -248,7 +249,7 @@ def _trained_by_service(
     """Return the model that a lifter trains in a process of its own when it is asked to."""
     name, steps = session.name_and_steps(title, "mocap")
     path = session.models / f"{name}{MODEL_SUFFIX}"
-    record = look(session.models, name)
+    record = read_record(session.models, name)
     if path.exists() and not record:
         return load_model(path)
     parameters = {

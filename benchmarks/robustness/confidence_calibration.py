@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from benchmarks.harness import Session, run_program
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
-from deep_nrsfm_ros.commands.evaluate import read_split
+from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.pose2sim import JOINTS, read_session
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25B
@@ -136,7 +136,9 @@ def on_mocap(session: Session, lifter: RecordingLifter, subject: str, seed: int)
     """Lift a subject's frames, seen and spoiled at random, and compare with the truth."""
     layout, rng = lifter.model.layout, np.random.default_rng(seed)
     stride = session.stride if session.stride > 1 else STRIDE
-    truth = read_split(session.data / "cmu", [subject], "all", layout, stride=stride).shapes
+    truth = read_split(
+        TrialSelection(session.data / "cmu", [subject], "all", stride), layout
+    ).shapes
     assert truth is not None
     T, points, confidence = project(truth, rng)
     return compare(lifter, points, confidence, T, np.arange(len(layout)))

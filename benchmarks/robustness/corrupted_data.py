@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.outliers import find_outliers
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 
@@ -60,7 +60,7 @@ def benchmark(session: Session) -> Table:
     )
     for subject in session.subjects:
         folder = session.data / "cmu"
-        dataset = read_split(folder, [subject], "train", HUMAN17, stride=session.stride)
+        dataset = read_split(TrialSelection(folder, [subject], stride=session.stride), HUMAN17)
         for seed in session.seeds:
             table.add((subject,), detection_rates(dataset, corrupt(dataset, seed)), seed)
     return table

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.commands.evaluate import read_split
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
@@ -61,7 +61,7 @@ def benchmark(session: Session) -> Table:
     model = load_model(find_model(MODEL, model_folders(Path("models"))))
     for subject in session.subjects:
         folder = session.data / "cmu"
-        dataset = read_split(folder, [subject], "all", model.layout, stride=session.stride)
+        dataset = read_split(TrialSelection(folder, [subject], "all", session.stride), model.layout)
         for seed in session.seeds:
             scene = random_scene(dataset, seed)
             for word, intrinsics in {"without": None, "with": CAMERA}.items():

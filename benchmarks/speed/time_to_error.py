@@ -20,8 +20,9 @@ from tqdm import tqdm
 from benchmarks.paper.table1_cmu import PAPER
 from benchmarks.speed.timing import print_and_write, speed_parser
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, evaluate, figures, read_split
+from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, evaluate, figures
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
@@ -136,7 +137,7 @@ def benchmark(args: Namespace) -> Iterator[Table]:
     """Run all trainings, the short ones first; yield the table."""
     torch.set_num_threads(args.threads)
     stride = 50 if args.quick else 1
-    dataset = read_split(args.data / "cmu", ("01",), "train", CMU31, stride=stride)
+    dataset = read_split(TrialSelection(args.data / "cmu", ("01",), stride=stride), CMU31)
     trainings: dict[str, TimedTraining] = {}
     for name, contender in reversed(CONTENDERS.items()):
         base = PRESETS[contender.preset]

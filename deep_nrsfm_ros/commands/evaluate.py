@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.mocap import HEIGHT_18, protocol_split, read_trials, trials
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.data.mocap import HEIGHT_18, TrialSelection, read_split
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
@@ -67,28 +66,6 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--stride", type=int, default=1, help="take every n-th frame")
     parser.add_argument("--camera-seed", type=int, default=0, help="cameras as in training: 0")
     return parser
-
-
-def read_split(
-    folder: Path,
-    subjects: Sequence[str],
-    split: str,
-    layout: KeypointLayout,
-    *,
-    seed: int = 0,
-    stride: int = 1,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Dataset:
-    """Return the trials "train", "held-out" (by the paper's protocol) or "all" of the subjects.
-
-    The rest is as in `read_trials`.
-    """
-    paths = []
-    for subject in subjects:
-        found = trials(folder, subject)
-        train, held_out = protocol_split(found)
-        paths += {"train": train, "held-out": held_out, "all": found}[split]
-    return read_trials(paths, layout, seed=seed, stride=stride, on_progress=on_progress)
 
 
 def reconstruct(lifter: Lifter, dataset: Dataset) -> NDArray[np.float32]:
@@ -145,11 +122,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         for name in given.models:
             model = load_model(find_model(name, model_folders(given.models_dir)))
-            dataset = read_split(
-                *(given.cmu, given.subjects, given.split, model.layout),
-                seed=given.camera_seed,
-                stride=given.stride,
+            selection = TrialSelection(
+                given.cmu, given.subjects, given.split, given.stride, given.camera_seed
             )
+            dataset = read_split(selection, model.layout)
             for word, lifting in LIFTING.items():
                 errors = evaluate(model, dataset, lifting)
                 cells = " | ".join(f"{figure:.2f}" for figure in figures(errors).values())

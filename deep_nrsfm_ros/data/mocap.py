@@ -246,3 +246,42 @@ def read_trials(
         parts.append(Dataset(W, np.ones(W.shape[:2], bool), layout, source, S))
         on_progress(done + 1, len(paths))
     return concatenate(parts)
+
+
+@dataclass(frozen=True)
+class TrialSelection:
+    """Trials of the CMU motion capture.
+
+    Attributes:
+        folder: folder of the database (NN/NN.asf, NN/NN_*.amc).
+        subjects: folders of the subjects, e.g. "01".
+        split: "train" or "held-out" by the paper's protocol, or "all".
+        stride: every n-th frame is taken.
+        camera_seed: seed of the random cameras.
+    """
+
+    folder: Path
+    subjects: Sequence[str]
+    split: str = "train"
+    stride: int = 1
+    camera_seed: int = 0
+
+
+def read_split(
+    selection: TrialSelection,
+    layout: KeypointLayout,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Dataset:
+    """Return the selected trials as one dataset, as `read_trials` reads them."""
+    paths: list[Path] = []
+    for subject in selection.subjects:
+        found = trials(selection.folder, subject)
+        train, held_out = protocol_split(found)
+        paths += {"train": train, "held-out": held_out, "all": found}[selection.split]
+    return read_trials(
+        paths,
+        layout,
+        seed=selection.camera_seed,
+        stride=selection.stride,
+        on_progress=on_progress,
+    )

@@ -40,6 +40,7 @@ from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER, InputOptions, Pipeline
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.model_files.find_layout import find_layout
@@ -54,12 +55,12 @@ from deep_nrsfm_ros.node.transforms import TransformBroadcaster
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.request import (
+    LifterInput,
     TrainingOptions,
+    TrainingParameters,
     TrainingRequest,
-    layouts,
-    limited,
     paths_of,
-    sandboxed,
+    training_request,
 )
 
 _SMOOTHING = "smoothing."
@@ -205,8 +206,7 @@ class LifterNode(Node):
         inputs = parameters.read(self, InputOptions, changes=changes)
         lifting = parameters.read(self, LiftingOptions, changes=changes)
         smoothing = parameters.read(self, SmoothingOptions, _SMOOTHING, changes)
-        for checked in (TrainingOptions, Recipe, LayoutLossWeights, Limits, Curation):
-            parameters.read(self, checked, _TRAIN, changes)
+        self._training_parameters(changes)
         # A file is read only when its parameter is set: it may have been deleted since.
         changed = {change.name for change in changes} or {"model", "keypoint_layout"}
         model: Model
@@ -239,27 +239,27 @@ class LifterNode(Node):
         self._pipeline = self._proposed
 
     def _training_request(self) -> TrainingRequest:
-        """Return what ~/train is to do, as the parameters stand."""
-        inputs = parameters.read(self, InputOptions)
-        wanted = sandboxed(parameters.read(self, TrainingOptions, _TRAIN), self._sandbox)
-        heard = self._sandbox.layout("keypoint_layout", inputs.keypoint_layout)
-        topics, model = self._keypoint_topics.topics, self._sandbox.model("model", inputs.model)
-        source, target = layouts(wanted, heard, model, wanted.from_)
-        return TrainingRequest(
-            wanted,
-            parameters.read(self, Recipe, _TRAIN),
-            topic=wanted.topic or (topics[0] if len(topics) == 1 else ""),
-            input_type=inputs.input_type,
+        """Return the training that the present parameters ask for."""
+        inputs, topics = parameters.read(self, InputOptions), self._keypoint_topics.topics
+        lifter = LifterInput(
+            topic=topics[0] if len(topics) == 1 else "",
+            keypoint_layout=self._sandbox.layout("keypoint_layout", inputs.keypoint_layout),
+            model=self._sandbox.model("model", inputs.model),
+            min_confidence=inputs.min_confidence,
+            mapping=inputs.input_type if inputs.input_type.endswith(MAPPING_SUFFIXES) else "",
             image_width=inputs.image_width,
             image_height=inputs.image_height,
-            source_layout=source,
-            target_layout=target,
-            start=wanted.from_,
-            min_confidence=inputs.min_confidence,
-            output=self._sandbox.models_dir,
-            curation=parameters.read(self, Curation, _TRAIN),
-            layout_loss=parameters.read(self, LayoutLossWeights, _TRAIN),
-            limits=limited(parameters.read(self, Limits, _TRAIN), wanted.max_minutes),
+        )
+        return training_request(self._training_parameters(), lifter, self._sandbox)
+
+    def _training_parameters(self, changes: Sequence[Parameter] = ()) -> TrainingParameters:
+        """Return the parameters `train.*` after `changes`; raise ValueError for a wrong one."""
+        return TrainingParameters(
+            parameters.read(self, TrainingOptions, _TRAIN, changes),
+            parameters.read(self, Recipe, _TRAIN, changes),
+            parameters.read(self, LayoutLossWeights, _TRAIN, changes),
+            parameters.read(self, Limits, _TRAIN, changes),
+            parameters.read(self, Curation, _TRAIN, changes),
         )
 
     def _activate(self, path: str) -> None:

@@ -14,17 +14,16 @@ from std_srvs.srv import Trigger
 from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, status
 from deep_nrsfm_ros.training.job import Progress, TrainingJob
-from deep_nrsfm_ros.training.record import find_records, look
-from deep_nrsfm_ros.training.request import TrainingOptions, TrainingRequest
+from deep_nrsfm_ros.training.record import find_records, read_record
+from deep_nrsfm_ros.training.request import TrainingRequest
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class TrainingService:
-    """Trains on request, one job at a time, and tells how it goes.
+    """Trains on request, one job at a time, and publishes its progress.
 
-    Everything that is ROS happens on the executor's thread: the thread that listens to the
-    job only queues what it hears.
+    All calls of ROS happen on the executor's thread: the thread of the job only queues progress.
     """
 
     def __init__(
@@ -36,16 +35,18 @@ class TrainingService:
     ) -> None:
         """Offer the services on `node`.
 
-        request: gives the request as the parameters stand; ValueError says what is wrong.
-        activate: switches to the model in the file named; ValueError says why it cannot.
-        folder: where models are, and what is left of trainings that were cut off.
+        Args:
+            node: the lifter.
+            request: returns the training that the present parameters ask for; raises ValueError.
+            activate: switches to the model in a file; raises ValueError if it cannot.
+            folder: folder of models and of the records of trainings.
         """
         self._node, self._request, self._activate = node, request, activate
         self._folder = folder
         self._job: TrainingJob | None = None
-        self._wanted = TrainingOptions()
+        self._name, self._activate_when_finished = "", True
         self._state, self._last_failure = "idle", "none"
-        self._heard: SimpleQueue[Progress] = SimpleQueue()
+        self._progress: SimpleQueue[Progress] = SimpleQueue()
         self._wake = node.create_guard_condition(self._report)
         self._publisher = node.create_publisher(
             DiagnosticStatus,
@@ -55,50 +56,47 @@ class TrainingService:
         )
         node.create_service(Trigger, "~/train", self._train)
         node.create_service(Trigger, "~/cancel_training", self._cancel)
-        self._tell_of_unfinished()
+        self._report_records()
 
     def close(self, timeout: float) -> None:
         """End a training that runs, by force after `timeout` seconds."""
         if self._job:
             self._job.close(timeout)
 
-    def _tell_of_unfinished(self) -> None:
-        """Say what was cut off before the lifter started, and how to go on."""
+    def _report_records(self) -> None:
+        """Report the trainings that were cut off before the lifter started, and how to go on."""
         message = "no training since the lifter started"
-        found = find_records(self._folder)
-        for one in found:
-            text = f"{one}: {one.advice}"
+        records = find_records(self._folder)
+        for record in records:
+            text = f"{record}: {record.advice}"
             self._node.get_logger().warning(text)
             message += f"; {text}"
-        names = {"unfinished": ", ".join(one.name for one in found)} if found else {}
-        self._tell(Progress("idle", message, {**names}))
+        names = {"unfinished": ", ".join(record.name for record in records)} if records else {}
+        self._publish(Progress("idle", message, {**names}))
 
     def _train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start a training and answer at once."""
         try:
             if self._job:
                 raise ValueError(
-                    f"training of {self._wanted.name!r} is under way; wait, or call "
-                    "~/cancel_training"
+                    f"training of {self._name!r} is under way; wait, or call ~/cancel_training"
                 )
             request = self._request()
-            warning = request.check()
-            self._job = TrainingJob(
-                request.arguments(), self._hear, threads=request.options.threads
-            )
+            config, warning = request.accept()
+            self._job = TrainingJob(config, self._enqueue)
         except (ValueError, OSError) as problem:
             response.success, response.message = False, str(problem)
             return response
-        self._wanted = request.options
-        data = f"{request.topic} of {', '.join(request.options.bags)}"
-        if self._wanted.resume:
+        self._name, self._activate_when_finished = config.output.name, request.activate
+        data = f"{config.data.topic} of {', '.join(map(str, config.data.bags))}"
+        if config.resume:
             data = "the data that it began with"
         response.success = True
-        response.message = f"training {self._wanted.name!r} on {data}"
+        response.message = f"training {self._name!r} on {data}"
         if warning:
             response.message += f"; {warning}"
             self._node.get_logger().warning(warning)
-        self._tell(Progress("starting", f"starting on {data}", {}))
+        self._publish(Progress("starting", f"starting on {data}", {}))
         return response
 
     def _cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -107,35 +105,35 @@ class TrainingService:
         response.message = "no training is under way"
         if self._job:
             self._job.cancel()
-            response.message = f"cancelling the training of {self._wanted.name!r}"
+            response.message = f"cancelling the training of {self._name!r}"
         return response
 
-    def _hear(self, progress: Progress) -> None:
-        """Take progress from the job's thread to the executor's."""
-        self._heard.put(progress)
+    def _enqueue(self, progress: Progress) -> None:
+        """Pass progress from the job's thread to the executor's."""
+        self._progress.put(progress)
         self._wake.trigger()
 
     def _report(self) -> None:
-        """Publish what the job has said since the last time."""
+        """Publish the progress that the job has queued."""
         while True:
             try:
-                progress = self._heard.get_nowait()
+                progress = self._progress.get_nowait()
             except Empty:
                 return
             if progress.ended:
                 self._job = None
             if progress.state in ("failed", "cancelled"):
                 progress = self._with_advice(progress)
-            if progress.state == "finished" and self._wanted.activate:
+            if progress.state == "finished" and self._activate_when_finished:
                 progress = self._switch(progress)
-            self._tell(progress)
+            self._publish(progress)
 
     def _with_advice(self, progress: Progress) -> Progress:
-        """Add to an untimely end how to go on, if there is something to go on from."""
-        found = look(self._folder, self._wanted.name)
-        if not found:
+        """Return the end of a training with how to continue it, if it can be continued."""
+        record = read_record(self._folder, self._name)
+        if not record:
             return progress
-        return progress._replace(message=f"{progress.message}\n{found}: {found.advice}")
+        return progress._replace(message=f"{progress.message}\n{record}: {record.advice}")
 
     def _switch(self, progress: Progress) -> Progress:
         """Activate the model of a finished training and say so."""
@@ -145,10 +143,10 @@ class TrainingService:
             return progress._replace(message=f"{progress.message}; not in use: {problem}")
         return progress._replace(message=f"{progress.message}; in use from now on")
 
-    def _tell(self, progress: Progress) -> None:
-        """Publish progress; log it where the state changes."""
+    def _publish(self, progress: Progress) -> None:
+        """Publish progress, and log it where the state changes or there is a message."""
         failed = progress.state == "failed"
-        news = f"training of {self._wanted.name!r}: {progress.message}"
+        news = f"training of {self._name!r}: {progress.message}"
         if failed:
             self._node.get_logger().error(news)
             self._last_failure = news

@@ -1,7 +1,8 @@
-"""What a training is told: the recipe, and the presets that go with it."""
+"""The options of a training besides its data: recipe, layout losses, and presets of both."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,76 +16,115 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 class Recipe:
     """Training."""
 
-    steps: int = option(30_000, "gradient steps", low=1, high=10_000_000)
-    batch: int = option(64, "frames a step", low=1, high=65536)
-    learning_rate: float = option(3e-3, "learning rate of Adam at the start", low=1e-7, high=1.0)
+    steps: int = option(30_000, "gradient steps of the training", low=1, high=10_000_000)
+    batch: int = option(64, "frames of each gradient step", low=1, high=65536)
+    learning_rate: float = option(
+        3e-3, "learning rate of Adam at the first step; 0.001 to 0.003 typical", low=1e-7, high=1.0
+    )
     schedule: str = option(
         "cosine",
-        "learning rate: cosine to zero, or the paper's release (x 0.95 every 10000 steps)",
+        "course of the learning rate: cosine falls to zero at the last step; exponential is that "
+        "of the paper's code, multiplied by 0.95 every 10000 steps",
         choices=("cosine", "exponential"),
     )
-    cycle: float = option(2.0, "weight of the cycle loss; 0 is the paper's loss", low=0, high=100)
+    cycle: float = option(
+        2.0,
+        "weight of the cycle loss: a shape seen from another camera gives the same shape again; "
+        "0 = off as in the paper, 2 typical",
+        low=0,
+        high=100,
+    )
     spectral: float = option(
-        0.01, "weight of the camera's spectral norm, for a free camera only", low=0, high=100
+        0.01,
+        "weight of the camera's spectral norm in the loss; used with the free camera only; "
+        "0 = off, 0.01 typical",
+        low=0,
+        high=100,
     )
     noise: float = option(
-        0.0, "highest noise added to the input, relative to its size", low=0.0, high=1.0
+        0.0,
+        "largest random noise added to the input while training, as a share of the object's size; "
+        "0 = off, 0.05 typical",
+        low=0.0,
+        high=1.0,
     )
-    mask: float = option(0.0, "highest share of points hidden in the input", low=0.0, high=0.9)
+    mask: float = option(
+        0.0,
+        "largest share of keypoints hidden at random in the input while training; 0 = off, 0.3 "
+        "typical",
+        low=0.0,
+        high=0.9,
+    )
     paper_initialisation: bool = option(
-        False, "start as the paper's release: random biases, convolutions' fans"
+        False,
+        "initialise the weights as the paper's code does: random biases, and the scale of weights "
+        "by the fans of its convolutions",
     )
     seeds: int = option(
-        3, "initialisations tried; the one with the lowest cycle error goes on", low=1, high=1000
+        3,
+        "random initialisations that are compared at the start; the one with the lowest cycle "
+        "error is trained to the end",
+        low=1,
+        high=1000,
     )
     screening: int = option(
-        1000, "steps after which they are compared, at most a tenth of all", low=1
+        1000,
+        "steps after which the initialisations are compared; a tenth of all steps at most",
+        low=1,
     )
-    seed: int = option(0, "seed of everything random", low=0, high=2**31)
+    seed: int = option(
+        0, "seed of all random numbers; the same seed gives the same model", low=0, high=2**31
+    )
 
 
 @dataclass(frozen=True)
 class LayoutLossWeights:
-    """What the layout knows of the object.
+    """Losses of the keypoint layout.
 
-    All is off by default, as in the paper, which knows nothing of bones and fronts.
+    All are off by default, as in the paper, whose method uses neither bones nor handedness.
     """
 
     bone_length_weight: float = option(
         0.0,
-        "weight of bones that keep their lengths, left ones as long as right ones, for an object "
-        "whose edges are rigid that was seen from one side only; 3 is much; 0: none",
+        "weight of the bone-length loss: bones keep their lengths, and left and right bones are "
+        "equally long; for objects seen from one side only; 0 = off, 1 typical, 3 strong",
         low=0.0,
         high=1000.0,
     )
     handedness_weight: float = option(
         0.0,
-        "weight of the handedness while training: the keypoints that the layout says are in front "
-        "should be; for the same objects, 1 is much; 0: none",
+        "weight of the handedness loss: the keypoints that the layout names as the front are in "
+        "front; for objects seen from one side only; 0 = off, 0.3 typical, 1 strong",
         low=0.0,
         high=1000.0,
     )
     depth_penalty: float = option(
         0.0,
-        "weight of depth, so that there is no more of it than the rest asks for, bones that keep "
-        "their lengths above all; for the same objects, 0.3 is much; 0: none",
+        "weight of the depth loss: the object is no deeper than the other losses need, the "
+        "bone-length loss above all; for objects seen from one side only; 0 = off, 0.1 typical, "
+        "0.3 strong",
         low=0.0,
         high=1000.0,
     )
 
-    def check(self, layout: KeypointLayout) -> None:
-        """Raise ValueError if the layout has nothing of what is asked for."""
-        for weight, field in (("bone_length_weight", "edges"), ("handedness_weight", "handedness")):
-            asked = getattr(self, weight)
-            if asked and not getattr(layout, field):
+    def check(self, layout: KeypointLayout, name_of: Callable[[str], str] = str) -> None:
+        """Raise ValueError if `layout` lacks the edges or the handedness that a weight needs.
+
+        Args:
+            layout: layout of the model.
+            name_of: returns the name of an option, for the message.
+        """
+        for name, field in (("bone_length_weight", "edges"), ("handedness_weight", "handedness")):
+            weight = getattr(self, name)
+            if weight and not getattr(layout, field):
                 raise ValueError(
-                    f"{weight} is {asked:g}, but layout {layout.name!r} has no {field}; give it "
-                    "some in a layout file, or ask for 0"
+                    f"{name_of(name)} is {weight:g}, but layout {layout.name!r} has no {field}; "
+                    "add some in a layout file, or set the weight to 0"
                 )
 
 
 class Preset(NamedTuple):
-    """Everything that shapes a training but the data."""
+    """Network, normaliser and recipe of a training."""
 
     architecture: Architecture
     normaliser: Normaliser

@@ -19,6 +19,7 @@ gradient comes from the code, which is not zero.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -64,8 +65,14 @@ def start_from(model: Model, layout: KeypointLayout) -> Network:
     )
 
 
-def keep_what_is_fixed(model: Model, preset: Preset) -> None:
-    """Raise ValueError that names an option of `preset` which `model` has fixed otherwise."""
+def check_fixed_options(model: Model, preset: Preset, name_of: Callable[[str], str] = str) -> None:
+    """Raise ValueError unless `preset` has the architecture and the normaliser of `model`.
+
+    Args:
+        model: the model to start from.
+        preset: the preset to train with.
+        name_of: returns the name of an option, for the message.
+    """
     fixed, wanted = (
         dataclasses.asdict(architecture) | dataclasses.asdict(normaliser)
         for architecture, normaliser in (
@@ -76,8 +83,8 @@ def keep_what_is_fixed(model: Model, preset: Preset) -> None:
     for name, value in wanted.items():
         if value != fixed[name]:
             raise ValueError(
-                f"{name} is {value}; model {model.name!r}, from which to start, has {fixed[name]}: "
-                "leave the option out"
+                f"{name_of(name)} is {value}; model {model.name!r}, from which to start, has "
+                f"{fixed[name]}: leave the option out"
             )
 
 

@@ -12,7 +12,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
+
+from deep_nrsfm_ros.training.config import TrainingConfig
 
 Value = str | int | float | None
 
@@ -43,41 +45,45 @@ class Progress(NamedTuple):
 class TrainingJob:
     """One run of the training command, from its start to its end.
 
-    The process runs at the lowest priority in a session of its own, so that neither Ctrl-C nor
-    its appetite reaches the lifter. It prints one JSON object a line, {"state": ..., ...}; any
-    other line is kept as its last words. Its standard input is a pipe: end of file means that
-    the lifter is gone, and the process shall end.
+    The process runs at a low priority in a session of its own, so that neither Ctrl-C nor its load
+    reaches the lifter. It reads its configuration from a file in memory (`--config`). It prints
+    one JSON object a line, {"state": ..., ...}; the last other lines are kept as its last words.
+    Its standard input is a pipe: end of file means that the lifter is gone, and the process ends.
     """
 
     def __init__(
         self,
-        arguments: Sequence[str],
+        config: TrainingConfig,
         on_progress: Callable[[Progress], None],
         *,
-        threads: int = 1,
         grace: float = 20.0,
         command: Sequence[str] = TRAIN_COMMAND,
     ) -> None:
-        """Start `command` with `arguments`; raise OSError if it cannot be started.
+        """Start the training; raise OSError if the process cannot be started.
 
-        on_progress: called from a thread of the job for every step; the last one, and only
-            that, has `ended` set, and comes when the process is gone.
-        threads: number of threads that the numerical libraries may use.
-        grace: seconds from `cancel` until a process that does not react is killed.
+        Args:
+            config: the training. Its threads are those that the numerical libraries may use too.
+            on_progress: called from a thread of the job with each progress. The last one, and only
+                that, has `ended` set, and comes when the process is gone.
+            grace: seconds from `cancel` until a process that does not react is killed.
+            command: the training command.
         """
         self._on_progress = on_progress
         self._grace = grace
         self._cancelled = False
         self._said: Progress | None = None
         self._last_words: deque[str] = deque(maxlen=_LAST_WORDS)
-        self._process = subprocess.Popen(
-            [*command, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            env=os.environ | dict.fromkeys(_THREAD_VARIABLES, str(threads)),
-        )
+        threads = str(config.output.threads or os.cpu_count() or 1)
+        with _file_in_memory(config.to_json()) as file:
+            self._process = subprocess.Popen(
+                [*command, "--config", f"/dev/fd/{file.fileno()}", "--json-progress"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                env=os.environ | dict.fromkeys(_THREAD_VARIABLES, threads),
+                pass_fds=[file.fileno()],
+            )
         _yield_to_others(self._process.pid)
         self._watcher = threading.Thread(target=self._watch, name="training", daemon=True)
         self._watcher.start()
@@ -156,6 +162,14 @@ class TrainingJob:
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
         words = "\n".join(self._last_words) or "it said nothing"
         return Progress("failed", f"the training process ended {how}; its last words:\n{words}", {})
+
+
+def _file_in_memory(text: str) -> BinaryIO:
+    """Return an open file without a name that holds `text`: nothing is left of it on any disk."""
+    file = os.fdopen(os.memfd_create("training_config"), "w+b")
+    file.write(text.encode())
+    file.flush()
+    return file
 
 
 def _yield_to_others(pid: int) -> None:

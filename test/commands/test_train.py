@@ -26,6 +26,7 @@ from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.training import run
 from deep_nrsfm_ros.training.trainer import Trainer
 
 DEADLINE = 90.0
@@ -287,18 +288,18 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "numbered motion capture": (
         ["--cmu", "FOLDER", "--object", "numbered"],
-        "--object numbered takes the points of bags",
+        "--object is 'numbered', which takes the points of bags",
     ),
     "absent start": (["--bag", "BAG", "--from", "nowhere"], "no model 'nowhere'; there are"),
     "start of another shape": (
         ["--bag", "BAG", "--from", "human", "--widths", "8"],
-        "widths is (8,); model 'human', from which to start, has",
+        "--widths is (8,); model 'human', from which to start, has",
     ),
     "start of another object": (
         ["--bag", "BAG", "--from", "cmu31", "--object", "coco17"],
         "model 'cmu31' knows 0 of the 17 keypoints",
     ),
-    "out of range": (["--bag", "BAG", "--learning-rate", "7"], "learning_rate is 7.0"),
+    "out of range": (["--bag", "BAG", "--learning-rate", "7"], "--learning-rate is 7.0"),
     "no dictionary": (["--bag", "BAG", "--widths"], "widths"),
     "output is a file": (
         ["--bag", "BAG", "--keypoint-layout", "coco17", "--output", "FOLDER/file"],
@@ -362,7 +363,7 @@ def test_the_ground_truth_is_not_read(
     found = []
     for shapes in (None, np.full((60, 17, 3), np.nan, np.float32)):
         dataset = Dataset(points, confidence > 0, COCO17, "made up", shapes)
-        monkeypatch.setattr(train, "read_data", lambda given, report, e=dataset: e)
+        monkeypatch.setattr(run, "read_data", lambda config, reporter, e=dataset: e)
         assert in_process(*arguments, "--steps", "5") == 0
         found.append(load_model(models / "mine.safetensors"))
     assert found[0].quality == found[1].quality
@@ -515,7 +516,7 @@ def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
     monkeypatch.setattr(train, "stop_with_parent", lambda stopped: stopped)
     words = (*arguments, "--steps", "3")
     for told in ("", "no depth in mine"):
-        monkeypatch.setattr(train, "handedness_warning", lambda model, dataset, told=told: told)
+        monkeypatch.setattr(run, "handedness_warning", lambda model, dataset, told=told: told)
         assert in_process(*words, "--json-progress") == 0
         *_, end = map(json.loads, capsys.readouterr().out.splitlines())
         assert (end["state"], end.get("warning", "")) == ("finished", told)

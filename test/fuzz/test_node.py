@@ -25,7 +25,7 @@ from deep_nrsfm_ros.node.parameters import parameter_name
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.training.job import parse_progress
 from deep_nrsfm_ros.training.limits import Limits
-from deep_nrsfm_ros.training.record import look, record_file
+from deep_nrsfm_ros.training.record import read_record, record_file
 from deep_nrsfm_ros.training.request import TrainingOptions, sandboxed
 from test.fuzz.conftest import Bench, Fuzz, Spoiler
 
@@ -40,8 +40,9 @@ def test_what_a_training_says_and_leaves_is_understood_or_not(fuzz: Fuzz, tmp_pa
         text = spoiler.spoil_bytes(line)
         text = text if spoiler.random() < 0.9 else b"[" * spoiler.randrange(60000)
         record_file(tmp_path, "mine").write_bytes(text)
-        progress, found = parse_progress(text.decode(errors="replace")), look(tmp_path, "mine")
-        assert found is None or str(found) and found.advice
+        progress = parse_progress(text.decode(errors="replace"))
+        record = read_record(tmp_path, "mine")
+        assert record is None or str(record) and record.advice
         return "progress" if progress else "words"
 
     fuzz("training", one)
@@ -58,6 +59,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
     stub._sandbox = PathSandbox(tmp_path, tmp_path, ["thing"])
     stub._pipeline = Pipeline(bench.model, None, inputs, LiftingOptions(), SmoothingOptions())
     stub._build_pipeline = lambda changes: LifterNode._build_pipeline(stub, changes)
+    stub._training_parameters = lambda changes: LifterNode._training_parameters(stub, changes)
     p = len(bench.layout)
     points = np.random.default_rng(0).uniform(50, 600, (1, p, 2))
     valid = bags._ENCODERS[POINT_CLOUD](next(frames(points, np.ones((1, p)))))

@@ -26,7 +26,7 @@ from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.node.publishing import point_cloud
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint
-from deep_nrsfm_ros.training.record import checkpoint_file, look, record_file
+from deep_nrsfm_ros.training.record import checkpoint_file, read_record, record_file
 from test.node.conftest import Connect, StartLifter
 
 P = 17
@@ -184,7 +184,7 @@ def test_many_kills_each_gone_on_with_end_in_the_model_of_a_training_left_alone(
         stream.until(lambda: ended() or time.monotonic() > moment, "the moment")
 
     def begin(name: str) -> None:
-        found = look(models, name)
+        found = read_record(models, name)
         counts["gone on with"] += bool(found)
         client.set_parameters(train__name=name, train__resume=found is not None)
         status.clear()
@@ -194,7 +194,7 @@ def test_many_kills_each_gone_on_with_end_in_the_model_of_a_training_left_alone(
     begin("alone")
     stream.until(ended, "the end", PATIENCE)
     alone = load_file(models / "alone.safetensors")
-    while counts["killed"] < MANY_KILLS or look(models, "killed"):
+    while counts["killed"] < MANY_KILLS or read_record(models, "killed"):
         begin("killed")
         if counts["killed"] == MANY_KILLS:
             stream.until(ended, "the end", PATIENCE)
@@ -246,7 +246,7 @@ def test_a_new_lifter_finds_what_was_cut_off(
     second.wait_for_log("unfinished training of 'fresh'")
     later = connect()
     status = later.wait_for_training("idle")
-    for words in ("steps 1000000", f"bag {tmp_path / 'bag'}", "ago", "train.resume to true",
+    for words in ("steps 1000000", f"bags {tmp_path / 'bag'}", "ago", "train.resume to true",
                   "ros2 run deep_nrsfm_ros train --resume --name fresh"):  # fmt: skip
         assert words in status.message and words in second.log
     assert values(status)["unfinished"] == "fresh"

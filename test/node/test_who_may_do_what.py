@@ -68,7 +68,7 @@ def test_a_request_beyond_the_owners_limits_is_refused(
     start_lifter(STAND_IN, train=train)
     client = connect()
     refused = client.call("/lifter/train")
-    assert not refused.success and "needs 1000000000 MB (free_disk)" in refused.message
+    assert not refused.success and "needs 1000000000 MB (train.free_disk)" in refused.message
     client.set_parameters(train__minutes=6)
     refused = client.call("/lifter/train")
     assert not refused.success and "allows at most 5 (train.max_minutes)" in refused.message

@@ -1,4 +1,4 @@
-"""Stands in for the training command: speaks its protocol and behaves as --name says.
+"""Stands in for the training command: speaks its protocol and behaves as its model is named.
 
 Its model is a copy of the first "bag".
 """
@@ -22,11 +22,10 @@ def say(state: str, **values: object) -> None:
 def main() -> None:
     """Train on nothing."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--name", choices=("finish", "wait", "deaf", "crash", "refuse", "mute"))
-    parser.add_argument("--bag", type=Path)
-    parser.add_argument("--output", type=Path)
-    options, _ = parser.parse_known_args()
-    behaviour = options.name
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--json-progress", action="store_true", required=True)
+    config = json.loads(parser.parse_args().config.read_text())
+    behaviour = config["output"]["name"]
     stop = threading.Event()
     if behaviour == "deaf":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -50,8 +49,9 @@ def main() -> None:
         say("cancelled", message="kept the best of 1 step", model="best.safetensors")
         return
     model = "new.safetensors"
-    if options.output:
-        model = str(shutil.copy(options.bag, options.output / f"{behaviour}.safetensors"))
+    if config["data"]["bags"]:
+        folder = Path(config["output"]["folder"])
+        model = str(shutil.copy(config["data"]["bags"][0], folder / f"{behaviour}.safetensors"))
     say("finished", message="done", model=model, step=2, steps=2)
 
 

@@ -14,7 +14,7 @@ from deep_nrsfm_ros.nrsfm.geometry import reprojection_error
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, forward, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
-from deep_nrsfm_ros.training.fine_tuning import inherit, keep_what_is_fixed, start_from
+from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.loop import Callbacks, Setup, train
 from deep_nrsfm_ros.training.trainer import Trainer
@@ -139,13 +139,13 @@ def test_what_the_model_has_fixed_cannot_be_chosen_anew(
     source: Model, part: str, changes: dict[str, Any], complaint: str
 ) -> None:
     preset = Preset(source.network.architecture, source.normaliser, RECIPE)
-    keep_what_is_fixed(source, preset)
+    check_fixed_options(source, preset)
     preset = preset._replace(**{part: dataclasses.replace(getattr(preset, part), **changes)})
     if complaint:
         with pytest.raises(ValueError, match=complaint):
-            keep_what_is_fixed(source, preset)
+            check_fixed_options(source, preset)
     else:
-        keep_what_is_fixed(source, preset)
+        check_fixed_options(source, preset)
 
 
 def test_it_inherits_its_origin_and_the_axes_that_it_cannot_find(

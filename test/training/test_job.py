@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.job import ENDED, Progress, TrainingJob, parse_progress
 
 STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in_training.py")))
@@ -43,9 +44,13 @@ class Listener:
         return heard
 
 
+def config(behaviour: str) -> TrainingConfig:
+    return TrainingConfig().with_options({"name": behaviour})
+
+
 def start(behaviour: str, **settings: Any) -> tuple[TrainingJob, Listener]:
     listener = Listener()
-    return TrainingJob(["--name", behaviour], listener, command=STAND_IN, **settings), listener
+    return TrainingJob(config(behaviour), listener, command=STAND_IN, **settings), listener
 
 
 def assert_gone(pid: int) -> None:
@@ -151,7 +156,7 @@ def test_a_process_that_never_says_how_it_ended_has_failed() -> None:
 
 def test_a_command_that_does_not_exist_is_an_error_at_once() -> None:
     with pytest.raises(OSError, match="no-such-program"):
-        TrainingJob([], lambda _: None, command=["/no-such-program"])
+        TrainingJob(TrainingConfig(), lambda _: None, command=["/no-such-program"])
 
 
 def test_the_process_ends_when_its_owner_is_killed() -> None:
@@ -160,9 +165,11 @@ def test_the_process_ends_when_its_owner_is_killed() -> None:
             sys.executable,
             "-c",
             "import sys, time\n"
+            "from deep_nrsfm_ros.training.config import TrainingConfig\n"
             "from deep_nrsfm_ros.training.job import TrainingJob\n"
             "say = lambda _: print(job.pid, flush=True)\n"
-            "job = TrainingJob(['--name', 'wait'], say, command=sys.argv[1:])\n"
+            "config = TrainingConfig().with_options({'name': 'wait'})\n"
+            "job = TrainingJob(config, say, command=sys.argv[1:])\n"
             "time.sleep(1000)",
             *STAND_IN,
         ],

@@ -1,15 +1,20 @@
-"""What the arguments of a training make of its data before it starts."""
+"""The data of a training is curated and assessed before the training starts."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.commands.train import arguments
+from deep_nrsfm_ros.commands.train import parser
+from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.preparation import prepare
+from deep_nrsfm_ros.training.reporter import Reporter
+
+REPORTER = Reporter(as_json=False, should_stop=lambda: False)
 
 
 def people(f: int = 60) -> Dataset:
@@ -29,14 +34,17 @@ def people(f: int = 60) -> Dataset:
         (("--bag", "bag", "--min-change", "0"), 120),
     ],
 )
-def test_motion_capture_is_left_as_it_is_unless_told(words: tuple[str, ...], left: int) -> None:
-    said: list[str] = []
-    curated, sufficiency = prepare(arguments().parse_args(words), people(), said.append)
-    assert len(curated.dataset) == sufficiency.frames == left
-    assert any("near-duplicates" in sentence for sentence in said) == (left == 60)
-    assert any(sentence.startswith("warning: ") for sentence in said)
+def test_motion_capture_keeps_all_frames_by_default(
+    words: tuple[str, ...], left: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = TrainingConfig.from_arguments(parser().parse_args(words))
+    prepared = prepare(config.curation, people(), REPORTER)
+    assert len(prepared.dataset) == prepared.sufficiency.frames == left
+    sentences = capsys.readouterr().err.splitlines()
+    assert any("near-duplicates" in sentence for sentence in sentences) == (left == 60)
+    assert any(sentence.startswith("warning: ") for sentence in sentences)
 
 
 def test_hopeless_data_is_refused() -> None:
-    with pytest.raises(ValueError, match="cannot be learned from this: .*at least 10"):
-        prepare(arguments().parse_args(["--bag", "bag"]), people(3), print)
+    with pytest.raises(ValueError, match=r"cannot be learned from this: .*at least 10"):
+        prepare(Curation(), people(3), REPORTER)

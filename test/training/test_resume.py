@@ -21,7 +21,7 @@ import deep_nrsfm_ros
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
-from deep_nrsfm_ros.training.record import checkpoint_file, look, record_file
+from deep_nrsfm_ros.training.record import checkpoint_file, read_record, record_file
 
 DEADLINE = 60.0
 PROGRAM = (sys.executable, "-m", "deep_nrsfm_ros.commands.train", "--json-progress")
@@ -88,7 +88,7 @@ def test_a_cancelled_training_goes_on_with_nothing_but_its_name(folder: Folder) 
     wait_for(record_file(folder.models, "mine").exists, "the record")
     second = lines_of(folder.begin("--steps", "3"))[-1]
     assert second["state"] == "failed" and "another process trains 'mine'" in second["message"]
-    found = look(folder.models, "mine")
+    found = read_record(folder.models, "mine")
     assert found is not None and found.running and "another process" in str(found)
     for line in process.stdout or ():
         if json.loads(line)["state"] == "training":
@@ -96,16 +96,17 @@ def test_a_cancelled_training_goes_on_with_nothing_but_its_name(folder: Folder) 
     process.send_signal(signal.SIGTERM)
     cancelled = lines_of(process)[-1]
     assert "--resume goes on" in cancelled["message"], cancelled
-    found = look(folder.models, "mine")
+    found = read_record(folder.models, "mine")
     assert found is not None and found.saved and not found.running
-    assert found.asked["bag"] == [str(folder.path / "bag")] and found.asked["steps"] == 1000000
+    assert found.config is not None
+    assert found.config.data.bags == (folder.path / "bag",) and found.config.recipe.steps == 1000000
     assert "train.resume to true" in found.advice
 
     steps = load_model(folder.models / "mine.safetensors").provenance["step"] + 20
     *said, last = lines_of(folder.start("--resume", "--steps", str(steps)))
     assert last["state"] == "finished", last
     warnings = [line["message"] for line in said if " was " in line.get("message", "")]
-    change = f"warning: since this training began, steps was 1000000, is {steps} now"
+    change = f"warning: since this training began, --steps was 1000000, is {steps} now"
     assert warnings == [change]
     provenance = load_model(folder.models / "mine.safetensors").provenance
     assert (provenance["step"], provenance["recipe"]["cycle"]) == (steps, 1.5)
@@ -121,7 +122,7 @@ def test_nothing_to_resume_is_said(folder: Folder) -> None:
     checkpoint_file(folder.models, "mine").write_bytes(b"\0" * 8)
     record_file(folder.models, "mine").write_text("half a rec")
     last = lines_of(folder.start("--resume"))[-1]
-    assert "there is no record of what" in last["message"]
+    assert "there is no record of the options" in last["message"]
     last = lines_of(folder.begin("--resume", "--steps", "3"))[-1]
     assert ".mine.checkpoint cannot be read" in last["message"]
 
@@ -138,13 +139,14 @@ def test_a_killed_training_leaves_whole_files_and_goes_on(folder: Folder) -> Non
         process.wait()
         for path in folder.models.glob("*.safetensors"):
             load_model(path)
-        found = look(folder.models, "mine")
+        found = read_record(folder.models, "mine")
         if found is None:  # it was faster
             break
-        assert not found.running and found.asked["steps"] == 400
+        assert not found.running and found.config is not None
+        assert found.config.recipe.steps == 400
         process = folder.start("--resume")
         time.sleep(1)
-    if look(folder.models, "mine"):
+    if read_record(folder.models, "mine"):
         process.kill()
         process.wait()
         assert lines_of(folder.start("--resume"))[-1]["state"] == "finished"
@@ -187,5 +189,5 @@ def test_who_listens_may_die_and_the_training_saves(folder: Folder) -> None:
     process.stdin.close()
     assert process.wait(DEADLINE) == 0
     assert load_model(folder.models / "mine.safetensors").provenance["step"] > 0
-    found = look(folder.models, "mine")
+    found = read_record(folder.models, "mine")
     assert found is not None and found.saved

@@ -1,0 +1,178 @@
+"""One training from its configuration to the model file and its report."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from safetensors import SafetensorError
+
+from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
+from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
+from deep_nrsfm_ros.reporting.page import Training, write_report
+from deep_nrsfm_ros.reporting.shapes import handedness_warning
+from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
+from deep_nrsfm_ros.training.disk import unwritable
+from deep_nrsfm_ros.training.distributed import join, rank
+from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
+from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data
+from deep_nrsfm_ros.training.record import checkpoint_file, keep_record
+from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
+from deep_nrsfm_ros.training.validation import validate
+
+if TYPE_CHECKING:
+    from deep_nrsfm_ros.training.trainer import Trainer
+
+
+def run(config: TrainingConfig, reporter: Reporter, should_stop: Callable[[], bool]) -> None:
+    """Read the data, train, and save the model with its report.
+
+    Args:
+        config: what to train on, how, and where the model goes.
+        reporter: takes progress, warnings and the end.
+        should_stop: called often; True ends the training, which saves the best model so far.
+
+    Raises:
+        ValueError: for a configuration, data or a folder that a training cannot work with.
+        CancelledError: the training was stopped before anything was learned.
+    """
+    validate(config, COMMAND_LINE)
+    prepared = prepare(config.curation, read_data(config, reporter), reporter)
+    try:
+        with _record(config) as checkpoint:
+            _train_and_save(config, prepared, checkpoint, reporter, should_stop)
+    except SafetensorError as error:  # neither OSError nor ValueError, though the disk is full
+        raise ValueError(unwritable(config.output.folder, error)) from error
+
+
+def _record(config: TrainingConfig) -> AbstractContextManager[Path]:
+    """Return the context of the training's record; only the first of several processes keeps it."""
+    if rank():
+        return nullcontext(checkpoint_file(config.output.folder, config.output.name))
+    return keep_record(config)
+
+
+def _train_and_save(
+    config: TrainingConfig,
+    prepared: Prepared,
+    checkpoint: Path,
+    reporter: Reporter,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Train on the prepared data; the first process saves the model and reports the end."""
+    start = load_model(Path(config.start)) if config.start else None
+    _describe(prepared, reporter, starts_anew=start is None)
+    trainer = _train(config, prepared, checkpoint, reporter, should_stop)
+    if trainer.team.rank:
+        return
+    if not trainer.step:
+        checkpoint.unlink(missing_ok=True)
+        raise CancelledError
+    from deep_nrsfm_ros.training.finish import finish
+
+    dataset = prepared.dataset
+    model = finish(trainer, config.output.name, dataset.layout, dataset.source)
+    model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
+    if start:
+        model = inherit(model, start)
+    path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"
+    save_model(path, model)
+    _report_end(model, path, prepared, reporter, _ending(trainer, path, model, checkpoint))
+
+
+def _describe(prepared: Prepared, reporter: Reporter, *, starts_anew: bool) -> None:
+    """Report the size of the dataset, and what it cannot teach."""
+    dataset = prepared.dataset
+    if dataset.layout.warning and starts_anew:  # a start passes its handedness on
+        reporter.warn(dataset.layout.warning)
+    times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
+    if missing := [name for name, times in times_visible if not times]:
+        reporter.warn(f"no frame shows {', '.join(missing)}: the model will only guess them")
+    reporter.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
+
+
+def _train(
+    config: TrainingConfig,
+    prepared: Prepared,
+    checkpoint: Path,
+    reporter: Reporter,
+    should_stop: Callable[[], bool],
+) -> Trainer:
+    """Return the trainer after the training loop; this process has left its group then."""
+    dataset, weights = prepared.dataset, config.layout_loss
+    start = start_from(load_model(Path(config.start)), dataset.layout) if config.start else None
+    weights.check(dataset.layout, COMMAND_LINE)
+    import torch  # takes seconds; a wrong configuration is refused without it
+
+    from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
+    from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, Setup, train
+
+    if config.output.threads:
+        torch.set_num_threads(config.output.threads)
+    group = join()
+    trainer = train(
+        dataset.points,
+        dataset.visible,
+        config.preset,
+        Setup(
+            start,
+            LayoutLoss(weights, dataset.layout) if weights != LayoutLossWeights() else None,
+            config.limits,
+            group,
+        ),
+        Callbacks(on_progress=reporter.training, should_stop=should_stop),
+        Checkpointing(checkpoint),
+    )
+    group.leave()
+    return trainer
+
+
+def _ending(trainer: Trainer, path: Path, model: Model, checkpoint: Path) -> tuple[str, str]:
+    """Return the state and the message with which the training ends; remove a used checkpoint."""
+    if not trainer.ended:
+        message = "cancelled; the model holds what was learned so far"
+        return "cancelled", message + (", --resume goes on" if checkpoint.exists() else "")
+    checkpoint.unlink(missing_ok=True)
+    message, steps = f"{path} {json.dumps(model.quality)}", trainer.preset.recipe.steps
+    if trainer.step < steps:
+        message += f"; after {trainer.step} of {steps} steps {trainer.ended}"
+    return "finished", message
+
+
+def _report_end(
+    model: Model, path: Path, prepared: Prepared, reporter: Reporter, ending: tuple[str, str]
+) -> None:
+    """Write the page of the training, and report its end."""
+    state, message = ending
+    values: dict[str, object] = dict(model.quality)
+    if warning := handedness_warning(model, prepared.dataset):
+        reporter.warn(warning)
+        values["warning"] = warning
+    page = _write_page(model, path, prepared, reporter, compare=state == "finished")
+    message += f"; report {page}" if page else ""
+    reporter.end(state, message, model=str(path), report=page, **values)
+
+
+def _write_page(
+    model: Model, path: Path, prepared: Prepared, reporter: Reporter, *, compare: bool
+) -> str:
+    """Write the HTML report next to the model; return its path, "" if that was not possible.
+
+    A page that cannot be written costs no model. `compare`: show other models beside this one,
+    which takes a second for each; a cancelled training does not take the time.
+    """
+    training = Training(
+        *(model, path, prepared.dataset, prepared.curated, prepared.sufficiency),
+        progress=reporter.curves,
+        warnings=reporter.warnings,
+    )
+    try:
+        return str(write_report(training, model_folders(path.parent) if compare else []))
+    except (ValueError, OSError) as error:
+        reporter.say(f"no report was written: {error}")
+        return ""

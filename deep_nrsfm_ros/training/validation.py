@@ -1,0 +1,91 @@
+"""The checks of a training that need no data: the same for the command line and the service."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.extras import require_extra
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
+from deep_nrsfm_ros.model_files.model_file import check_name, load_model
+from deep_nrsfm_ros.training.config import OptionNames, TrainingConfig
+from deep_nrsfm_ros.training.disk import check_room
+from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
+
+_NUMBERED_LAYOUT = KeypointLayout(NUMBERED, ())  # its points are counted when the bags are read
+
+
+def validate(config: TrainingConfig, names: OptionNames) -> str:
+    """Check all that can be checked before the data are read.
+
+    Args:
+        config: the configuration to check.
+        names: the names of the options in the messages.
+
+    Returns:
+        A warning about the layout of the model, or "".
+
+    Raises:
+        ValueError: names the first option that is wrong, and says what to do.
+    """
+    check_name(names("name"), config.output.name)
+    _check_ranges(config, names)
+    _check_data(config, names)
+    source, target = find_layouts(config, names)
+    if target != _NUMBERED_LAYOUT:
+        KeypointMap(source, target)
+    config.layout_loss.check(target, names)
+    if config.start:
+        start = load_model(Path(config.start))
+        if target != _NUMBERED_LAYOUT:
+            start_from(start, target)
+        check_fixed_options(start, config.preset, names)
+    check_room(names("free_disk"), config.output.folder, config.limits.free_disk)
+    require_extra("train", "training")
+    return "" if config.start else target.warning  # a start passes its handedness on
+
+
+def find_layouts(
+    config: TrainingConfig, names: OptionNames
+) -> tuple[KeypointLayout, KeypointLayout]:
+    """Return the layouts of the data and of the model.
+
+    Both are empty and called "numbered" where the points of the bags are taken as they are. Raises
+    ValueError for a layout that does not exist.
+    """
+    if config.object == NUMBERED:
+        if config.data.keypoint_layout or config.data.cmu:
+            raise ValueError(
+                f"{names('object')} is {NUMBERED!r}, which takes the points of bags as they are; "
+                f"leave out {names('keypoint_layout')}, or name an object"
+            )
+        return _NUMBERED_LAYOUT, _NUMBERED_LAYOUT
+    target = find_layout(names("object"), config.object or config.start or HUMAN17.name)
+    named = config.data.keypoint_layout
+    return find_layout(names("keypoint_layout"), named) if named else target, target
+
+
+def _check_ranges(config: TrainingConfig, names: OptionNames) -> None:
+    """Raise ValueError for the first option outside its range."""
+    for part in (*config.preset, config.layout_loss, config.curation, config.limits):
+        for field, _, option in options(type(part)):
+            option.check(names(field.name), getattr(part, field.name))
+    for name, value, least in (
+        ("min_confidence", config.data.min_confidence, 0),
+        ("stride", config.data.stride, 1),
+        ("threads", config.output.threads, 0),
+    ):
+        if not value >= least:
+            raise ValueError(f"{names(name)} is {value}; it must be at least {least}")
+
+
+def _check_data(config: TrainingConfig, names: OptionNames) -> None:
+    """Raise ValueError unless there is data of exactly one kind, and each bag exists."""
+    if bool(config.data.bags) == bool(config.data.cmu):
+        raise ValueError(f"name what to train on: {names('data')}")
+    for bag in config.data.bags:
+        if not bag.expanduser().exists():
+            raise ValueError(f"{names('bags')} names {bag}, which does not exist")
