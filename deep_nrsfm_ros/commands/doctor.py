@@ -30,7 +30,13 @@ LEAST_SHM = 8e6  # bytes: each participant of Fast DDS takes a segment of about 
 
 
 class Finding(NamedTuple):
-    """What a check saw. mend: what to do about it, "" if all is well. fatal: lifting needs it."""
+    """The result of a check.
+
+    Attributes:
+        seen: what was found, in words.
+        mend: what to do about it; "" if all is well.
+        fatal: whether lifting needs it.
+    """
 
     seen: str
     mend: str = ""
@@ -38,7 +44,7 @@ class Finding(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Return how bad it is."""
+        """Return "ok", "FAIL" or, for a finding that is not fatal, "warn"."""
         return "ok" if not self.mend else "FAIL" if self.fatal else "warn"
 
 
@@ -73,7 +79,7 @@ def check_imports() -> Finding:
 
 
 def check_environment() -> Finding:
-    """Return what decides whom ROS nodes find."""
+    """Return the variables that decide which ROS nodes find each other."""
     said = os.environ.get
     domain, reach = said("ROS_DOMAIN_ID", "0"), said("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     seen = f"ROS_DOMAIN_ID {domain}, discovery range {reach}"
@@ -159,7 +165,7 @@ def check_bags() -> Finding:
 
 
 def check_dds(name: str, models_dir: Path, seconds: float) -> Finding:
-    """Ask a lifter in another process for an answer."""
+    """Start a lifter in another process and wait for its answer over DDS."""
     import numpy as np
 
     from deep_nrsfm_ros.model_files.folders import model_folders
@@ -179,26 +185,26 @@ def check_dds(name: str, models_dir: Path, seconds: float) -> Finding:
     return Finding(f"a lifter in another process answered {took:.1f} s after its start")
 
 
-def examine(given: argparse.Namespace) -> bool:
+def examine(args: argparse.Namespace) -> bool:
     """Run every check and print what it found; return whether lifting works."""
     checks: dict[str, Callable[[], Finding]] = {
         "imports": check_imports,
         "environment": check_environment,
-        "room": lambda: check_room(given.models_dir),
-        "model": lambda: check_model(given.model, given.models_dir),
+        "room": lambda: check_room(args.models_dir),
+        "model": lambda: check_model(args.model, args.models_dir),
         "bags": check_bags,
-        "DDS": lambda: check_dds(given.model, given.models_dir, given.timeout),
+        "DDS": lambda: check_dds(args.model, args.models_dir, args.timeout),
     }
     well = True
     for name, check in checks.items():
         try:
-            found = check()
+            finding = check()
         except Exception as error:  # whatever is broken, the other checks tell more
-            found = Finding(f"{type(error).__name__}: {error}", "mend what is wrong above first")
-        well &= found.word != "FAIL"
-        print(f"{found.word:4}  {name}: {found.seen}", flush=True)
-        if found.mend:
-            print(f"      -> {found.mend}", flush=True)
+            finding = Finding(f"{type(error).__name__}: {error}", "mend what is wrong above first")
+        well &= finding.word != "FAIL"
+        print(f"{finding.word:4}  {name}: {finding.seen}", flush=True)
+        if finding.mend:
+            print(f"      -> {finding.mend}", flush=True)
     return well
 
 
@@ -211,9 +217,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--model", default="human", help="model to lift with (default: human)")
     parser.add_argument("--models-dir", type=Path, default=default_models_dir())
     parser.add_argument("--timeout", type=float, default=30.0, help="seconds for an answer")
-    given = parser.parse_args(argv)
-    given.models_dir = given.models_dir.expanduser().absolute()
-    if not examine(given):
+    args = parser.parse_args(argv)
+    args.models_dir = args.models_dir.expanduser().absolute()
+    if not examine(args):
         print("something that lifting needs does not work; mend it from the top", file=sys.stderr)
         sys.exit(1)
     print("all that lifting needs works")

@@ -14,8 +14,7 @@ from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import HEIGHT_18, TrialSelection, read_split
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
-from deep_nrsfm_ros.model_files.folders import model_folders
-from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
 
 CONVENTIONS = {
@@ -37,8 +36,8 @@ LIFTING = {
     "as shipped": LiftingOptions(),
     "as shipped, noise 0": LiftingOptions(noise=0.0),
 }
-"""How a model's shapes come about: one pass, one pass moved onto the input, all but what the bones
-tell, the default, and the default for keypoints without noise."""
+"""Lifting options that are compared: one pass of the network, the same with back-projection, the
+default without bones, the default, and the default for keypoints without noise."""
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -53,8 +52,8 @@ def arguments() -> argparse.ArgumentParser:
     source.add_argument(
         "--pose2sim",
         type=Path,
-        help="wheel of pose2sim 0.6.0, with real detections of a person by four cameras: tells "
-        "what intrinsics are worth, and how far off the place is",
+        help="wheel of pose2sim 0.6.0, with real detections of a person by four cameras: compares "
+        "lifting with and without intrinsics, and measures the error of the position",
     )
     parser.add_argument("--subjects", nargs="+", default=["01"])
     parser.add_argument(
@@ -91,7 +90,7 @@ def figures(errors: ShapeErrors) -> dict[str, float]:
     return {name: 100 * value for name, value in zip(CONVENTIONS, shown, strict=True)}
 
 
-def compare_cameras(given: argparse.Namespace) -> None:
+def compare_cameras(args: argparse.Namespace) -> None:
     """Print what a real person's detections come to, with and without intrinsics."""
     try:
         # Here, because motion capture needs no SciPy.
@@ -101,8 +100,8 @@ def compare_cameras(given: argparse.Namespace) -> None:
         print(f"failed: {error}; install deep_nrsfm_ros[benchmarks]", file=sys.stderr)
         sys.exit(2)
     try:
-        models = [load_model(find_model(m, model_folders(given.models_dir))) for m in given.models]
-        session = read_session(given.pose2sim)
+        models = [load_model(m, args.models_dir) for m in args.models]
+        session = read_session(args.pose2sim)
         print(camera_table(models, session), flush=True)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
@@ -113,17 +112,17 @@ def compare_cameras(given: argparse.Namespace) -> None:
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per model and way of lifting; exit code 2 says the input was at fault."""
-    given = arguments().parse_args(argv)
-    if given.pose2sim:
-        compare_cameras(given)
+    args = arguments().parse_args(argv)
+    if args.pose2sim:
+        compare_cameras(args)
         return
     columns = ("model", "lifted", *CONVENTIONS)
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
     try:
-        for name in given.models:
-            model = load_model(find_model(name, model_folders(given.models_dir)))
+        for name in args.models:
+            model = load_model(name, args.models_dir)
             selection = TrialSelection(
-                given.cmu, given.subjects, given.split, given.stride, given.camera_seed
+                args.cmu, args.subjects, args.split, args.stride, args.camera_seed
             )
             dataset = read_split(selection, model.layout)
             for word, lifting in LIFTING.items():

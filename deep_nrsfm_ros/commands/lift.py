@@ -23,8 +23,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.model_files.find_layout import find_layout
-from deep_nrsfm_ros.model_files.folders import model_folders
-from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -42,7 +41,7 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what says how keypoints are read and lifted."""
+    """Add the options of reading keypoints and of lifting."""
     parser.add_argument("--topic", default="", help="keypoints in a bag (default: the only ones)")
     parser.add_argument(
         "--mapping",
@@ -59,7 +58,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         "--objects",
         default="all",
         choices=("all", "largest"),
-        help="lift everyone in a frame, or who is largest in the image (default: %(default)s)",
+        help="lift all objects of a frame, or the largest in the image (default: %(default)s)",
     )
     parser.add_argument(
         "--intrinsics",
@@ -77,50 +76,49 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     add_arguments(parser, LiftingOptions)
 
 
-def read_model(given: argparse.Namespace) -> tuple[Model, KeypointLayout]:
-    """Return the model and the layout of the keypoints; raise ValueError if there is none."""
-    inputs = override(InputOptions(), given)
-    folders = model_folders(Path(inputs.models_dir).expanduser())
-    model = load_model(find_model(inputs.model, folders))
+def read_model(args: argparse.Namespace) -> tuple[Model, KeypointLayout]:
+    """Return the model and the layout of the keypoints; raise ValueError if one is missing."""
+    inputs = override(InputOptions(), args)
+    model = load_model(inputs.model, Path(inputs.models_dir).expanduser())
     if inputs.keypoint_layout == MODEL_ORDER:
         return model, model.layout
     return model, find_layout("--keypoint-layout", inputs.keypoint_layout)
 
 
-def read_objects(given: argparse.Namespace, source: KeypointLayout) -> Detections:
+def read_objects(args: argparse.Namespace, source: KeypointLayout) -> Detections:
     """Return the objects in the input; raise ValueError if it cannot be read."""
-    inputs = override(InputOptions(), given)
+    inputs = override(InputOptions(), args)
     with progress("reading") as on_progress:
-        seen = read_keypoints(
-            given.input,
+        detections = read_keypoints(
+            args.input,
             len(source),
             ReadOptions(
-                topic=given.topic,
-                rate=given.rate,
+                topic=args.topic,
+                rate=args.rate,
                 min_confidence=inputs.min_confidence,
-                mapping=read_mapping(Path(given.mapping).expanduser()) if given.mapping else None,
+                mapping=read_mapping(Path(args.mapping).expanduser()) if args.mapping else None,
                 image_size=inputs.image_size,
             ),
             on_progress=on_progress,
             warn=warn,
         )
-    return seen.largest() if given.objects == "largest" else seen
+    return detections.largest() if args.objects == "largest" else detections
 
 
 def lift_objects(
-    given: argparse.Namespace, model: Model, source: KeypointLayout, seen: Detections
+    args: argparse.Namespace, model: Model, source: KeypointLayout, detections: Detections
 ) -> Recording:
-    """Return the objects lifted as the arguments say."""
-    lifter = Lifter(model, override(LiftingOptions(), given))
-    file = Path(given.intrinsics).expanduser()
-    intrinsics = read_camera_file(file, rectified=given.rectified) if given.intrinsics else None
+    """Return the recording of the objects, lifted with the options of the command line."""
+    lifter = Lifter(model, override(LiftingOptions(), args))
+    file = Path(args.intrinsics).expanduser()
+    intrinsics = read_camera_file(file, rectified=args.rectified) if args.intrinsics else None
     with progress("lifting") as on_progress:
-        return lift_recording(seen, source, lifter, on_progress, intrinsics)
+        return lift_recording(detections, source, lifter, on_progress, intrinsics)
 
 
 @contextmanager
 def progress(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield what shows how many of how many are done, on a terminal."""
+    """Yield a function that shows, on a terminal, how many of how many are done."""
     with tqdm(desc=label, disable=None, leave=False, file=sys.stderr) as bar:
 
         def show(done: int, total: int) -> None:
@@ -131,7 +129,7 @@ def progress(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def warn(message: str) -> None:
-    """Tell what was not as it should be, though the work goes on."""
+    """Print a warning on standard error."""
     tqdm.write(f"warning: {message}", file=sys.stderr)
 
 
@@ -145,18 +143,18 @@ def _positive(text: str) -> float:
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Write the lifted objects; exit code 2 says that the input was at fault."""
-    given = arguments().parse_args(argv)
+    args = arguments().parse_args(argv)
     try:
-        check_output(given.output)
-        model, source = read_model(given)
-        recording = lift_objects(given, model, source, read_objects(given, source))
-        write_recording(given.output, recording, model.name)
+        check_output(args.output)
+        model, source = read_model(args)
+        recording = lift_objects(args, model, source, read_objects(args, source))
+        write_recording(args.output, recording, model.name)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)
     lifted, total = recording.is_lifted.sum(), len(recording.detections)
     frames = len(recording.detections.stamps)
-    print(f"{given.output}: {lifted} of {total} objects in {frames} frames lifted")
+    print(f"{args.output}: {lifted} of {total} objects in {frames} frames lifted")
     if lifted < total:
         warn(f"{total - lifted} objects have too few visible keypoints, or all on one line")
 

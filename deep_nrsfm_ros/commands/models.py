@@ -1,4 +1,4 @@
-"""List the models that the lifter can be given, with their label-free quality and provenance."""
+"""List the models that the lifter can be args, with their label-free quality and provenance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXPLANATION = (
 
 
 class Listed(NamedTuple):
-    """A model file as it is listed: a row of `COLUMNS`, and lines about it."""
+    """A model file in the list: a row of `COLUMNS`, and notes for the lines below it."""
 
     row: tuple[str, ...]
     notes: tuple[str, ...]
@@ -46,15 +46,15 @@ def arguments() -> argparse.ArgumentParser:
 
 def find_files(folders: Sequence[Path]) -> list[Path]:
     """Return every model file in the folders, in order; the same file by the same name once."""
-    found: dict[tuple[Path, str], Path] = {}
+    files: dict[tuple[Path, str], Path] = {}
     for folder in folders:
         for path in sorted(folder.glob(f"*{MODEL_SUFFIX}")):
-            found.setdefault((path.resolve(), path.stem), path)
-    return list(found.values())
+            files.setdefault((path.resolve(), path.stem), path)
+    return list(files.values())
 
 
 def list_models(folders: Sequence[Path]) -> list[Listed]:
-    """Return what there is to say of every model file, damaged ones too."""
+    """Return a row and notes for every model file, damaged ones included."""
     listed: list[Listed] = []
     for path in find_files(folders):
         hidden = any(path.stem == other.row[0] for other in listed)
@@ -119,8 +119,8 @@ def show(listed: Sequence[Listed]) -> str:
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the models; exit code 2 says that there are none."""
-    given = arguments().parse_args(argv)
-    folders = model_folders(given.models_dir.expanduser())
+    args = arguments().parse_args(argv)
+    folders = model_folders(args.models_dir.expanduser())
     listed = list_models(folders)
     if not listed:
         print(f"failed: no models in {', '.join(map(str, folders))}", file=sys.stderr)

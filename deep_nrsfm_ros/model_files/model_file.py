@@ -37,16 +37,23 @@ class ModelFileError(ValueError):
 
 @dataclass(frozen=True)
 class Model:
-    """A trained network and what its input and output mean.
+    """A trained network of p keypoints and all that is needed to lift with it.
 
-    object_frame: (3, 3) orthonormal A that takes the network's axes to the object's (S A, A^T M).
-        det -1 undoes a mirrored depth; the axes are x front, y left, z up where the layout has
-        a handedness.
-    provenance: data, recipe and versions; quality: label-free figures.
-    error_covariance: (3p, 3p) of the network's errors, in its own axes; see `correction`. Equal
-        and apart from each other if nothing is known.
-    bone_lengths: (b, 2) of the layout's bones, shares of their sum and how much they vary; see
-        `bones`. Empty if nothing is known.
+    Attributes:
+        name: name of the model.
+        network: architecture and weights.
+        layout: layout of the p keypoints.
+        normaliser: takes keypoints to the input of the network.
+        object_frame: (3, 3) orthonormal A from the network's axes to the object's (S A, A^T M).
+            det -1 undoes a mirrored depth. The axes are x front, y left, z up where the layout
+            has a handedness.
+        provenance: data, recipe, seed, date and versions.
+        quality: label-free figures, such as `reprojection_error` and `cycle_error`.
+        error_covariance: (3p, 3p) covariance of the network's errors, in its own axes (see
+            `lifting/correction.py`); the identity if it was not measured.
+        bone_lengths: (b, 2) mean and standard deviation of the length of each bone of the
+            layout, as shares of the sum of all lengths (see `nrsfm/bones.py`); (0, 2) if they
+            were not measured.
     """
 
     name: str
@@ -60,14 +67,14 @@ class Model:
     bone_lengths: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
     def __post_init__(self) -> None:
-        """Fill in a covariance that is not given."""
+        """Set the error covariance to the identity if it is empty."""
         if not self.error_covariance.size:
             unknown = np.eye(3 * len(self.layout), dtype=np.float32)
             object.__setattr__(self, "error_covariance", unknown)
 
     @property
     def bones(self) -> Bones | None:
-        """What is known of the bones."""
+        """Mean and spread of the bones' lengths; None if they were not measured."""
         if not len(self.bone_lengths):
             return None
         ends = np.array(self.layout.bone_indices(), np.int32).T
@@ -75,7 +82,7 @@ class Model:
 
 
 def save_model(path: Path, model: Model) -> None:
-    """Write `model` whole or not at all: to a temporary name first, then renamed."""
+    """Write a model file completely or not at all: under a temporary name, then renamed."""
     header = {
         "name": model.name,
         "architecture": dataclasses.asdict(model.network.architecture),
@@ -166,12 +173,12 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     if "bone_lengths" in weights:  # older files have none
         shapes["bone_lengths"] = (len(layout.bone_indices()), 2)
     for name, shape in shapes.items():
-        found = weights[name]
-        if found.shape != shape or found.dtype != np.float32:
+        weight = weights[name]
+        if weight.shape != shape or weight.dtype != np.float32:
             raise ValueError(
-                f"weight {name} is {found.dtype} {found.shape}; it must be float32 {shape}"
+                f"weight {name} is {weight.dtype} {weight.shape}; it must be float32 {shape}"
             )
-        if not (np.abs(found) < _LARGEST).all():  # NaN compares false
+        if not (np.abs(weight) < _LARGEST).all():  # NaN compares false
             raise ValueError(f"weight {name} has a number that is not below {_LARGEST:g}")
     frame = np.array(header["object_frame"], np.float64)
     # NaN and what would overflow compare false.

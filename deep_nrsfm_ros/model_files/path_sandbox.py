@@ -1,8 +1,8 @@
-"""What whoever sets parameters may make the lifter read and write: what its owner allows.
+"""The files that the lifter may read and write at the request of others on the network.
 
-The owner starts the lifter and may name any file then. Afterwards parameters are set, and services
-called, by whoever is on the network: what they name must be in one of the owner's two folders,
-`bags_dir` and `models_dir`, or come with the package.
+The owner of the lifter starts it, and may name any file at the start. Later, anybody on the
+network can set parameters and call services: the files that those name must be in one of the
+owner's two folders, `bags_dir` and `models_dir`, or come with the package.
 """
 
 from __future__ import annotations
@@ -18,19 +18,22 @@ from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, ModelFileError, 
 
 
 class PathSandboxError(ValueError):
-    """A path that leads elsewhere: names the option, the path and the folders allowed."""
+    """A path outside the allowed folders; the text names the option, the path and the folders."""
 
 
 class PathSandbox:
-    """The owner's folders, and what the owner has named at the start."""
+    """Checks paths against the owner's folders and the values that the owner gave at the start."""
 
     def __init__(
         self, models_dir: Path, bags_dir: Path, named_at_start: Iterable[str] = ()
     ) -> None:
-        """PathSandbox in the two folders, which need not exist yet.
+        """Allow the two folders, which need not exist yet.
 
-        named_at_start: words that the owner gave for any option; they mean what they meant then,
-            relative to the working folder, wherever that leads.
+        Args:
+            models_dir: folder of the owner's models.
+            bags_dir: folder of the owner's bags.
+            named_at_start: values that the owner gave for any option at the start. They are
+                allowed wherever they are, relative to the working folder.
         """
         self.models_dir, self.bags_dir = models_dir, bags_dir
         self._owners = frozenset(named_at_start)
