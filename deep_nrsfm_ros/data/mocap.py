@@ -61,7 +61,7 @@ class Motion:
 
 
 def _euler(angles: NDArray[np.float64], axes: str) -> NDArray[np.float64]:
-    """Return rotations (..., 3, 3) by degrees (..., len(axes)) about `axes`, the first one first."""
+    """Return rotations (..., 3, 3) by degrees (..., len(axes)) about `axes`, in order."""
     R = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
     for i, name in enumerate(axes):
         a = np.radians(angles[..., i])
