@@ -1,19 +1,18 @@
-"""Fine-tuning: a training that starts from a trained model instead of from chance.
+"""Fine-tuning: a training that starts from a trained model instead of from random weights.
 
 Architecture and normaliser stay those of the model: its weights mean nothing in others.
 
-The whitening L decides what the first dictionary means, D_1 being a dictionary of L S. Encoder
-and decoder share D_1, so no change of it undoes a change of L in both: (L D)^T would have to
-undo what L^-1 D does not. So with the same keypoints L stays as it is, and the training starts
-as good as the model. With others L has to be another matrix; it is then computed from the new
-data, as for a fresh network, and D_1 keeps its rows, for whitened coordinates of one object look
-alike whatever else is seen of it. On a synthetic object with points taken away and added, that
-started at a reprojection error of 0.19 to 0.35; converting D_1 by L_new L_old^-1 started at 0.36
-to 0.84, keeping the block of L that both share at 0.34 to 0.59, and a fresh network at 1.
+The whitening L defines what the first dictionary means, because D_1 is a dictionary of L S. Encoder
+and decoder share D_1, so no change of D_1 compensates a change of L in both: (L D)^T would have to
+compensate what L^-1 D does not. With the same keypoints L therefore stays, and the training starts
+with the quality of the model. With other keypoints L has another size. It is computed from
+the new data, as for a fresh network, and D_1 keeps its rows: the whitened coordinates of one object
+are similar whichever keypoints are added. docs/devlog has the errors at the start of this and of
+other conversions.
 
-A keypoint that the model does not know starts at zero: the encoder does not hear it yet, the
-decoder puts it at the centre, and neither harms the others. From there it is learned, since its
-gradient comes from the code, which is not zero.
+A keypoint that the model does not have starts with zero weights: the encoder ignores it, and the
+decoder puts it at the centre. It is learned from there, because its gradient comes from the code,
+which is not zero.
 """
 
 from __future__ import annotations
@@ -29,14 +28,21 @@ from deep_nrsfm_ros.nrsfm.geometry import Array
 from deep_nrsfm_ros.nrsfm.network import Network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 
-_FEWEST = 4  # as for lifting: less than a tetrahedron is no shape
+_FEWEST = 4  # keypoints, as for lifting: fewer than a tetrahedron has are no 3D shape
 
 
 def start_from(model: Model, layout: KeypointLayout) -> Network:
     """Return the network of `model` for the keypoints of `layout`, matched by name.
 
-    With other keypoints than the model's it is not yet whitened. Raises ValueError when fewer
-    than 4 keypoints match.
+    Args:
+        model: the model to start from.
+        layout: layout of the new model.
+
+    Returns:
+        The network. With other keypoints than the model's it is not whitened (L is the identity).
+
+    Raises:
+        ValueError: fewer than 4 keypoints match.
     """
     new = {name: i for i, name in enumerate(layout.keypoints)}
     pairs = [(i, new[name]) for i, name in enumerate(model.layout.keypoints) if name in new]
@@ -89,10 +95,10 @@ def check_fixed_options(model: Model, preset: Preset, name_of: Callable[[str], s
 
 
 def inherit(trained: Model, start: Model) -> Model:
-    """Return the model `trained` from `start` with what it owes to it.
+    """Return the model `trained` from `start` with the origin in its provenance.
 
-    That is a line in the provenance, and the object's axes where its layout names no handedness:
-    the network has kept the axes of its start, and which way round depth is.
+    Where the layout names no handedness, the object frame is that of `start` too: the network keeps
+    the axes of its start and the sign of depth.
     """
     origin = {"model": start.name, "data": start.provenance.get("data", "unknown")}
     model = dataclasses.replace(trained, provenance=trained.provenance | {"from": origin})

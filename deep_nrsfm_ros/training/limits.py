@@ -1,4 +1,4 @@
-"""When a training ends before its last step, and which of its states is kept."""
+"""Limits: when a training ends before its last step, and which state it keeps."""
 
 from __future__ import annotations
 
@@ -14,42 +14,44 @@ class Limits:
     With `minutes` the learning rate follows the clock, so the same seed does not give the same
     model twice.
 
-    `patience` is off unless asked for: with a learning rate that falls to zero most of what is
-    gained in the second half is gained by its falling, and a stretch without improvement before
-    that says nothing of what is to come. Who has steps to spare sets 0.2 or so.
+    `patience` is off by default. The learning rate falls to zero, and most of the gain of the
+    second half of a training comes from that fall, so a stretch without improvement before it says
+    little. Use 0.2 where steps are plentiful.
     """
 
     minutes: float = option(
         0.0,
-        "wall time after which the training ends, its learning rate having fallen to zero by "
-        "then; 0: none",
+        "minutes of wall time after which the training ends; the learning rate falls to zero by "
+        "then; 0 = no limit",
         low=0.0,
         high=100_000.0,
     )
     patience: float = option(
         0.0,
-        "share of the training without a better label-free quality after which it ends; 0: never",
+        "share of the training without a better label-free quality after which it ends; 0 = "
+        "never, 0.2 typical",
         low=0.0,
         high=1.0,
     )
     max_frames: int = option(
         1_000_000,
-        "most frames that the bags may hold; more are refused, before they fill the memory",
+        "largest number of frames in the bags; a training with more is refused before they fill "
+        "the memory",
         low=10,
         high=1_000_000_000,
         read_only=True,
     )
     free_disk: float = option(
         100.0,
-        "MB that must be free on the disk of the models when a training begins",
+        "MB that must be free on the disk of the models when a training begins; 0 = no check",
         low=0.0,
         high=1e9,
         read_only=True,
     )
     keep_best: bool = option(
-        True, "keep the state with the best label-free quality, not the last one"
+        True, "keep the state with the best label-free quality instead of the last state"
     )
 
 
 WHOLE = Limits(keep_best=False)
-"""All steps, and the state after the last of them."""
+"""All steps are taken, and the state after the last one is kept."""

@@ -1,4 +1,4 @@
-"""What a training tells: progress for people or for a program, warnings, and how it ended."""
+"""Reports of a training: progress as a bar or as JSON lines, warnings, and the end."""
 
 from __future__ import annotations
 
@@ -16,16 +16,24 @@ from deep_nrsfm_ros.training.distributed import rank
 
 
 class CancelledError(Exception):
-    """Somebody stopped the training before it began."""
+    """The training was stopped before anything was learned."""
 
 
 class Reporter:
-    """Shows progress to people (a bar) or to a program (JSON lines)."""
+    """Reports progress as a bar for people, or as JSON lines for a program.
+
+    Attributes:
+        as_json: JSON lines on standard output instead of a bar.
+        curves: every progress of the training loop, in order.
+        warnings: every warning, in order.
+    """
 
     def __init__(self, as_json: bool, should_stop: Callable[[], bool]) -> None:
-        """Start silent; the bar appears with the first progress.
+        """Report nothing until the first progress.
 
-        should_stop: ends reading, which may take minutes, by `CancelledError`.
+        Args:
+            as_json: JSON lines on standard output instead of a bar.
+            should_stop: True ends reading, which may take minutes, by `CancelledError`.
         """
         self.as_json, self._should_stop = as_json, should_stop
         self._bar: tqdm[Any] | None = None
@@ -44,7 +52,7 @@ class Reporter:
             self._close_bar()
 
     def training(self, progress: Any) -> None:
-        """Report a `nrsfm.progress.Progress`, and keep it for the curves."""
+        """Report a `training.progress.Progress`, and keep it for the curves."""
         self.curves.append(progress)
         values = progress._asdict()
         values["combined"] = math.hypot(progress.loss, progress.cycle_error)
@@ -52,19 +60,19 @@ class Reporter:
         self._show("training", step, steps, values)
 
     def say(self, message: str) -> None:
-        """Report something worth reading."""
+        """Report a message."""
         if self.as_json:
             self._print({"state": self._state or "reading", "message": message})
         else:
             tqdm.write(message, file=sys.stderr)
 
     def warn(self, message: str) -> None:
-        """Report something that the report of the training shall say too."""
+        """Report a warning, and keep it for the page of the training."""
         self.warnings.append(message)
         self.say(f"warning: {message}")
 
     def end(self, state: str, message: str, **values: Any) -> None:
-        """Report how it ended."""
+        """Report the end of the training: "finished", "cancelled" or "failed"."""
         self._close_bar()
         if self.as_json:
             self._print({"state": state, "message": message, **values})
@@ -87,7 +95,7 @@ class Reporter:
         self._bar.update(done - self._bar.n)
 
     def _close_bar(self) -> None:
-        """Leave the bar as it is; the time it shows no longer runs."""
+        """Leave the bar as it is and stop its clock."""
         if self._bar is not None:
             self._bar.close()
         self._bar = None
@@ -98,18 +106,18 @@ class Reporter:
         try:
             print(json.dumps(rounded), flush=True)
         except BrokenPipeError:
-            # Who listened is gone: `stop_with_parent` ends the training, which saves first.
+            # The parent process is gone: `stop_with_parent` ends the training, which saves first.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class SilentReporter(Reporter):
-    """Leaves the talking to the first process, but for what went wrong in this one."""
+    """Reports only failures of this process: the first process reports everything else."""
 
     def say(self, message: str) -> None:
-        """Say nothing."""
+        """Report nothing."""
 
     def end(self, state: str, message: str, **values: Any) -> None:
-        """Report a failure, which may be of this machine alone."""
+        """Report a failure, which may concern this machine alone."""
         if state == "failed":
             print(f"process {rank()} {state}: {message}", file=sys.stderr)
 

@@ -25,34 +25,36 @@ class TrainingOptions:
     """Data and result of the service ~/train: the parameters `train.*` that no other part has."""
 
     bags: tuple[str, ...] = option((), "rosbag2 folders or files to train on")
-    topic: str = option("", "topic in the bags; empty: the one that the lifter listens to")
+    topic: str = option("", "topic in the bags; empty = the topic that the lifter listens to")
     object: str = option(
         "",
         "layout of the new model: a preset, the path of a layout file or of a model file, or "
-        "'numbered' for points without names; empty: that of train.from, or of the present model",
+        "'numbered' for points without names; empty = that of train.from, or of the present model",
     )
     keypoint_layout: str = option(
         "",
-        "order of the keypoints in the bags; empty: as the parameter keypoint_layout says, and "
-        "where that is 'model', that of train.object if it is set",
+        "order of the keypoints in the bags; empty = that of the parameter keypoint_layout, or where "
+        "that is 'model', the layout of train.object if it is set",
     )
     from_: str = option(
         "",
-        "model to start from, by name or path, its keypoints matched by name; empty: from chance",
+        "model to start from, by name or path; keypoints are matched by name; empty = random weights",
     )
-    name: str = option("trained", "name of the new model; an old one of this name is replaced")
+    name: str = option(
+        "trained", "name of the new model; an existing model of this name is replaced"
+    )
     threads: int = option(1, "threads that the training may use", low=1, high=1024)
     max_minutes: float = option(
         0.0,
-        "most wall time that train.minutes may ask for, and what a training gets that asks for no "
-        "limit; 0: no limit",
+        "largest value of train.minutes, in minutes of wall time, and the limit of a training that "
+        "sets none; 0 = no limit",
         low=0.0,
         high=100_000.0,
         read_only=True,
     )
     resume: bool = option(
         False,
-        "go on with the training of train.name that was cut off, with the bags and options that it "
+        "continue the training of train.name that was cut off, with the bags and options that it "
         "began with",
     )
     activate: bool = option(True, "switch to the new model when the training has finished")

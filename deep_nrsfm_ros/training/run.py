@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from collections.abc import Callable
@@ -77,7 +78,8 @@ def _train_and_save(
 
     dataset = prepared.dataset
     model = finish(trainer, config.output.name, dataset.layout, dataset.source)
-    model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
+    date = time.strftime("%Y-%m-%d", time.gmtime())
+    model = dataclasses.replace(model, provenance=model.provenance | {"date": date})
     if start:
         model = inherit(model, start)
     path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"

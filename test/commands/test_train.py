@@ -27,6 +27,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training import run
+from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.trainer import Trainer
 
 DEADLINE = 90.0
@@ -89,6 +90,7 @@ def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
 def in_process(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     """Run the program within the test, without its signal handlers; return the exit code."""
     monkeypatch.setattr(train, "stop_on_signals", lambda: lambda: False)
+    monkeypatch.setattr(train, "stop_with_parent", lambda stopped: stopped)
     threads = torch.get_num_threads()
 
     def run(*words: str) -> int:
@@ -140,11 +142,14 @@ def assert_lifts(path: Path) -> Model:
 
 
 def test_from_bag_to_model(
-    arguments: list[str], models: Path, start: Callable[..., subprocess.Popen[str]]
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    process = start(*arguments, "--steps", "30", "--seeds", "2", "--screening", "5")
-    lines = finish(process)
-    assert process.returncode == 0
+    words = (*arguments, "--steps", "30", "--seeds", "2", "--screening", "5", "--json-progress")
+    assert in_process(*words) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     states = [line["state"] for line in lines]
     order = ["reading", "training", "finished"]
     assert states[-1] == "finished" and [*dict.fromkeys(states)] == [
@@ -336,10 +341,11 @@ def test_a_wrong_command_line_ends_with_2(
     assert words[0] in capsys.readouterr().err
 
 
-def test_failing_is_a_line_of_json_too(start: Callable[..., subprocess.Popen[str]]) -> None:
-    process = start("--bag", "absent")
-    (line,) = finish(process)
-    assert process.returncode == 2
+def test_failing_is_a_line_of_json_too(
+    in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert in_process("--bag", "absent", "--json-progress") == 2
+    (line,) = map(json.loads, capsys.readouterr().out.splitlines())
     assert line["state"] == "failed" and "absent" in line["message"]
 
 
@@ -513,7 +519,6 @@ def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(train, "stop_with_parent", lambda stopped: stopped)
     words = (*arguments, "--steps", "3")
     for told in ("", "no depth in mine"):
         monkeypatch.setattr(run, "handedness_warning", lambda model, dataset, told=told: told)
@@ -536,3 +541,21 @@ def test_a_report_that_cannot_be_written_costs_no_model(
     assert "no report was written" in capsys.readouterr().err
     assert_lifts(models / "mine.safetensors")
     assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
+
+
+def test_a_configuration_file_gives_the_options_that_are_not_given(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = TrainingConfig.from_arguments(train.parser().parse_args([*arguments, "--batch", "5"]))
+    file = tmp_path / "config.json"
+    file.write_text(config.to_json())
+    assert in_process("--config", str(file), "--steps", "3") == 0
+    recipe = load_model(models / "mine.safetensors").provenance["recipe"]
+    assert (recipe["steps"], recipe["batch"]) == (3, 5)
+    file.write_text('{"data": {"bag": []}}')
+    assert in_process("--config", str(file)) == 2
+    assert "config.json: data.bag is no option" in capsys.readouterr().err
