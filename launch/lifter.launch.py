@@ -8,24 +8,24 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the lifter with its arguments; `ros2 launch --show-args` prints them."""
+    """Return the launch description; `ros2 launch --show-args` prints its arguments."""
     share = FindPackageShare("deep_nrsfm_ros")
     return LaunchDescription(
         [
             DeclareLaunchArgument(
                 "keypoints",
                 default_value="keypoints",
-                description="Topic on which the detector publishes 2D keypoints, in pixels.",
+                description="Topic of the detector's 2D keypoints, in pixels.",
             ),
             DeclareLaunchArgument(
                 "namespace",
                 default_value="",
-                description="Namespace of the node, e.g. the name of its camera.",
+                description="Namespace of the node, such as the name of its camera; empty = none.",
             ),
             DeclareLaunchArgument(
                 "config",
                 default_value=PathJoinSubstitution([share, "config", "lifter.yaml"]),
-                description="Parameter file: model, detector's layout, scale of the output.",
+                description="Parameter file of the lifter: model, detector's layout, output unit.",
             ),
             Node(
                 package="deep_nrsfm_ros",

@@ -1,4 +1,4 @@
-"""Start detector, lifter and RViz; the detector is a command, or runs already.
+"""Start detector, lifter and RViz; the detector is a command, or is already running.
 
 ros2 launch deep_nrsfm_ros live.launch.py keypoints:=/keypoints config:=my_lifter.yaml \
     detector:="python3 mediapipe_detector.py --ros-args -p source:=0"
@@ -14,32 +14,32 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return detector, lifter and RViz with their arguments."""
+    """Return the launch description of detector, lifter and RViz."""
     share = FindPackageShare("deep_nrsfm_ros")
     return LaunchDescription(
         [
             DeclareLaunchArgument(
                 "detector",
                 default_value="",
-                description="Command that starts the detector; empty: it runs already.",
+                description="Command that starts the detector; empty = it is already running.",
             ),
             DeclareLaunchArgument(
                 "keypoints",
                 default_value="/keypoints",
-                description="Topic on which the detector publishes 2D keypoints.",
+                description="Topic of the detector's 2D keypoints.",
             ),
             DeclareLaunchArgument(
                 "config",
                 default_value=PathJoinSubstitution([share, "config", "lifter.yaml"]),
-                description="Parameter file of the lifter: model, detector's layout, scale.",
+                description="Parameter file of the lifter: model, detector's layout, output unit.",
             ),
             DeclareLaunchArgument(
-                "rviz", default_value="true", description="Whether to open RViz: true or false."
+                "rviz", default_value="true", description="Whether RViz is started: true or false."
             ),
             DeclareLaunchArgument(
                 "camera_frame",
                 default_value="camera",
-                description="frame_id of the keypoints: the camera's optical frame.",
+                description="Optical frame of the camera, as in the keypoints' header.",
             ),
             DeclareLaunchArgument(
                 "fixed_frame",
@@ -49,8 +49,8 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "level_camera",
                 default_value="true",
-                description="Whether to publish a level camera in the fixed frame, so that people "
-                "stand upright: true, or false where TF knows the camera already.",
+                description="Whether a level camera is published in the fixed frame, so people "
+                "stand upright: true, or false if TF already has the camera.",
             ),
             ExecuteProcess(
                 cmd=[LaunchConfiguration("detector")],

@@ -1,4 +1,4 @@
-"""Play a bag to the lifter and look.
+"""Play a bag to the lifter and show the result in RViz.
 
 ros2 launch deep_nrsfm_ros replay_bag.launch.py bag:=my_bag keypoints:=/keypoints
 """
@@ -11,31 +11,33 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return player, lifter and RViz with their arguments."""
+    """Return the launch description of bag player, lifter and RViz."""
     share = FindPackageShare("deep_nrsfm_ros")
     return LaunchDescription(
         [
-            DeclareLaunchArgument("bag", description="Folder or file of the recording."),
+            DeclareLaunchArgument("bag", description="Bag to play: a folder or a file."),
             DeclareLaunchArgument(
                 "keypoints",
                 default_value="/keypoints",
-                description="Topic of the 2D keypoints in the bag; no other is played.",
+                description="Topic of the 2D keypoints in the bag; only this topic is played.",
             ),
             DeclareLaunchArgument(
-                "rate", default_value="1.0", description="How many times as fast as recorded."
+                "rate",
+                default_value="1.0",
+                description="Playback rate; 1.0 = as recorded, 2.0 = twice as fast.",
             ),
             DeclareLaunchArgument(
                 "config",
                 default_value=PathJoinSubstitution([share, "config", "lifter.yaml"]),
-                description="Parameter file of the lifter: model, detector's layout, scale.",
+                description="Parameter file of the lifter: model, detector's layout, output unit.",
             ),
             DeclareLaunchArgument(
-                "rviz", default_value="true", description="Whether to open RViz: true or false."
+                "rviz", default_value="true", description="Whether RViz is started: true or false."
             ),
             DeclareLaunchArgument(
                 "camera_frame",
                 default_value="camera",
-                description="frame_id of the keypoints: the camera's optical frame.",
+                description="Optical frame of the camera, as in the keypoints' header.",
             ),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(

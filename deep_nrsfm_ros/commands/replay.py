@@ -1,4 +1,4 @@
-"""Look at a recording, or at a lifter at work, in a browser: 2D keypoints beside 3D skeletons."""
+"""Show a recording, or a running lifter, in a browser: 2D keypoints beside 3D skeletons."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from deep_nrsfm_ros.commands.lift import (
 from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import override
 from deep_nrsfm_ros.data.bag_files import BagError
+from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import KINDS, is_bag
 from deep_nrsfm_ros.data.lifted_bags import has_lifted_messages, read_lifted_messages
 from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages
@@ -45,55 +46,74 @@ def arguments() -> argparse.ArgumentParser:
         type=Path,
         nargs="?",
         metavar="BAG",
-        help=f"recording: {KINDS}. A lifter's answers in a bag are shown as they are; keypoints "
-        "alone are lifted. Without one, --serve shows the lifter that runs",
+        help=f"recording: {KINDS}. Lifted points in a bag are shown as recorded; keypoints alone "
+        "are lifted. Without a recording, --serve shows the running lifter",
     )
-    out = parser.add_argument_group("What to do with it")
-    out.add_argument("--html", type=Path, help="page to write; it opens offline")
+    out = parser.add_argument_group("Output")
+    out.add_argument("--html", type=Path, help="HTML page to write; it needs no network")
     out.add_argument(
-        "--serve", action="store_true", help="show it as it happens, on a page of this machine"
+        "--serve",
+        action="store_true",
+        help="serve a page to this machine, at the rate of the recording or of the lifter",
     )
     out.add_argument(
-        "--port", type=int, default=8765, help="of that page; 0: a free one (default: %(default)s)"
+        "--port",
+        type=int,
+        default=8765,
+        help="port of the served page; 0 = a free port (default: %(default)s)",
     )
     out.add_argument(
         "--max-frames",
         type=int,
         default=MOST_FRAMES,
-        help="of a longer recording --html shows every n-th frame (default: %(default)s)",
+        help="most frames in --html; a longer recording is subsampled (default: %(default)s)",
     )
     out.add_argument(
-        "--lift-again", action="store_true", help="do not show the answers that the bag has"
+        "--lift-again",
+        action="store_true",
+        help="lift the keypoints again instead of showing the lifted points of the bag",
     )
-    out.add_argument("--lifter", default="/lifter", help="the node to look at (default: /lifter)")
+    out.add_argument(
+        "--lifter", default="/lifter", help="name of the running lifter (default: /lifter)"
+    )
     add_reading_arguments(parser)
     return parser
 
 
 def read_recording(
-    given: argparse.Namespace, model: Model, source: KeypointLayout
+    args: argparse.Namespace, model: Model, source: KeypointLayout
 ) -> tuple[Recording, str]:
-    """Return the recording, and in words where its shapes come from; raise ValueError if none."""
-    if not given.input.exists():
-        raise ValueError(f"{given.input} does not exist")
-    if given.lift_again or not is_bag(given.input) or not has_lifted_messages(given.input):
-        seen = read_objects(given, source)
-        return lift_objects(given, model, source, seen), f"lifted with model {model.name}"
-    with progress("reading answers") as on_progress:
-        answers = read_lifted_messages(given.input, on_progress, warn)
+    """Return the recording, and the origin of its shapes as text.
+
+    Raises:
+        ValueError: the input does not exist or is not usable.
+    """
+    if not args.input.exists():
+        raise ValueError(f"{args.input} does not exist")
+    if args.lift_again or not is_bag(args.input) or not has_lifted_messages(args.input):
+        recording = lift_objects(args, model, source, read_objects(args, source))
+        return recording, f"lifted with model {model.name}"
+    with progress("reading lifted points") as on_progress:
+        lifted = read_lifted_messages(args.input, on_progress, warn)
     try:
-        seen_then = read_objects(given, source)
+        detections: Detections | None = read_objects(args, source)
     except BagError as error:
-        warn(f"showing the answers without keypoints: {error}")
-        seen_then = None
-    recording = join_lifted_messages(answers, seen_then, source, model.layout)
+        warn(f"showing the lifted points without keypoints: {error}")
+        detections = None
+    recording = join_lifted_messages(lifted, detections, source, model.layout)
     return recording, f"as recorded; drawn as model {model.name}"
 
 
 def serve(page: str, port: int, work: Callable[[Broadcast, threading.Event], None]) -> None:
-    """Serve a page while `work` puts frames into it, and after, until Ctrl-C."""
+    """Serve a page until Ctrl-C.
+
+    Args:
+        page: HTML.
+        port: 0 = a free port.
+        work: puts frames into the broadcast; it may return before Ctrl-C.
+    """
     broadcast, stop = Broadcast(), threading.Event()
-    # As `program` has it, the first browser that leaves would end the server.
+    # `program` lets SIGPIPE end the process; a browser that disconnects must not end the server.
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     with server(page, broadcast, port) as made:
         threading.Thread(target=made.serve_forever, daemon=True).start()
@@ -101,7 +121,9 @@ def serve(page: str, port: int, work: Callable[[Broadcast, threading.Event], Non
         try:
             work(broadcast, stop)
             broadcast.end()
-            while not stop.wait(0.5):  # a signal just before does not end a wait without end
+            while not stop.wait(
+                0.5
+            ):  # an unbounded wait would miss a signal that arrives before it
                 pass
         except KeyboardInterrupt:
             pass
@@ -110,15 +132,15 @@ def serve(page: str, port: int, work: Callable[[Broadcast, threading.Event], Non
             made.shutdown()
 
 
-def watch(given: argparse.Namespace, model: Model, source: KeypointLayout) -> None:
-    """Serve what the lifter that runs answers; raise ValueError where there is no ROS."""
+def watch(args: argparse.Namespace, model: Model, source: KeypointLayout) -> None:
+    """Serve the frames of the running lifter; needs ROS."""
     require_extra("ros", "replay without a BAG")
-    import rclpy  # only here: files need no ROS
+    import rclpy  # imported here because recordings need no ROS
     from rclpy.executors import ExternalShutdownException
 
-    from deep_nrsfm_ros.node.lifter_client import LifterClient
+    from deep_nrsfm_ros.node.lifter_client import LifterClient, LifterTopics
 
-    inputs, stage = override(InputOptions(), given), Stage()
+    inputs, stage = override(InputOptions(), args), Stage()
 
     def work(broadcast: Broadcast, stop: threading.Event) -> None:
         def show(recording: Recording) -> None:
@@ -127,48 +149,52 @@ def watch(given: argparse.Namespace, model: Model, source: KeypointLayout) -> No
 
         rclpy.init()
         try:
-            topic = given.topic or "/keypoints"
-            names = (given.lifter, topic, source, model.layout)
-            rclpy.spin(LifterClient(*names, inputs.min_confidence, inputs.image_size, show))
+            topic = args.topic or "/keypoints"
+            layouts = (source, model.layout)
+            limits = (inputs.min_confidence, inputs.image_size)
+            topics = LifterTopics(args.lifter, topic, *layouts, *limits)
+            rclpy.spin(LifterClient(topics, show))
         except ExternalShutdownException:
             raise KeyboardInterrupt from None
         finally:
             rclpy.try_shutdown()
 
-    serve(live_page(source, model.layout, f"live: {given.lifter}"), given.port, work)
+    serve(live_page(source, model.layout, f"live: {args.lifter}"), args.port, work)
 
 
-def play(given: argparse.Namespace, recording: Recording, origin: str) -> None:
-    """Serve a recording at the pace at which it was made."""
+def play(args: argparse.Namespace, recording: Recording, origin: str) -> None:
+    """Serve a recording at its own rate."""
     source, target = recording.source, recording.target
 
     def work(broadcast: Broadcast, stop: threading.Event) -> None:
         in_real_time(scenes(recording), broadcast.put, stop.wait)
 
-    serve(live_page(source, target, f"{given.input.name}, {origin}"), given.port, work)
+    serve(live_page(source, target, f"{args.input.name}, {origin}"), args.port, work)
 
 
 @program
 def main(argv: Sequence[str] | None = None) -> None:
-    """Write or serve the page; exit code 2 says that the input was at fault."""
-    given = arguments().parse_args(argv)
+    """Write or serve the page; exit with 2 if the input is not usable."""
+    args = arguments().parse_args(argv)
     try:
-        if not given.html and not given.serve:
-            raise ValueError("say what to do with it: --html FILE, --serve, or both")
-        model, source = read_model(given)
-        if given.input is None:
-            if given.html:
-                raise ValueError("--html needs a BAG; record one, or look with --serve alone")
-            watch(given, model, source)
+        if not args.html and not args.serve:
+            raise ValueError("no output chosen: give --html FILE, --serve, or both")
+        model, source = read_model(args)
+        if args.input is None:
+            if args.html:
+                raise ValueError(
+                    "--html needs a BAG: record one, or show the running lifter with --serve"
+                )
+            watch(args, model, source)
             return
-        recording, origin = read_recording(given, model, source)
-        if given.html:
-            page = recording_page(recording, given.input.name, [origin], given.max_frames)
-            given.html.write_text(page, encoding="utf-8")
-            size = given.html.stat().st_size / 1e6
-            print(f"{given.html}: {size:.1f} MB, open it in a browser")
-        if given.serve:
-            play(given, recording, origin)
+        recording, origin = read_recording(args, model, source)
+        if args.html:
+            page = recording_page(recording, args.input.name, [origin], args.max_frames)
+            args.html.write_text(page, encoding="utf-8")
+            size = args.html.stat().st_size / 1e6
+            print(f"{args.html}: {size:.1f} MB, open it in a browser")
+        if args.serve:
+            play(args, recording, origin)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)

@@ -91,9 +91,9 @@ class NumpyBackend:
         """Return the fields of `Lifted`, and which of the n objects cannot be lifted.
 
         Args:
-            points: (n, p, 2) as in `Lifter.__call__`; the shape is not checked again.
+            points: (n, p, 2) as in `Lifter.lift`; the shape is not checked again.
             confidence: (n, p) in [0, 1], 0 = missing.
-            perspective: as in `Lifter.__call__`.
+            perspective: as in `Lifter.lift`.
         """
         visible = confidence > 0
         mask = visible[..., None].astype(np.float32)

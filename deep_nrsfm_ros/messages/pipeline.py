@@ -193,7 +193,7 @@ class Pipeline:
         if intrinsics:
             lifted = lift_perspective(self._lifter, intrinsics, points, confidence)
         else:
-            lifted = self._lifter(points, confidence)
+            lifted = self._lifter.lift(points, confidence)
         smoother = self._smoothers.get(topic)
         if smoother is None:
             smoother = self._smoothers[topic] = Smoother(self._smoothing)

@@ -1,9 +1,10 @@
-"""Watch a lifter at work: its answers, joined with the keypoints that they are about."""
+"""Client of a running lifter: its points and rotations, joined with their keypoints."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,81 +26,108 @@ from deep_nrsfm_ros.node.message_types import message_class
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 
-_KEPT = 100  # observations that wait for their answers
-_LOOK = 0.5  # seconds between looks for the keypoints' topic
+_MAX_WAITING = 100  # observations that are kept until their points arrive
+_SEARCH_PERIOD = 0.5  # seconds between two searches for the keypoints' topic
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-class LifterClient(Node):
-    """Gives every frame that a lifter answers to `show`, as a `Recording` of one frame.
+@dataclass(frozen=True)
+class LifterTopics:
+    """Names and layouts of what a lifter receives and publishes.
 
-    The rotation follows the points; a frame without one is shown when the next points come.
+    Attributes:
+        lifter: name of the node.
+        keypoints: topic of the keypoints.
+        source: layout of the keypoints.
+        target: layout of the lifted points.
+        min_confidence: in [0, 1]; a keypoint with less is missing.
+        size: width and height of the image in pixels; None: unknown.
+    """
+
+    lifter: str
+    keypoints: str
+    source: KeypointLayout
+    target: KeypointLayout
+    min_confidence: float
+    size: Size | None = None
+
+
+class LifterClient(Node):
+    """Passes on every lifted message as a `Recording` of one frame.
+
+    The rotation is published after the points. A frame whose rotation does not arrive is passed on
+    when the next points arrive.
     """
 
     def __init__(
         self,
-        lifter: str,
-        keypoints: str,
-        source: KeypointLayout,
-        target: KeypointLayout,
-        min_confidence: float,
-        size: Size | None,
-        show: Callable[[Recording], None],
+        topics: LifterTopics,
+        on_frame: Callable[[Recording], None],
         context: Context | None = None,
     ) -> None:
-        """Listen to the node called `lifter` and to the topic `keypoints`, whatever its type."""
-        super().__init__("lifter_client", context=context)
-        self._source, self._target, self._show = source, target, show
-        self._min_confidence, self._size = min_confidence, size
-        self._seen: OrderedDict[int, Observation] = OrderedDict()  # by stamp; 0: has no header
-        self._waiting: LiftedMessage | None = None
-        self._keypoints = self.resolve_topic_name(keypoints)
-        lifter = lifter.rstrip("/")
-        self.create_subscription(PointCloud2, f"{lifter}/points", self._take_points, 10)
-        self.create_subscription(
-            QuaternionStamped, f"{lifter}/camera_rotation", self._take_rotation, 10
-        )
-        self._search = self.create_timer(_LOOK, self._look_for_keypoints)
+        """Subscribe to the lifter; the type of the keypoints is found when they are published.
 
-    def _look_for_keypoints(self) -> None:
-        """Listen to the keypoints once somebody publishes them in a type that can be read."""
+        Args:
+            topics: names and layouts.
+            on_frame: called with each frame.
+            context: of rclpy; None: the default context.
+        """
+        super().__init__("lifter_client", context=context)
+        self._topics, self._on_frame = topics, on_frame
+        # By stamp; 0 for messages without a header.
+        self._observations: OrderedDict[int, Observation] = OrderedDict()
+        self._waiting: LiftedMessage | None = None
+        self._keypoints = self.resolve_topic_name(topics.keypoints)
+        lifter = topics.lifter.rstrip("/")
+        self.create_subscription(PointCloud2, f"{lifter}/points", self._receive_points, 10)
+        self.create_subscription(
+            QuaternionStamped, f"{lifter}/camera_rotation", self._receive_rotation, 10
+        )
+        self._search = self.create_timer(_SEARCH_PERIOD, self._find_keypoints)
+
+    def _find_keypoints(self) -> None:
+        """Subscribe to the keypoints once they are published with a type that can be read."""
         for name, types in self.get_topic_names_and_types():
             for kind in (kind.replace("/msg/", "/") for kind in types):
                 if name == self._keypoints and kind in INPUT_TYPES:
-                    self.create_subscription(message_class(kind), name, self._taker(kind), _QOS)
-                    self.get_logger().info(f"listening to {name} ({kind})")
+                    self.create_subscription(message_class(kind), name, self._receiver(kind), _QOS)
+                    self.get_logger().info(f"subscribed to {name} ({kind})")
                     self._search.cancel()
                     return
 
-    def _taker(self, kind: str) -> Callable[[Any], None]:
-        """Return what keeps the observation in a message of type `kind`."""
+    def _receiver(self, kind: str) -> Callable[[Any], None]:
+        """Return the callback that keeps the observation of a message of type `kind`."""
 
-        def take(message: Any) -> None:
+        def receive(message: Any) -> None:
             try:
-                seen = read_observation(
-                    message, kind, len(self._source), self._min_confidence, self._size
+                observation = read_observation(
+                    message,
+                    kind,
+                    len(self._topics.source),
+                    self._topics.min_confidence,
+                    self._topics.size,
                 )
             except ValueError as problem:
-                self._complain(str(problem))
+                self._warn(str(problem))
                 return
-            self._seen[stamp_of(message)] = seen
-            while len(self._seen) > _KEPT:
-                self._seen.popitem(last=False)
+            self._observations[stamp_of(message)] = observation
+            while len(self._observations) > _MAX_WAITING:
+                self._observations.popitem(last=False)
 
-        return take
+        return receive
 
-    def _take_points(self, message: PointCloud2) -> None:
-        """Keep the points until their rotation comes."""
+    def _receive_points(self, message: PointCloud2) -> None:
+        """Keep the points until their rotation arrives."""
         self._flush()
         try:
             values = read_points(message)
         except ValueError as problem:
-            self._complain(str(problem))
+            self._warn(str(problem))
             return
         self._waiting = LiftedMessage(stamp_of(message), values[..., :3], values[..., 3], None)
 
-    def _take_rotation(self, message: QuaternionStamped) -> None:
-        """Show the points that were waiting for it."""
+    def _receive_rotation(self, message: QuaternionStamped) -> None:
+        """Add the rotation to its points and pass them on."""
         q = message.quaternion
         if self._waiting and self._waiting.stamp == stamp_of(message):
             R = rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w]))
@@ -107,16 +135,18 @@ class LifterClient(Node):
             self._flush()
 
     def _flush(self) -> None:
-        """Show the points that wait, beside the keypoints of their stamp."""
-        answer, self._waiting = self._waiting, None
-        if answer is None:
+        """Pass on the waiting points, joined with the keypoints of their stamp."""
+        lifted, self._waiting = self._waiting, None
+        if lifted is None:
             return
-        seen = self._seen.get(answer.stamp) or self._seen.get(0)
-        detections = seen and gather([seen], [answer.stamp], len(self._source))
+        observation = self._observations.get(lifted.stamp) or self._observations.get(0)
+        source, target = self._topics.source, self._topics.target
+        detections = observation and gather([observation], [lifted.stamp], len(source))
         try:
-            self._show(join_lifted_messages([answer], detections, self._source, self._target))
+            self._on_frame(join_lifted_messages([lifted], detections, source, target))
         except ValueError as problem:
-            self._complain(str(problem))
+            self._warn(str(problem))
 
-    def _complain(self, problem: str) -> None:
+    def _warn(self, problem: str) -> None:
+        """Log a problem, throttled."""
         self.get_logger().warning(problem, throttle_duration_sec=LOG_PERIOD)

@@ -1,7 +1,7 @@
-"""Messages of the lifter from arrays.
+"""Build the lifter's messages from arrays.
 
-Those of the hot path come serialised: all but stamp and numbers is the same in each, so one that
-ROS has serialised serves for the next.
+Messages of the hot path are built serialised. They differ only in stamp and numbers, so a message
+that ROS has serialised once is a template for the next ones.
 """
 
 from __future__ import annotations
@@ -27,29 +27,35 @@ from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.nrsfm.geometry import centre, quaternion
 
 NO_EVENT_CALLBACKS = PublisherEventCallbacks(use_default_callbacks=False)
-"""For publishers of the lifter: rclpy looks after two events of any other at every message.
+"""For the lifter's publishers: rclpy polls two events of a publisher with callbacks per message.
 
-They would tell of a subscriber whose quality of service does not fit. Its own node tells it too.
+The events report subscribers with an incompatible quality of service, which the subscriber's own
+node reports as well.
 """
 
-_MAKES = 16  # of each kind of message that are kept: cameras, and numbers of objects
+_MAX_TEMPLATES = 16  # kept of each kind of message: one per camera and number of objects
 
 _LIFETIME = Duration(nanosec=300_000_000)
 _BONES = std_msgs.ColorRGBA(r=0.2, g=0.6, b=1.0, a=1.0)
 _JOINTS = std_msgs.ColorRGBA(r=1.0, g=0.7, b=0.1, a=1.0)
-_JOINT_SIZE = 0.08  # of the shape's RMS radius
+_JOINT_SIZE = 0.08  # diameter, relative to the shape's RMS radius
 _BONE_SIZE = 0.03
 
 
 class _Template(NamedTuple):
-    """A serialised message, to be filled again for every message of its make."""
+    """A serialised message whose stamp and numbers are overwritten.
+
+    Attributes:
+        raw: the bytes.
+        values: view of the numbers in them.
+    """
 
     raw: bytearray
-    values: NDArray[Any]  # a view of the numbers in it
+    values: NDArray[Any]
 
 
 def point_cloud(header: Header, lifted: Lifted) -> bytes:
-    """Return the points and confidence of n objects as a serialised PointCloud2."""
+    """Return the serialised PointCloud2 of n objects (rows) with p points (columns)."""
     raw, values = _point_cloud(header.frame_id, *lifted.confidence.shape)
     header.write_stamp(raw)
     values[..., :3] = lifted.shapes
@@ -59,16 +65,16 @@ def point_cloud(header: Header, lifted: Lifted) -> bytes:
 
 
 def camera_rotation(header: Header, rotation: NDArray[np.float32]) -> bytes:
-    """Return the rotation (3, 3) of an object as a serialised QuaternionStamped."""
+    """Return the serialised QuaternionStamped of a rotation (3, 3)."""
     raw, values = _quaternion(header.frame_id)
     header.write_stamp(raw)
     values[:] = quaternion(rotation)
     return bytes(raw)
 
 
-@lru_cache(_MAKES)
+@lru_cache(_MAX_TEMPLATES)
 def _point_cloud(frame_id: str, n: int, p: int) -> _Template:
-    """Return a template of the cloud of n objects (its height) of p keypoints (its width)."""
+    """Return a template of the cloud with height n and width p."""
     message = PointCloud2(header=std_msgs.Header(frame_id=frame_id), height=n, width=p)
     message.fields = [
         PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
@@ -77,12 +83,12 @@ def _point_cloud(frame_id: str, n: int, p: int) -> _Template:
     message.point_step, message.row_step = POINT_STEP, p * POINT_STEP
     message.data = array("B", bytes(n * p * POINT_STEP))
     raw = bytearray(serialize_message(message))
-    # The data comes last but for is_dense.
+    # The data is followed only by the byte is_dense.
     values = np.frombuffer(raw, "<f4", n * p * 4, len(raw) - 1 - len(message.data))
     return _Template(raw, values.reshape(n, p, 4))
 
 
-@lru_cache(_MAKES)
+@lru_cache(_MAX_TEMPLATES)
 def _quaternion(frame_id: str) -> _Template:
     """Return a template of the quaternion x, y, z, w."""
     message = QuaternionStamped(header=std_msgs.Header(frame_id=frame_id))
@@ -91,7 +97,7 @@ def _quaternion(frame_id: str) -> _Template:
 
 
 def to_header(header: Header) -> std_msgs.Header:
-    """Return a header as a message."""
+    """Return a header as a message of ROS."""
     stamp = Time(sec=header.sec, nanosec=header.nanosec)
     return std_msgs.Header(stamp=stamp, frame_id=header.frame_id)
 
@@ -99,16 +105,20 @@ def to_header(header: Header) -> std_msgs.Header:
 def objects(
     header: Header, lifted: Lifted, identities: Sequence[str], *, positioned: bool = False
 ) -> MultiDOFJointState:
-    """Return who is in which row of the point cloud, and how each is turned.
+    """Return identity and transform of the object in each row of the point cloud.
 
-    Of the standard messages this one alone holds a header, a list of names and a transform for
-    each: an object before a camera is a floating joint. (TFMessage is in a package that this one
-    does not need; an id as a field of the cloud would have to be a number.)
+    Among the standard messages, only MultiDOFJointState has a header, a list of names and a
+    transform for each: an object before a camera is a floating joint. TFMessage is in a package on
+    which this one does not depend, and a field of the cloud would have to be a number.
 
-    identities: n, "" for an object without one. A transform leads from the axes of the object, its
-    origin the mean of its keypoints, to those of the cloud: its rotation is that of
-    ~/camera_rotation, its translation the object's place, zero unless the shapes are `positioned`.
-    NaN where the object could not be lifted.
+    Args:
+        header: of the message.
+        lifted: n objects.
+        identities: n, "" for an object without one.
+        positioned: whether the shapes are at their positions before the camera.
+
+    Returns:
+        Transforms as `transforms` gives them, NaN for objects that are not lifted.
     """
     message = MultiDOFJointState(header=to_header(header), joint_names=list(identities))
     message.transforms = transforms(lifted, positioned=positioned)
@@ -116,15 +126,23 @@ def objects(
 
 
 def transforms(lifted: Lifted, *, positioned: bool) -> list[Transform]:
-    """Return what leads from the axes of each object to those of the camera."""
+    """Return the transform from the axes of each object to those of the camera.
+
+    The origin of an object is the mean of its keypoints.
+
+    Args:
+        lifted: n objects.
+        positioned: whether the shapes are at their positions; if not, translations are 0.
+    """
     means = lifted.shapes.mean(1) if positioned else np.zeros((len(lifted.shapes), 3))
-    moves = (Vector3(x=x, y=y, z=z) for x, y, z in means.tolist())
-    turns = map(to_quaternion, lifted.rotations)
-    return [Transform(translation=t, rotation=q) for t, q in zip(moves, turns, strict=True)]
+    translations = (Vector3(x=x, y=y, z=z) for x, y, z in means.tolist())
+    rotations = map(to_quaternion, lifted.rotations)
+    pairs = zip(translations, rotations, strict=True)
+    return [Transform(translation=t, rotation=q) for t, q in pairs]
 
 
 def to_quaternion(rotation: NDArray[np.float32]) -> Quaternion:
-    """Return a rotation (3, 3) as a message, NaN if it is."""
+    """Return the Quaternion of a rotation (3, 3); NaN stays NaN."""
     x, y, z, w = quaternion(rotation).tolist()
     return Quaternion(x=x, y=y, z=z, w=w)
 
@@ -132,19 +150,22 @@ def to_quaternion(rotation: NDArray[np.float32]) -> Quaternion:
 def markers(
     header: Header, lifted: Lifted, edges: Sequence[tuple[int, int]], *, positioned: bool = False
 ) -> MarkerArray:
-    """Return each object as a list of lines, one an edge, and a list of spheres.
+    """Return for each lifted object a list of lines (edges) and a list of spheres (keypoints).
 
-    positioned: the shapes are at their place. Where they are not, the first object is at the
-    origin, as in the point cloud; the others stand beside it as they do in the image. Objects that
-    are NaN are left out.
+    Args:
+        header: of the message.
+        lifted: n objects.
+        edges: pairs of keypoint indices.
+        positioned: whether the shapes are at their positions. If not, the first object is at the
+            origin, as in the point cloud, and the others stand beside it as in the image.
     """
-    array_of_markers, stamped = MarkerArray(), to_header(header)
+    message, stamped = MarkerArray(), to_header(header)
     lifted = Lifted(*(part[~np.isnan(lifted.residual)] for part in lifted))
     sizes = np.sqrt((centre(lifted.shapes) ** 2).sum(-1).mean(-1)).tolist()
-    apart = (lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]
-    places = (np.zeros_like(apart) if positioned else apart).tolist()
+    offsets = (lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]
+    positions = (np.zeros_like(offsets) if positioned else offsets).tolist()
     for i, (shape, size, (x, y)) in enumerate(
-        zip(lifted.shapes.tolist(), sizes, places, strict=True)
+        zip(lifted.shapes.tolist(), sizes, positions, strict=True)
     ):
         points = [Point(x=px, y=py, z=pz) for px, py, pz in shape]
         bones, joints = Marker(ns="bones", type=Marker.LINE_LIST), Marker(ns="joints")
@@ -155,5 +176,5 @@ def markers(
         for marker in (bones, joints):
             marker.header, marker.id, marker.lifetime = stamped, i, _LIFETIME
             marker.pose.position = Point(x=x, y=y)
-        array_of_markers.markers += [bones, joints]
-    return array_of_markers
+        message.markers += [bones, joints]
+    return message

