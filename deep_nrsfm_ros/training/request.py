@@ -33,12 +33,13 @@ class TrainingOptions:
     )
     keypoint_layout: str = option(
         "",
-        "order of the keypoints in the bags; empty = that of the parameter keypoint_layout, or where "
-        "that is 'model', the layout of train.object if it is set",
+        "order of the keypoints in the bags; empty = that of the parameter keypoint_layout, or "
+        "where that is 'model', the layout of train.object if it is set",
     )
     from_: str = option(
         "",
-        "model to start from, by name or path; keypoints are matched by name; empty = random weights",
+        "model to start from, by name or path; keypoints are matched by name; empty = random "
+        "weights",
     )
     name: str = option(
         "trained", "name of the new model; an existing model of this name is replaced"
