@@ -79,8 +79,8 @@ class InputOptions:
     )
     min_confidence: float = option(
         0.1,
-        "detector confidence below which a keypoint is missing; 0 = all keypoints are used, 0.1 "
-        "typical, 0.5 strict",
+        "detector confidence below which a keypoint is missing; 0 = every keypoint with a positive "
+        "confidence is used, 0.1 typical, 0.5 strict",
         low=0,
         high=1,
     )

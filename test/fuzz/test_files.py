@@ -88,7 +88,7 @@ def test_a_mapping_file_is_read_or_refused_and_what_is_read_reads_messages(
 ) -> None:
     texts = [p.read_bytes() for p in (ROOT / "config" / "mappings").glob("*.yaml")]
     texts.append(
-        b"type: a/B\nobjects: found\nobject_id: number\nkeypoints: joints\nx: place.u\ny: place.v\n"
+        b"type: a/B\nobjects: found\nidentity: number\nkeypoints: joints\nx: place.u\ny: place.v\n"
         b"confidence: sure\nkeypoint_id: which\nfirst_id: 0\nmissing: -1\nunits: pixels\n"
     )
     p, file = len(bench.layout), tmp_path / "mapping.yaml"

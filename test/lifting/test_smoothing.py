@@ -24,16 +24,16 @@ def one(
     S: np.ndarray = SHAPE,
     turn: ArrayLike = (0, 0, 0),
     place: ArrayLike = (0, 0, 0),
-    sure: float = 0.8,
+    confidence: float = 0.8,
 ) -> Lifted:
     """Return an object of shape S in its own axes, turned and at its place."""
     R = rotation_from_vector(np.array(turn, float))
-    parts = (S @ R.T + np.array(place), R, 1.0, np.zeros(2), 0.1, np.full(P, sure))
+    parts = (S @ R.T + np.array(place), R, 1.0, np.zeros(2), 0.1, np.full(P, confidence))
     return Lifted(*(np.asarray(part, np.float32)[None] for part in parts))
 
 
 def nothing() -> Lifted:
-    parts = one(sure=0)
+    parts = one(confidence=0)
     unknown = (np.full_like(part, np.nan) for part in parts[:-1])
     return Lifted._make((*unknown, parts.confidence))
 
@@ -43,8 +43,8 @@ def both(*objects: Lifted) -> Lifted:
 
 
 def run(objects: Sequence[Lifted], options: SmoothingOptions = ON, rate: float = RATE) -> Lifted:
-    steady = Smoother(options)
-    return both(*(steady(lifted, ("a",), i / rate)[0] for i, lifted in enumerate(objects)))
+    smoother = Smoother(options)
+    return both(*(smoother(lifted, ("a",), i / rate)[0] for i, lifted in enumerate(objects)))
 
 
 def angles(R: np.ndarray) -> np.ndarray:
@@ -57,10 +57,10 @@ def moves(S: np.ndarray) -> float:
 
 
 def test_off_it_changes_nothing() -> None:
-    steady, lifted = Smoother(SmoothingOptions()), both(one(), nothing())
+    smoother, lifted = Smoother(SmoothingOptions()), both(one(), nothing())
     assert not SmoothingOptions().enabled
     for time in (0.0, 0.1):
-        same, identities = steady(lifted, ("a", "b"), time)
+        same, identities = smoother(lifted, ("a", "b"), time)
         assert same is lifted and identities == ("a", "b")
 
 
@@ -70,10 +70,10 @@ def test_what_trembles_is_held_still() -> None:
         one(SHAPE + 0.03 * rng.standard_normal((P, 3)), 0.02 * rng.standard_normal(3))
         for _ in range(200)
     ]
-    raw, steady = both(*shaken), run(shaken)
-    assert angles(steady.rotations[50:]).mean() < 0.3 * angles(raw.rotations[50:]).mean()
-    assert moves(steady.shapes[50:]) < 0.3 * moves(raw.shapes[50:])
-    assert np.abs(steady.shapes[-1] - SHAPE).max() < 0.05
+    raw, smoothed = both(*shaken), run(shaken)
+    assert angles(smoothed.rotations[50:]).mean() < 0.3 * angles(raw.rotations[50:]).mean()
+    assert moves(smoothed.shapes[50:]) < 0.3 * moves(raw.shapes[50:])
+    assert np.abs(smoothed.shapes[-1] - SHAPE).max() < 0.05
 
 
 @pytest.mark.parametrize("rate", [30.0, 60.0, 120.0])
@@ -105,9 +105,9 @@ def test_a_turn_through_half_a_circle_takes_the_short_way_and_stays_a_rotation()
 
 def test_shape_and_rotation_still_belong_together() -> None:
     rng = np.random.default_rng(2)
-    steady = run([one(turn=0.1 * rng.standard_normal(3)) for _ in range(50)])
+    smoothed = run([one(turn=0.1 * rng.standard_normal(3)) for _ in range(50)])
     np.testing.assert_allclose(
-        steady.shapes @ steady.rotations, SHAPE[None].repeat(50, 0), atol=1e-4
+        smoothed.shapes @ smoothed.rotations, SHAPE[None].repeat(50, 0), atol=1e-4
     )
 
 
@@ -118,63 +118,63 @@ def test_each_object_has_a_filter_of_its_own_wherever_it_stands_in_the_message()
         for far in (np.zeros((P, 3)), np.eye(P, 3))
     )
     alone = run(a)
-    steady = Smoother(ON)
+    smoother = Smoother(ON)
     for i in range(20):
         order = ("a", "b") if i % 2 else ("b", "a")
         pair = both(a[i], b[i]) if i % 2 else both(b[i], a[i])
-        together, identities = steady(pair, order, i / RATE)
+        together, identities = smoother(pair, order, i / RATE)
         assert identities == order
         np.testing.assert_array_equal(together.shapes[order.index("a")], alone.shapes[i])
 
 
 @pytest.mark.parametrize("listed", [True, False], ids=["not lifted", "not in the message"])
-def test_a_gap_is_bridged_for_its_time_and_less_sure(listed: bool) -> None:
-    steady = Smoother(dataclasses.replace(ON, max_gap=0.4))
+def test_a_gap_is_filled_for_its_time_with_falling_confidence(listed: bool) -> None:
+    smoother = Smoother(dataclasses.replace(ON, max_gap=0.4))
     empty = Lifted(*(part[:0] for part in one()))
     gone, identities = (nothing(), ("a",)) if listed else (empty, ())
-    steady(one(), ("a",), 10.0)
+    smoother(one(), ("a",), 10.0)
     for wait, left in ((0.1, 0.75), (0.3, 0.25)):
-        held, found = steady(gone, identities, 10 + wait)
+        held, found = smoother(gone, identities, 10 + wait)
         assert found == ("a",)
         np.testing.assert_allclose(held.shapes[0], SHAPE, atol=1e-6)
         np.testing.assert_allclose(held.confidence, 0.8 * left, rtol=1e-5)
-    after, found = steady(gone, identities, 10.5)
+    after, found = smoother(gone, identities, 10.5)
     assert found == identities and np.isnan(after.residual).all()
     assert (after.confidence == 0).all()
 
 
-def test_no_bridge_if_none_is_asked_for_and_none_for_strangers() -> None:
-    steady = Smoother(dataclasses.replace(ON, max_gap=0.0))
-    steady(one(), ("a",), 0.0)
-    assert np.isnan(steady(nothing(), ("a",), 0.01)[0].residual).all()
+def test_no_gap_is_filled_with_max_gap_0_or_for_a_new_object() -> None:
+    smoother = Smoother(dataclasses.replace(ON, max_gap=0.0))
+    smoother(one(), ("a",), 0.0)
+    assert np.isnan(smoother(nothing(), ("a",), 0.01)[0].residual).all()
     assert np.isnan(Smoother(ON)(nothing(), ("b",), 0.0)[0].residual).all()
 
 
 def test_an_object_that_was_away_for_long_begins_anew() -> None:
     far = one(SHAPE + np.eye(P, 3))
     for wait, anew in ((0.5 * MAX_AGE, False), (1.5 * MAX_AGE, True)):
-        steady = Smoother(dataclasses.replace(ON, min_cutoff=0.1, beta=0.0))
-        steady(one(), ("a",), 0.0)
-        back, _ = steady(far, ("a",), wait)
+        smoother = Smoother(dataclasses.replace(ON, min_cutoff=0.1, beta=0.0))
+        smoother(one(), ("a",), 0.0)
+        back, _ = smoother(far, ("a",), wait)
         assert np.array_equal(back.shapes, far.shapes) == anew
 
 
 def test_what_comes_late_or_twice_passes_and_leaves_no_trace() -> None:
     options = dataclasses.replace(ON, min_cutoff=0.1, beta=0.0)
-    untouched, steady = Smoother(options), Smoother(options)
+    untouched, smoother = Smoother(options), Smoother(options)
     odd = one(5 * SHAPE)
-    for other in (untouched, steady):
+    for other in (untouched, smoother):
         other(one(), ("a",), 1.0)
     for time in (1.0, 0.5):
-        np.testing.assert_array_equal(steady(odd, ("a",), time)[0].shapes, odd.shapes)
+        np.testing.assert_array_equal(smoother(odd, ("a",), time)[0].shapes, odd.shapes)
     next_one = one(2 * SHAPE)
-    expected, found = (f(next_one, ("a",), 1.1)[0].shapes for f in (untouched, steady))
+    expected, found = (f(next_one, ("a",), 1.1)[0].shapes for f in (untouched, smoother))
     np.testing.assert_array_equal(expected, found)
 
 
 def test_a_clock_that_goes_far_back_begins_anew() -> None:
-    steady = Smoother(dataclasses.replace(ON, min_cutoff=0.1, beta=0.0))
-    steady(one(), ("a",), 100.0)
-    steady(one(2 * SHAPE), ("a",), 1.0)
-    again, _ = steady(one(3 * SHAPE), ("a",), 1.1)
+    smoother = Smoother(dataclasses.replace(ON, min_cutoff=0.1, beta=0.0))
+    smoother(one(), ("a",), 100.0)
+    smoother(one(2 * SHAPE), ("a",), 1.0)
+    again, _ = smoother(one(3 * SHAPE), ("a",), 1.1)
     assert 2 < (again.shapes[0] / SHAPE).mean() < 2.5

@@ -217,7 +217,7 @@ def test_markers_come_when_someone_listens(start_lifter: StartLifter, connect: C
     assert all(m.scale.x > 0 for m in markers)
 
 
-def test_steadied_it_follows_slower_and_bridges_a_gap(
+def test_smoothing_follows_slower_and_fills_a_gap(
     start_lifter: StartLifter, connect: Connect
 ) -> None:
     start_lifter(**{"smoothing.enabled": True, "smoothing.max_gap": 5.0})
@@ -244,8 +244,8 @@ def test_steadied_it_follows_slower_and_bridges_a_gap(
     assert "at least 0" in client.set_parameters(smoothing__max_gap=-1)
     alone = answer(here, 200)
     np.testing.assert_allclose(alone, first, rtol=1e-4)  # what was known is forgotten
-    steadied = answer(there, 201)
-    assert np.abs(steadied - alone)[..., :3].max() < 0.05 * np.abs(alone[..., :3]).max()
+    smoothed = answer(there, 201)
+    assert np.abs(smoothed - alone)[..., :3].max() < 0.05 * np.abs(alone[..., :3]).max()
 
 
 def test_parameters_change_what_the_next_message_gets(
