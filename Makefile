@@ -33,7 +33,7 @@ LIBASAN = $(shell $(SANITIZE_CC) -print-file-name=libasan.so)
 LIBSTDCXX = $(shell $(SANITIZE_CC) -print-file-name=libstdc++.so.6)
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g
 SANITIZE_TESTS := test/kernel test/fuzz/test_kernel.py test/lifting/test_compiled_backend.py \
-    test/messages/test_serialised.py test/training/test_compiled_gradient.py
+    test/messages/test_serialised.py test/training/test_compiled_network.py
 SANITIZE_FUZZ ?= 1000
 
 PYTHON := .venv/bin/python

@@ -35,20 +35,60 @@ def lift(plan: object, points: Any, confidence: Any, perspective: bool, /, *outp
         RuntimeError: The plan is in use by another lift.
     """
 
-def workers(header: Any, L: Any, L_inverse: Any, /) -> object: ...
-def gradient(
-    workers: object,
-    cycle: float,
-    weights: Any,
-    x: Any,
-    W: Any,
-    mask: Any,
-    T: Any,
-    losses: Any,
-    shapes: Any,
-    gradient: Any,
-    /,
-) -> None: ...
+def worker_pool(header: Any, L: Any, L_inverse: Any, /) -> object:
+    """Return the threads' memory for the passes of a network in training.
+
+    Args:
+        header: int32: keypoints p, layers, 1 if whitened, frames of a block, threads, widths.
+        L: (p, p) float32, whitening.
+        L_inverse: (p, p) float32.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: A number is out of range, or there is no memory.
+    """
+
+def activations_per_frame(pool: object, /) -> int:
+    """Return how many floats the forward pass keeps of a frame for the backward pass."""
+
+def network_forward(
+    pool: object, weights: Any, x: Any, activations: Any, S: Any, M_T: Any, /
+) -> None:
+    """Compute the forward pass of n frames and fill the outputs.
+
+    Args:
+        pool: as `worker_pool` returned it.
+        weights: float32, in the order of `Network.trainable_weights`.
+        x: (n, p, 2) float32, the network's input.
+        activations: output (n, activations_per_frame) float32.
+        S: output (n, 3, p) float32.
+        M_T: output (n, 2, 3) float32.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: The arrays do not fit the network and each other.
+        RuntimeError: The pool is in use by another call.
+    """
+
+def network_backward(
+    pool: object, weights: Any, activations: Any, S_bar: Any, M_T_bar: Any, gradient: Any, /
+) -> None:
+    """Compute the gradient by the weights from the gradients by S and M^T.
+
+    Args:
+        pool: as `worker_pool` returned it.
+        weights: those of the forward pass.
+        activations: those of the forward pass.
+        S_bar: (n, 3, p) float32.
+        M_T_bar: (n, 2, 3) float32.
+        gradient: output float32, in the order of the weights.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: The arrays do not fit the network and each other.
+        RuntimeError: The pool is in use by another call.
+    """
+
 def decode_keypoints(
     data: Any,
     messages: tuple[int, int],

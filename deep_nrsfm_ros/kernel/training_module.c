@@ -1,91 +1,177 @@
-/* Entry points of training in the module `_kernel`. */
+/* Entry points of training in the module `_kernel`: Python's arrays to training_pass.c and back.
+
+   As in module.c, no argument is trusted. */
 #include "training_module.h"
 
 #include <stdint.h>
 
-#include "gradient.h"
+#include "arguments.h"
+#include "training_pass.h"
 
-#define LINE 64 /* bytes of the cache, at whose borders all parts begin */
+static const char POOL[] = "deep_nrsfm_ros.kernel._kernel.worker_pool";
 
-/* The workers of a training, one a thread. */
-typedef struct {
-    Kind kind;
-    int threads;
-    char *memory;
-    Worker *workers;
-} Staff;
-
-static const char STAFF[] = "deep_nrsfm_ros.kernel._kernel.workers";
-
-static void dismiss(PyObject *capsule) {
-    Staff *staff = PyCapsule_GetPointer(capsule, STAFF);
-    if (staff) PyMem_Free(staff->memory), PyMem_Free(staff->workers), PyMem_Free(staff);
+static void worker_pool_free(WorkerPool *pool) {
+    PyMem_Free(pool->memory), PyMem_Free(pool->weights), PyMem_Free(pool->workers), PyMem_Free(pool);
 }
 
-/* workers(header int32, L, L_inverse float32) -> capsule; header: p, layers, whitened, frames at a time,
+static void worker_pool_stop(PyObject *capsule) {
+    WorkerPool *pool = PyCapsule_GetPointer(capsule, POOL);
+    if (pool) worker_pool_free(pool);
+}
+
+/* Return a pool of workers for a network, or NULL without memory. Header as in `training_worker_pool`, valid. */
+static WorkerPool *worker_pool_start(const int *header, const float *L, const float *L_inverse) {
+    WorkerPool *pool = PyMem_Calloc(1, sizeof(WorkerPool));
+    if (!pool) return NULL;
+    NetworkSizes *sizes = &pool->sizes;
+    sizes->p = header[0], sizes->layers = header[1], sizes->whitened = header[2] != 0, sizes->block = header[3];
+    pool->threads = header[4];
+    network_sizes_set(sizes, header + 5);
+    pool->workers = PyMem_Calloc(pool->threads, sizeof(Worker));
+    pool->weights = PyMem_Calloc(sizes->weights, sizeof(float));
+    size_t each, total;
+    int fits = pool->workers && pool->weights;
+    /* The bytes of a worker are a multiple of a cache line. */
+    fits = fits && !__builtin_add_overflow(worker_lay_out(pool->workers, sizes, NULL), 0, &each) &&
+           !__builtin_mul_overflow(each, pool->threads, &total) && !__builtin_add_overflow(total, CACHE_LINE, &total);
+    pool->memory = fits ? PyMem_Calloc(total, 1) : NULL;
+    if (!pool->memory) {
+        worker_pool_free(pool);
+        return NULL;
+    }
+    char *at = (char *)TO_CACHE_LINE((uintptr_t)pool->memory);
+    for (int i = 0; i < pool->threads; i++, at += each) {
+        worker_lay_out(pool->workers + i, sizes, at);
+        worker_set_whitening(pool->workers + i, L, L_inverse);
+    }
+    return pool;
+}
+
+/* Return whether n ints are the header of a pool. */
+static int header_valid(const int *header, Py_ssize_t n) {
+    if (n < 6 || header[1] < 1 || header[1] > MOST_LAYERS || n != 5 + header[1]) return 0;
+    if (header[0] < 1 || header[0] > MAX_KEYPOINTS || header[3] < 1 || header[3] > MAX_BLOCK) return 0;
+    if (header[4] < 1 || header[4] > MAX_THREADS) return 0;
+    for (int i = 5; i < n; i++)
+        if (header[i] < 1 || header[i] > MAX_WIDTH) return 0;
+    return 1;
+}
+
+/* worker_pool(header int32, L, L_inverse float32) -> capsule; header: p, layers, whitened, frames of a block,
    threads, widths. */
-PyObject *workers(PyObject *Py_UNUSED(module), PyObject *args) {
-    Py_buffer parts[3];
-    if (!PyArg_ParseTuple(args, "y*y*y*", &parts[0], &parts[1], &parts[2])) return NULL;
-    const int *h = parts[0].buf;
-    Py_ssize_t n = parts[0].len / 4;
-    int sound = n > 5 && h[0] > 0 && h[1] > 0 && h[1] <= MOST_LAYERS && n == 5 + h[1] && h[3] > 0 && h[4] > 0;
-    for (int i = 0; sound && i < h[1]; i++) sound = h[5 + i] > 0;
-    for (int i = 1; i < 3; i++) sound = sound && parts[i].len == (Py_ssize_t)4 * h[0] * h[0];
-    Staff *staff = sound ? PyMem_Calloc(1, sizeof(Staff)) : NULL;
-    if (staff) {
-        Kind *kind = &staff->kind;
-        kind->p = h[0], kind->layers = h[1], kind->whitened = h[2], kind->block = h[3], staff->threads = h[4];
-        describe(kind, h + 5);
-        staff->workers = PyMem_Calloc(staff->threads, sizeof(Worker));
-        size_t each = staff->workers ? (employ(staff->workers, kind, NULL) + LINE - 1) / LINE * LINE : 0;
-        staff->memory = each ? PyMem_Calloc(staff->threads * each + LINE, 1) : NULL;
-        char *at = staff->memory ? staff->memory + (LINE - (uintptr_t)staff->memory % LINE) : NULL;
-        for (int i = 0; at && i < staff->threads; i++, at += each) {
-            employ(staff->workers + i, kind, at);
-            whiten_by(staff->workers + i, parts[1].buf, parts[2].buf);
-        }
-    }
-    for (int i = 0; i < 3; i++) PyBuffer_Release(&parts[i]);
-    if (staff && !staff->memory) {
-        PyMem_Free(staff->workers), PyMem_Free(staff);
-        return PyErr_NoMemory();
-    }
-    if (!staff) {
+PyObject *training_worker_pool(PyObject *Py_UNUSED(module), PyObject *args) {
+    static const ArrayArgument expected[3] = {{"header", INT32, 0}, {"L", FLOAT32, 0}, {"L_inverse", FLOAT32, 0}};
+    PyObject *objects[3];
+    Py_buffer arrays[3];
+    if (!parse_arguments(args, "OOO:worker_pool", &objects[0], &objects[1], &objects[2])) return NULL;
+    if (!get_arrays(3, expected, objects, arrays)) return NULL;
+    const int *header = arrays[0].buf;
+    int valid = header_valid(header, count_items(arrays));
+    for (int i = 1; valid && i < 3; i++) valid = count_items(arrays + i) == (Py_ssize_t)header[0] * header[0];
+    WorkerPool *pool = valid ? worker_pool_start(header, arrays[1].buf, arrays[2].buf) : NULL;
+    release_arrays(3, arrays);
+    if (!valid) {
         PyErr_SetString(PyExc_ValueError, "the arrays are not those of a network");
         return NULL;
     }
-    return PyCapsule_New(staff, STAFF, dismiss);
+    if (!pool) {
+        PyErr_SetString(PyExc_ValueError, "there is no memory for the workers");
+        return NULL;
+    }
+    PyObject *capsule = PyCapsule_New(pool, POOL, worker_pool_stop);
+    if (!capsule) worker_pool_free(pool);
+    return capsule;
 }
 
-/* gradient(workers, cycle, weights, x, W, mask, T, losses float64, shapes, gradient): fill the last three,
-   arrays as in `gradient.h`; T may be empty. For one thread of Python at a time. */
-PyObject *gradient(PyObject *Py_UNUSED(module), PyObject *args) {
-    PyObject *capsule;
-    Py_buffer b[8];
-    double cycle;
-    if (!PyArg_ParseTuple(args, "Ody*y*y*y*y*w*w*w*", &capsule, &cycle, &b[0], &b[1], &b[2], &b[3], &b[4],
-                          &b[5], &b[6], &b[7]))
-        return NULL;
-    Staff *staff = PyCapsule_GetPointer(capsule, STAFF);
-    int sound = staff != NULL;
-    if (staff) {
-        Py_ssize_t p = staff->kind.p, weights = 4 * staff->kind.learned, frames = b[3].len / (4 * p);
-        Py_ssize_t known = b[4].len / (12 * p);
-        const Py_ssize_t lengths[8] = {weights,       8 * p * (frames + known), 8 * p * frames, 4 * p * frames,
-                                       12 * p * known, 16,                       12 * p * frames, weights};
-        for (int i = 0; i < 8; i++) sound = sound && b[i].len == lengths[i];
-        Task task = {frames, known, b[1].buf, b[2].buf, b[3].buf, b[4].buf, cycle};
-        if (sound && frames) {
-            Py_BEGIN_ALLOW_THREADS
-            gradient_of(staff->workers, staff->threads, b[0].buf, &task, b[5].buf, b[6].buf, b[7].buf);
-            Py_END_ALLOW_THREADS
-        } else {
-            sound = 0;
-            PyErr_SetString(PyExc_ValueError, "the arrays do not fit the network and each other");
-        }
+/* activations_per_frame(pool) -> floats that the forward pass keeps of a frame. */
+PyObject *training_activations(PyObject *Py_UNUSED(module), PyObject *capsule) {
+    WorkerPool *pool = PyCapsule_GetPointer(capsule, POOL);
+    return pool ? PyLong_FromSize_t(pool->sizes.activations) : NULL;
+}
+
+/* Return whether the arrays are those of n frames, n >= 1; floats: of each array for a frame, 0 for a weight vector. */
+static int arrays_fit(const NetworkSizes *sizes, Py_ssize_t n, const Py_buffer *arrays, const size_t floats[5]) {
+    for (int i = 0; i < 5; i++) {
+        size_t expected = sizes->weights;
+        if (floats[i] && __builtin_mul_overflow(floats[i], n, &expected)) return 0;
+        if ((size_t)count_items(arrays + i) != expected) return 0;
     }
-    for (int i = 0; i < 8; i++) PyBuffer_Release(&b[i]);
-    if (!sound) return NULL;
-    Py_RETURN_NONE;
+    return n > 0;
+}
+
+/* A call of one of the passes, with its pool taken and its arrays held. */
+typedef struct {
+    WorkerPool *pool;
+    Py_buffer arrays[5];
+} PassCall;
+
+/* Take the pool and the arrays; return 0 with an exception set if there is none or another call has it. */
+static int pass_begin(PassCall *call, PyObject *capsule, const ArrayArgument *expected, PyObject *const *objects) {
+    call->pool = PyCapsule_GetPointer(capsule, POOL);
+    if (!call->pool) return 0;
+    if (__atomic_exchange_n(&call->pool->busy, 1, __ATOMIC_ACQUIRE)) {
+        PyErr_SetString(PyExc_RuntimeError, "the workers are in use by another call");
+        return 0;
+    }
+    if (get_arrays(5, expected, objects, call->arrays)) return 1;
+    __atomic_store_n(&call->pool->busy, 0, __ATOMIC_RELEASE);
+    return 0;
+}
+
+/* Give the arrays and the pool back; return None, or NULL with ValueError if the arrays did not fit. */
+static PyObject *pass_end(PassCall *call, int fit) {
+    release_arrays(5, call->arrays);
+    __atomic_store_n(&call->pool->busy, 0, __ATOMIC_RELEASE);
+    if (fit) Py_RETURN_NONE;
+    PyErr_SetString(PyExc_ValueError, "the arrays do not fit the network and each other");
+    return NULL;
+}
+
+/* network_forward(pool, weights, x, activations, S, M_T): fill the last three; arrays as in training_pass.h. */
+PyObject *training_forward(PyObject *Py_UNUSED(module), PyObject *args) {
+    static const ArrayArgument expected[5] = {{"weights", FLOAT32, 0},
+                                              {"x", FLOAT32, 0},
+                                              {"activations", FLOAT32, 1},
+                                              {"S", FLOAT32, 1},
+                                              {"M_T", FLOAT32, 1}};
+    PyObject *capsule, *o[5];
+    PassCall call;
+    if (!parse_arguments(args, "OOOOOO:network_forward", &capsule, &o[0], &o[1], &o[2], &o[3], &o[4])) return NULL;
+    if (!pass_begin(&call, capsule, expected, o)) return NULL;
+    const Py_buffer *a = call.arrays;
+    size_t p = call.pool->sizes.p;
+    const size_t floats[5] = {0, 2 * p, call.pool->sizes.activations, 3 * p, 6};
+    Py_ssize_t n = count_items(a + 4) / 6;
+    int fit = arrays_fit(&call.pool->sizes, n, a, floats);
+    if (fit) {
+        Py_BEGIN_ALLOW_THREADS
+        network_forward(call.pool, a[0].buf, n, a[1].buf, a[2].buf, a[3].buf, a[4].buf);
+        Py_END_ALLOW_THREADS
+    }
+    return pass_end(&call, fit);
+}
+
+/* network_backward(pool, weights, activations, S_bar, M_T_bar, gradient): fill the last; arrays as in
+   training_pass.h. */
+PyObject *training_backward(PyObject *Py_UNUSED(module), PyObject *args) {
+    static const ArrayArgument expected[5] = {{"weights", FLOAT32, 0},
+                                              {"activations", FLOAT32, 0},
+                                              {"S_bar", FLOAT32, 0},
+                                              {"M_T_bar", FLOAT32, 0},
+                                              {"gradient", FLOAT32, 1}};
+    PyObject *capsule, *o[5];
+    PassCall call;
+    if (!parse_arguments(args, "OOOOOO:network_backward", &capsule, &o[0], &o[1], &o[2], &o[3], &o[4])) return NULL;
+    if (!pass_begin(&call, capsule, expected, o)) return NULL;
+    const Py_buffer *a = call.arrays;
+    size_t p = call.pool->sizes.p;
+    const size_t floats[5] = {0, call.pool->sizes.activations, 3 * p, 6, 0};
+    Py_ssize_t n = count_items(a + 3) / 6;
+    int fit = arrays_fit(&call.pool->sizes, n, a, floats);
+    if (fit) {
+        Py_BEGIN_ALLOW_THREADS
+        network_backward(call.pool, a[0].buf, n, a[1].buf, a[2].buf, a[3].buf, a[4].buf);
+        Py_END_ALLOW_THREADS
+    }
+    return pass_end(&call, fit);
 }

@@ -5,10 +5,15 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
-PyObject *workers(PyObject *module, PyObject *args);
-PyObject *gradient(PyObject *module, PyObject *args);
+PyObject *training_worker_pool(PyObject *module, PyObject *args);
+PyObject *training_activations(PyObject *module, PyObject *pool);
+PyObject *training_forward(PyObject *module, PyObject *args);
+PyObject *training_backward(PyObject *module, PyObject *args);
 
-#define TRAINING_METHODS \
-    {"workers", workers, METH_VARARGS, NULL}, {"gradient", gradient, METH_VARARGS, NULL}
+#define TRAINING_METHODS                                              \
+    {"worker_pool", training_worker_pool, METH_VARARGS, NULL},        \
+    {"activations_per_frame", training_activations, METH_O, NULL},    \
+    {"network_forward", training_forward, METH_VARARGS, NULL},        \
+    {"network_backward", training_backward, METH_VARARGS, NULL}
 
 #endif

@@ -1,92 +1,111 @@
-"""What a layout knows of an object, as a loss: bones keep their lengths, the front is in front.
+"""A loss from what a keypoint layout says of the object: rigid bones, keypoints in front, depth.
 
-Not of the paper, and no 3D label: edges and handedness are what a layout file says in words. Views
-from one side only tell too little about depth: which way each limb goes, and how far what hardly
-moves, is then a matter of chance, unless this is asked for (`recipe.LayoutLossWeights`).
+Not of the paper, and no 3D label: a layout file gives the edges and the handedness in words. Views
+from one side only contain little about depth: the direction of each limb, and the depth of
+keypoints that hardly move, are then a matter of chance without this loss
+(`recipe.LayoutLossWeights`).
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 
 _FRONT_MARGIN = 0.1
-"""RMS radii by which a keypoint in front should be before its plane: at 0 it would lie in it."""
-_ALIKE = 4.0
+"""Least height of a front keypoint over its plane, in RMS radii: at 0 it would lie in the plane."""
+_SYMMETRY_WEIGHT = 4.0
 """Left and right differ by twice what each differs from their mean, squared."""
 
 
 class LayoutLoss:
-    """The weighted sum of the terms, of shapes in the network's axes, and its gradient.
+    """The weighted sum of the terms, of shapes in the network's axes.
 
-    One weight at least is not zero.
+    Attributes:
+        weights: of the terms; at least one is not zero.
     """
 
     def __init__(self, weights: LayoutLossWeights, layout: KeypointLayout) -> None:
-        """Find edges, their partners on the other side, and the votes on the handedness.
+        """Take edges, their partners on the other side and the handedness from the layout.
 
-        Raises ValueError if the layout has nothing of what the weights ask for.
+        Raises:
+            ValueError: a weight is set, and the layout has nothing for its term.
         """
         weights.check(layout)
         self.weights = weights
-        edges = layout.edge_indices()
-        self._ends = [list(ends) for ends in zip(*edges, strict=True)]
-        partners = layout.partners() or range(len(layout))
+        p, edges = len(layout), layout.edge_indices()
+        partners = layout.partners() or range(p)
         places = {frozenset(edge): i for i, edge in enumerate(edges)}
-        self._partners = [
+        other = [
             places.get(frozenset((partners[a], partners[b])), i) for i, (a, b) in enumerate(edges)
         ]
-        fours = [[layout.index(name) for name in four] for four in layout.handedness]
-        self._votes = [list(corner) for corner in zip(*fours, strict=True)]
+        # Differences of keypoints are products with matrices: torch gathers rows more slowly, and
+        # far more slowly in the backward pass.
+        self._edges = _differences(p, edges)
+        one = np.eye(len(edges), dtype=np.float32)
+        self._partners = torch.from_numpy(np.concatenate([one - one[other], one + one[other]]))
+        corners = [[layout.index(name) for name in four] for four in layout.handedness]
+        self._corners = _differences(p, [(four[i], four[1]) for i in (0, 2, 3) for four in corners])
 
     def __call__(self, S: Tensor, M: Tensor) -> Tensor:
-        """Return the loss of a batch of shapes S (b, p, 3) before cameras M (b, 3, 2)."""
-        loss = S.new_zeros(())
-        if self.weights.bone_length_weight:
-            loss = loss + self.weights.bone_length_weight * self._bones(S)
-        if self.weights.handedness_weight:
-            loss = loss + self.weights.handedness_weight * self._front(S)
-        if self.weights.depth_penalty:
-            loss = loss + self.weights.depth_penalty * self._depth(S, M.detach())
+        """Return the loss of shapes S (b, p, 3) seen by cameras M (b, 3, 2).
+
+        It has a gradient by S alone.
+        """
+        weights, loss = self.weights, S.new_zeros(())
+        if weights.bone_length_weight:
+            loss = loss + weights.bone_length_weight * self._bone_lengths(S)
+        if weights.handedness_weight:
+            loss = loss + weights.handedness_weight * self._front(S)
+        if weights.depth_penalty:
+            loss = loss + weights.depth_penalty * self._depth(S, M.detach())
         return loss
 
-    def gradient(self, S: Tensor, M: Tensor) -> Tensor:
-        """Return the gradient (b, p, 3) by S; also within torch.inference_mode. M has none."""
-        with torch.inference_mode(False), torch.enable_grad():
-            X = S.clone().requires_grad_()
-            (S_bar,) = torch.autograd.grad(self(X, M.clone()), X)
-            return S_bar
-
-    def _bones(self, S: Tensor) -> Tensor:
-        """Return how much each edge's share of all edges varies, and differs from its partner's.
+    def _bone_lengths(self, S: Tensor) -> Tensor:
+        """Return how far each edge's share of all lengths varies, and differs from its partner's.
 
         Squares, relative to the share, means over the edges.
         """
-        i, j = self._ends
-        lengths = ((S[:, i] - S[:, j]) ** 2).sum(-1).add(1e-10).sqrt()
+        bones = _product(S, self._edges)
+        lengths = (bones * bones).sum(1).add(1e-10).sqrt()  # (b, edges)
         shares = lengths / lengths.sum(1, keepdim=True)
-        mean = shares.mean(0)
-        other = mean[self._partners]
-        varies = ((shares - mean) ** 2).mean(0) / mean**2
-        differs = _ALIKE * ((mean - other) / (mean + other)) ** 2
-        return (varies + differs).mean()
+        variance, mean = torch.var_mean(shares, 0, correction=0)
+        difference, total = (self._partners.to(S) @ mean).chunk(2)
+        asymmetry = difference / total
+        return (variance / (mean * mean) + _SYMMETRY_WEIGHT * asymmetry * asymmetry).mean()
 
     def _front(self, S: Tensor) -> Tensor:
         """Return by how much keypoints fail to be in front, in RMS radii; `handedness.votes`."""
-        left, right, up, front = (S[:, corner] for corner in self._votes)
-        normal = torch.linalg.cross(left - right, up - right)
-        heights = ((front - right) * normal).sum(-1) / normal.norm(dim=-1).clamp(min=1e-6)
+        left, up, front = _product(S, self._corners).chunk(3, -1)  # (b, 3, votes), from the right
+        normal = torch.linalg.cross(left, up, dim=1)
+        heights = (front * normal).sum(1) / normal.norm(dim=1).clamp(min=1e-6)
         X = S - S.mean(1, keepdim=True)
         radius = (X * X).sum(-1).mean(1, keepdim=True).add(1e-12).sqrt()
         return torch.relu(_FRONT_MARGIN - heights / radius).mean()
 
     @staticmethod
     def _depth(S: Tensor, M: Tensor) -> Tensor:
-        """Return the extent in depth over that in the image, squares."""
+        """Return the extent in depth over the extent in the image, squares."""
         X = S - S.mean(1, keepdim=True)
-        seen = X @ M
-        depth = X - seen @ M.mT
-        return ((depth * depth).sum((1, 2)) / (seen * seen).sum((1, 2)).clamp(min=1e-9)).mean()
+        projected = X @ M
+        depth = X - projected @ M.mT
+        image = (projected * projected).sum((1, 2)).clamp(min=1e-9)
+        return ((depth * depth).sum((1, 2)) / image).mean()
+
+
+def _differences(p: int, pairs: list[tuple[int, int]]) -> Tensor:
+    """Return the matrix (p, pairs) whose product with rows of p numbers is a - b of each pair."""
+    matrix: NDArray[np.float32] = np.zeros((p, len(pairs)), np.float32)
+    for i, (a, b) in enumerate(pairs):
+        matrix[a, i] += 1
+        matrix[b, i] -= 1
+    return torch.from_numpy(matrix)
+
+
+def _product(S: Tensor, A: Tensor) -> Tensor:
+    """Return S^T A (b, 3, k) for S (b, p, 3) and A (p, k), as one product of all rows."""
+    return (S.mT.reshape(-1, S.shape[1]) @ A.to(S)).view(len(S), 3, -1)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
-from deep_nrsfm_ros.nrsfm.network import Network, forward, whiten
+from deep_nrsfm_ros.nrsfm.network import Network, forward
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
@@ -28,44 +28,20 @@ class Losses(NamedTuple):
     shapes: Tensor  # (b, p, 3) centred and back-projected, without gradient
 
 
-class Frames(NamedTuple):
-    """A batch of frames as tensors."""
+class Batch(NamedTuple):
+    """Frames as tensors."""
 
-    points: Tensor  # (b, p, 2)
+    points: Tensor  # (b, p, 2), 0 where missing
     mask: Tensor  # (b, p, 1), 1 visible, 0 missing
 
 
 class Task(NamedTuple):
-    """What a batch gives the network to see, and what it should make of it."""
+    """The network's input of a batch, and the output that the losses compare with."""
 
-    x: Tensor  # (b + c, p, 2) input: b frames, then c known shapes by random cameras
-    W: Tensor  # (b, p, 2) what S M of the frames should be, centred on the visible points
+    x: Tensor  # (b + c, p, 2) input: b frames, then c known shapes seen by random cameras
+    W: Tensor  # (b, p, 2) target of S M of the frames, centred on the visible points
     mask: Tensor  # (b, p, 1)
-    T: Tensor | None = None  # (c, p, 3) the known shapes
-
-
-class Relative(NamedTuple):
-    """||E|| / ||X|| of each of a batch."""
-
-    E: Tensor  # (b, p, d)
-    error: Tensor  # (b,) ||E||_F
-    size: Tensor  # (b,) ||X||_F
-
-    def mean(self) -> Tensor:
-        """Return the mean over the batch."""
-        return (self.error / self.size).mean()
-
-    def gradient(self) -> Tensor:
-        """Return the gradient (b, p, d) of the mean by E."""
-        return self.E / (len(self.E) * self.error * self.size)[:, None, None]
-
-
-class Differences(NamedTuple):
-    """What a reconstruction of a batch leaves, before it becomes numbers."""
-
-    residual: Tensor  # (b, p, 2) of the reprojection, over the visible points
-    reprojection: Relative
-    cycle: Relative | None
+    T: Tensor | None = None  # (c, p, 3) the known shapes, targets of S
 
 
 def frobenius(X: Tensor) -> Tensor:
@@ -74,12 +50,13 @@ def frobenius(X: Tensor) -> Tensor:
 
 
 def visible_centre(X: Tensor, mask: Tensor) -> Tensor:
-    """Return C X for C = diag(mask)(I - 1 mask^T / visible points), X (b, p, d).
+    """Return X (b, p, d) less its mean over the visible points, and 0 where a point is missing."""
+    return (X - visible_share(mask).mT @ X) * mask
 
-    C is symmetric, so a gradient goes back through it the same way.
-    """
-    mean = (X * mask).sum(-2, keepdim=True) / mask.sum(-2, keepdim=True).clamp(min=1)
-    return (X - mean) * mask
+
+def visible_share(mask: Tensor) -> Tensor:
+    """Return the weights (b, p, 1) of the points in the mean over the visible ones."""
+    return mask / mask.sum(-2, keepdim=True).clamp(min=1)
 
 
 class Objective:
@@ -93,106 +70,104 @@ class Objective:
         whitened: bool = True,
         layout_loss: LayoutLoss | None = None,
     ) -> None:
-        """Take what the loss depends on besides network and data.
+        """Set up the loss.
 
-        Differences are weighed by the network's whitening, or by plain distance if not `whitened`.
-        `layout_loss` is a term of its own, of the shapes of the frames.
+        Args:
+            normaliser: of the network's input.
+            recipe: weights of the losses and of the augmentation.
+            whitened: weigh differences by the network's whitening; otherwise by plain distance.
+            layout_loss: another term, of the shapes of the frames.
         """
         self.normaliser, self.recipe, self.whitened = normaliser, recipe, whitened
         self.layout_loss = layout_loss
 
     def __call__(
-        self, net: Network, frames: Frames, known: Tensor | None, generator: torch.Generator
+        self, net: Network, batch: Batch, known: Tensor | None, generator: torch.Generator
     ) -> Losses:
-        """Return the losses; all randomness comes from `generator`.
+        """Return the losses of a network; autograd gets their gradient by its weights.
 
-        The cycle loss is that of the shapes `known` (c, p, 3), which an earlier call returned: so
-        one pass of the network serves both losses, and takes half the time of two. It is 0 for
-        None.
+        Args:
+            net: the network, of tensors.
+            batch: the frames.
+            known: (c, p, 3) shapes for the cycle loss, which an earlier call returned; without
+                them the cycle loss is 0. One pass of the network serves both losses, in half the
+                time of two.
+            generator: source of all random numbers.
         """
-        task = self.task(net, frames, known, generator)
-        S, M = forward(net, task.x)
-        return self.losses(net, S, M, self.differences(net, task, S, M))
+        task = self.task(net, batch, known, generator)
+        return self.losses(net, task, *forward(net, task.x))
 
     @torch.no_grad()
     def task(
-        self, net: Network, frames: Frames, known: Tensor | None, generator: torch.Generator
+        self, net: Network, batch: Batch, known: Tensor | None, generator: torch.Generator
     ) -> Task:
-        """Return what the batch, and the shapes `known` by random cameras, ask of the network."""
+        """Return input and targets of a batch, and of known shapes (c, p, 3) by random cameras.
+
+        Args and `generator` as in `__call__`; only the whitening of `net` is used.
+        """
         if not self.recipe.cycle:
             known = None
-        b = len(frames.points)
+        b = len(batch.points)
         if known is not None:
             Q = polar(torch.randn(len(known), 2, 3, generator=generator, device=known.device))
             replay = known @ Q.mT, torch.ones_like(known[..., :1])
-            frames = Frames(*(torch.cat(pair) for pair in zip(frames, replay, strict=True)))
-        x, W, unit = self._observe(net, frames, generator)
-        mask = frames.mask[:b]
+            batch = Batch(*(torch.cat(pair) for pair in zip(batch, replay, strict=True)))
+        x, W, unit = self._observe(net, batch, generator)
+        mask = batch.mask[:b]
         T = None if known is None else known / unit[b:]
         return Task(x, visible_centre(W[:b], mask), mask, T)
 
-    def differences(self, net: Network, task: Task, S: Tensor, M: Tensor) -> Differences:
-        """Return what S (b + c, p, 3) and M (b + c, 3, 2), the answer to a task, leave."""
-        b = len(task.W)
-        residual = task.W - visible_centre(S[:b] @ M[:b], task.mask)
-        cycle = None
-        if task.T is not None:
-            again = S[b:]
-            cycle = self._relative(net, again - again.mean(-2, keepdim=True) - task.T, task.T)
-        return Differences(residual, self._relative(net, residual, task.W), cycle)
+    def losses(self, net: Network, task: Task, S: Tensor, M: Tensor) -> Losses:
+        """Return the losses of the network's output S (b + c, p, 3) and M (b + c, 3, 2) of a task.
 
-    def losses(self, net: Network, S: Tensor, M: Tensor, left: Differences) -> Losses:
-        """Return the losses of what the answer S, M to a task has left."""
-        M = M[: len(left.residual)]
-        total = reprojection = left.reprojection.mean()
+        Only the whitening and the architecture of `net` are used.
+        """
+        # In few operations and with the points last, as the network computes: on arrays this small
+        # the number of operations is the time.
+        b = len(task.W)
+        frames, again = torch.split(S.mT, [b, len(S) - b])
+        M, W = M[:b], task.W.mT
+        projected = M.mT @ frames  # (b, 2, p)
+        mean = projected @ visible_share(task.mask)
+        residual = torch.addcmul(W, projected - mean, task.mask.mT, value=-1)
+        total = reprojection = self._relative_error(net, residual, W)
         if net.architecture.camera == "free":
             total = total + self.recipe.spectral * spectral_norm(M.mT).mean()
         cycle = torch.zeros_like(reprojection)
-        if left.cycle is not None:
-            cycle = left.cycle.mean()
+        if task.T is not None:
+            T = task.T.mT
+            cycle = self._relative_error(net, again - again.mean(-1, keepdim=True) - T, T)
             total = total + self.recipe.cycle * cycle
         if self.layout_loss:
-            total = total + self.layout_loss(S[: len(M)], M)
+            total = total + self.layout_loss(frames.mT, M)
         with torch.no_grad():
-            shapes = S[: len(M)] + left.residual @ M.mT
+            shapes = frames + M @ residual
             # Contiguous, as a checkpoint keeps it: the layout decides the last bit of a product.
-            shapes = (shapes - shapes.mean(-2, keepdim=True)).contiguous()
+            shapes = (shapes - shapes.mean(-1, keepdim=True)).mT.contiguous()
         return Losses(reprojection, cycle, total, shapes)
 
-    def gradient(
-        self, net: Network, task: Task, S: Tensor, M: Tensor, left: Differences
-    ) -> tuple[Tensor, Tensor]:
-        """Return the gradients by S and by an orthonormal M of the total of `losses`."""
-        b = len(task.W)
-        S_bar, M_bar = torch.zeros_like(S), torch.zeros_like(M)
-        residual_bar = self._weighed(net, left.reprojection.gradient())
-        P_bar = visible_centre(residual_bar, task.mask).neg_()
-        torch.matmul(P_bar, M[:b].mT, out=S_bar[:b])
-        torch.matmul(S[:b].mT, P_bar, out=M_bar[:b])
-        if self.layout_loss:
-            S_bar[:b] += self.layout_loss.gradient(S[:b], M[:b])
-        if left.cycle is not None:
-            again_bar = self._weighed(net, self.recipe.cycle * left.cycle.gradient())
-            torch.sub(again_bar, again_bar.mean(-2, keepdim=True), out=S_bar[b:])
-        return S_bar, M_bar
+    def _relative_error(self, net: Network, difference: Tensor, X: Tensor) -> Tensor:
+        """Return the mean of ||difference|| / ||X||, both (b, d, p) and weighed."""
+        error, size = self._weighed_norm(net, difference), self._weighed_norm(net, X)
+        # A frame without an extent has no error either.
+        return (error / size.clamp(min=1e-6)).mean()
 
-    def _relative(self, net: Network, error: Tensor, X: Tensor) -> Relative:
-        E = self._weighed(net, error)
-        return Relative(E, frobenius(E), frobenius(self._weighed(net, X)))
-
-    def _weighed(self, net: Network, X: Tensor) -> Tensor:
-        """Return L X, or X; L is symmetric, so a gradient goes back through it the same way."""
-        weighed: Tensor = whiten(net, X) if self.whitened else X
-        return weighed
+    def _weighed_norm(self, net: Network, X: Tensor) -> Tensor:
+        """Return ||L X^T|| (b,), or ||X||, for X (b, d, p)."""
+        rows = X.reshape(-1, X.shape[-1])
+        if self.whitened and net.architecture.whitening:
+            rows = rows @ net.L
+        norm: Tensor = torch.linalg.vector_norm(rows.reshape(len(X), -1), dim=1)
+        return norm
 
     def _observe(
-        self, net: Network, frames: Frames, generator: torch.Generator
+        self, net: Network, batch: Batch, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the network's input, what it should reproject to, and the unit (b, 1, 1).
+        """Return the network's input, the target of its reprojection, and the unit (b, 1, 1).
 
         The input is noisy and incomplete by the recipe; the target is the frame itself.
         """
-        points, mask = frames
+        points, mask = batch
         device = points.device
         if self.recipe.noise:
             noise = torch.randn(points.shape, generator=generator, device=device)
@@ -204,5 +179,9 @@ class Objective:
                 (len(points), 1, 1), generator=generator, device=device
             )
             mask = mask * (torch.rand(mask.shape, generator=generator, device=device) >= level)
-        seen = normalise(net, self.normaliser, points, mask)
-        return seen.W * seen.gain, (frames.points - seen.origin) / seen.unit, seen.unit
+        visible = normalise(net, self.normaliser, points, mask)
+        return (
+            visible.W * visible.gain,
+            (batch.points - visible.origin) / visible.unit,
+            visible.unit,
+        )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deep_nrsfm_ros.batched import slices
-from deep_nrsfm_ros.nrsfm.losses import Frames
+from deep_nrsfm_ros.nrsfm.losses import Batch
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ class FrameStore:
         points, visible = (tensor[self.usable].to(device) for tensor in (self.points, self.visible))
         return FrameStore(points, visible, torch.arange(len(self), device=device))
 
-    def batch(self, which: Tensor | slice) -> Frames:
+    def batch(self, which: Tensor | slice) -> Batch:
         """Return the chosen of the usable frames, 0 where a point is missing."""
         frames = self.usable[which]
         visible = self.visible[frames][..., None]
-        return Frames(self.points[frames].where(visible, 0.0), visible.float())
+        return Batch(self.points[frames].where(visible, 0.0), visible.float())
 
-    def blocks(self) -> Iterator[Frames]:
+    def blocks(self) -> Iterator[Batch]:
         """Return all usable frames, some at a time."""
         return map(self.batch, slices(len(self)))

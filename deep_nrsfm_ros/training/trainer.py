@@ -12,13 +12,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
-from deep_nrsfm_ros.nrsfm.losses import Frames, Objective
+from deep_nrsfm_ros.nrsfm.losses import Batch, Objective
 from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.gradient_function import GradientFunction, joined
+from deep_nrsfm_ros.training.gradient_function import (
+    GradientFunction,
+    weight_vector,
+    with_weights,
+)
 
 
 class Trainer:
@@ -68,31 +72,23 @@ class Trainer:
             initial = dataclasses.replace(initial, L=L, L_inverse=L_inverse)
         self.initial = initial.map(lambda w: torch.from_numpy(w).to(device))
         # All weights in one tensor: Adam costs a tenth of a step on one, a fifth on fifty.
-        self.weights = joined(w for _, w in self.initial.trainable_weights())
-        self.net = self._views()
+        self.weights = weight_vector(self.initial)
+        self.net = with_weights(self.initial, self.weights)
         self.optimiser = torch.optim.Adam([self.weights], lr=recipe.learning_rate, fused=True)
         self.objective = Objective(normaliser, recipe, layout_loss=layout_loss)
-        self.descent = GradientFunction(self.objective, self.net, self.batch)
+        self.gradient_function = GradientFunction(self.objective, self.net, self.batch)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)
         self.shapes: Tensor | None = None  # of the last batch, for the cycle loss
         self.probe = self.sample(1024)
 
-    def _views(self) -> Network:
-        """Return the network; what is learned in it are views of `weights`."""
-        learned = dict(self.initial.trainable_weights())
-        parts = torch.split(self.weights, [w.numel() for w in learned.values()])
-        views = (part.view(w.shape) for part, w in zip(parts, learned.values(), strict=True))
-        weights = dict(self.initial.named_weights()) | dict(zip(learned, views, strict=True))
-        return Network.from_named_weights(self.initial.architecture, weights)
-
     @property
     def progress(self) -> float:
         """Return how much of the training is over, 0 to 1: of its steps, or of its time."""
         return max(self.step / self.preset.recipe.steps, min(self.time_gone, 1.0))
 
-    def sample(self, size: int, step: int = -1) -> Frames:
+    def sample(self, size: int, step: int = -1) -> Batch:
         """Return the random batch of a step; leaves the generator ready for its cameras."""
         self.generator.manual_seed((self.seed << 32) + (self.team.rank << 24) + step + 1)
         pool, generator = self.frames, self.generator
@@ -102,7 +98,7 @@ class Trainer:
 
     def advance(self) -> None:
         """Take one gradient step."""
-        with self.descent.threads():
+        with self.gradient_function.threads():
             self._advance()
 
     def _advance(self) -> None:
@@ -110,7 +106,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.preset.recipe, self.step, self.time_gone)
         batch = self.sample(self.batch, self.step)
-        losses, gradient = self.descent(self.net, batch, self.shapes, self.generator)
+        losses, gradient = self.gradient_function(self.weights, batch, self.shapes, self.generator)
         self.shapes = losses.shapes
         if self.team.size > 1:
             gradient = gradient * (self.batch / self.preset.recipe.batch)

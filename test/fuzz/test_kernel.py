@@ -233,9 +233,8 @@ def spoil(spoiler: Spoiler, arguments: Arguments) -> Arguments:
 
 
 def names() -> set[str]:
-    """Return the names of the kernel's entry points, but of those that are about to go."""
-    found = {name for name, _ in inspect.getmembers(COMPILED, inspect.isbuiltin)}
-    return found - {"workers", "gradient"}
+    """Return the names of the kernel's entry points."""
+    return {name for name, _ in inspect.getmembers(COMPILED, inspect.isbuiltin)}
 
 
 def called(name: str, arguments: Arguments) -> Any:

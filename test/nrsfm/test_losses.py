@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from deep_nrsfm_ros.nrsfm.losses import Frames, Losses, Objective
+from deep_nrsfm_ros.nrsfm.losses import Batch, Losses, Objective
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, complete, forward, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
@@ -49,7 +49,7 @@ def losses(
     """Return the losses in float32, as training computes them."""
     points, visible = (torch.from_numpy(array.astype(np.float32)) for array in data)
     tensors = net.map(lambda w: torch.from_numpy(w.astype(np.float32)))
-    frames = Frames(points, visible[..., None])
+    frames = Batch(points, visible[..., None])
     objective = Objective(Normaliser(scale), recipe, whitened=whitened)
     shapes = None if known is None else torch.from_numpy(known.astype(np.float32))
     return objective(tensors, frames, shapes, torch.Generator().manual_seed(5))
@@ -165,7 +165,7 @@ def test_the_gradient_reaches_every_weight(threshold: str, recovery: str) -> Non
         lambda w: torch.from_numpy(w).requires_grad_()
     )
     points, visible = batch(incomplete=True)
-    frames = Frames(
+    frames = Batch(
         torch.from_numpy(points.astype(np.float32)),
         torch.from_numpy(visible[..., None].astype(np.float32)),
     )
@@ -182,7 +182,7 @@ def test_the_gradient_reaches_every_weight(threshold: str, recovery: str) -> Non
 def test_noise_and_hidden_points_spoil_the_input_not_the_target(trained: Any, figure: Any) -> None:
     net, f = trained.net, 500
     points = torch.from_numpy(figure.points[:f])
-    frames = Frames(points, torch.ones(f, points.shape[1], 1))
+    frames = Batch(points, torch.ones(f, points.shape[1], 1))
 
     def reprojection(**augmentation: Any) -> float:
         recipe = Recipe(cycle=0.0, **augmentation)
@@ -201,7 +201,7 @@ def test_a_frame_with_nothing_to_see_gives_no_gradient(visible: int) -> None:
     net = network().map(lambda w: torch.from_numpy(w).requires_grad_())
     mask = torch.zeros(1, P, 1, dtype=torch.float64)
     mask[:, :visible] = 1
-    frames = Frames(torch.ones(1, P, 2, dtype=torch.float64) * 30 * mask, mask)
+    frames = Batch(torch.ones(1, P, 2, dtype=torch.float64) * 30 * mask, mask)
     losses = Objective(Normaliser(), PLAIN)(net, frames, None, torch.Generator())
     losses.total.backward()
     assert torch.isfinite(losses.total)

@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file
 
 import deep_nrsfm_ros
-from deep_nrsfm_ros.nrsfm.losses import Frames
+from deep_nrsfm_ros.nrsfm.losses import Batch
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup, join, rank
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
@@ -64,8 +64,8 @@ def test_the_first_step_is_that_of_one_process_with_both_batches(
     assert [len(part["batch"]) for part in found] == [32, 33]
     batch = torch.cat([part["batch"] for part in found])
     assert len(batch.unique(dim=0)) > 60  # each draws its own
-    both = Frames(batch, torch.ones_like(batch[..., :1]))
-    _, gradient = alone.descent(alone.net, both, None, alone.generator)
+    both = Batch(batch, torch.ones_like(batch[..., :1]))
+    _, gradient = alone.gradient_function(alone.weights, both, None, alone.generator)
     for part in found:
         torch.testing.assert_close(part["L"], alone.initial.L, rtol=0, atol=1e-5)
         torch.testing.assert_close(part["gradient"], gradient, rtol=0, atol=1e-6)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from benchmarks.speed.plain_torch import PlainNetwork, PlainTraining
-from deep_nrsfm_ros.nrsfm.losses import Frames
+from deep_nrsfm_ros.nrsfm.losses import Batch
 from deep_nrsfm_ros.nrsfm.network import forward, initialise
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 from deep_nrsfm_ros.training.frames import FrameStore
@@ -45,7 +45,7 @@ def test_has_the_same_losses(name: str, points: torch.Tensor) -> None:
     preset = preset._replace(
         architecture=architecture, recipe=dataclasses.replace(preset.recipe, batch=len(points))
     )
-    frames = Frames(points, torch.ones(len(points), P, 1))
+    frames = Batch(points, torch.ones(len(points), P, 1))
     ours = Trainer(pool(points), preset, 0)
     plain = PlainTraining(ours.net, points, preset)
     generator = torch.Generator().manual_seed(3)
