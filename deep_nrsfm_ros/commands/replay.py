@@ -30,7 +30,7 @@ from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.reporting.player import (
     MOST_FRAMES,
-    Stage,
+    SceneTransform,
     live_page,
     recording_page,
     scenes,
@@ -140,11 +140,11 @@ def watch(args: argparse.Namespace, model: Model, source: KeypointLayout) -> Non
 
     from deep_nrsfm_ros.node.lifter_client import LifterClient, LifterTopics
 
-    inputs, stage = override(InputOptions(), args), Stage()
+    inputs, transform = override(InputOptions(), args), SceneTransform()
 
     def work(broadcast: Broadcast, stop: threading.Event) -> None:
         def show(recording: Recording) -> None:
-            for scene in scenes(recording, stage=stage):
+            for scene in scenes(recording, transform=transform):
                 broadcast.put(scene)
 
         rclpy.init()

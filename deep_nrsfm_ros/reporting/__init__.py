@@ -1,1 +1,1 @@
-"""What there is to look at, as HTML files that open offline: reports and recordings."""
+"""HTML pages that open offline: reports of trainings, and recordings."""

@@ -1,4 +1,4 @@
-"""Figures of the report: curves and skeletons as SVG, 3D shapes as data for the viewer."""
+"""Drawings of the report: charts and skeletons as SVG, 3D shapes as data for viewer.js."""
 
 from __future__ import annotations
 
@@ -17,13 +17,19 @@ Line = Sequence[tuple[float, float]]
 
 COLOURS = {"left": "#1f77b4", "right": "#d62728"}
 MIDDLE = "#666666"
-GUESSED = "#d4d4d4"
+MISSING = "#d4d4d4"
 _LINES = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f")
 _ACCENT = "#d01c8b"
 
 
 def curve(lines: Mapping[str, Line], label: str, size: tuple[int, int] = (330, 210)) -> Markup:
-    """Return a chart of named lines of (x, y), both from zero, as SVG."""
+    """Return a line chart as SVG, both axes from zero.
+
+    Args:
+        lines: points (x, y) of each line, by its name; points that are not finite are left out.
+        label: title of the chart.
+        size: width and height in pixels.
+    """
     width, height = size
     left, right, top, bottom = 48, 12, 26, 30
     points = [point for line in lines.values() for point in line]
@@ -58,22 +64,28 @@ def curve(lines: Mapping[str, Line], label: str, size: tuple[int, int] = (330, 2
 
 
 def bars(values: Sequence[float], label: str, size: tuple[int, int] = (330, 210)) -> Markup:
-    """Return values 0..1 as bars with their figures, as SVG."""
+    """Return a bar chart of values in [0, 1] as SVG, each with its value in percent.
+
+    Args:
+        values: the first three bars have another colour.
+        label: title of the chart.
+        size: width and height in pixels.
+    """
     width, height = size
     parts = [_text(12, 16, label, "start", "title")]
-    each = (width - 24) / max(len(values), 1)
+    step = (width - 24) / max(len(values), 1)
     for k, value in enumerate(values):
-        tall = max(1.0, min(1.0, value) * (height - 70))
-        across = 12 + k * each
+        bar = max(1.0, min(1.0, value) * (height - 70))
+        across = 12 + k * step
         colour = COLOURS["left"] if k < 3 else "#b9b9b9"
         parts.append(
             Markup('<rect x="{}" y="{}" width="{}" height="{}" fill="{}"/>').format(
-                *(f"{v:.1f}" for v in (across, height - 28 - tall, each * 0.8, tall)), colour
+                *(f"{v:.1f}" for v in (across, height - 28 - bar, step * 0.8, bar)), colour
             )
         )
-        middle = across + each * 0.4
-        if each > 22:
-            parts.append(_text(middle, height - 32 - tall, f"{100 * value:.1f}", "middle"))
+        middle = across + step * 0.4
+        if step > 22:
+            parts.append(_text(middle, height - 32 - bar, f"{100 * value:.1f}", "middle"))
         parts.append(_text(middle, height - 12, str(k + 1), "middle"))
     return _svg(width, height, parts, label)
 
@@ -82,27 +94,35 @@ def skeleton(
     points: Points,
     visible: Points,
     layout: KeypointLayout,
-    doubted: Points | None = None,
+    outliers: Points | None = None,
     size: int = 160,
 ) -> Markup:
-    """Return 2D keypoints (p, 2), x right and y down, as SVG; doubted ones (p,) are circled."""
-    seen = np.asarray(visible, bool) & np.isfinite(points).all(1)
+    """Return 2D keypoints with the edges of their layout as SVG.
+
+    Args:
+        points: (p, 2), x right and y down, in any unit.
+        visible: (p,) bool.
+        layout: names and edges.
+        outliers: (p,) bool, keypoints to circle.
+        size: width and height in pixels.
+    """
+    shown = np.asarray(visible, bool) & np.isfinite(points).all(1)
     parts: list[Markup] = []
-    if seen.any():
+    if shown.any():
         P = np.asarray(points, np.float64)
-        middle = (P[seen].max(0) + P[seen].min(0)) / 2
-        extent = max(float((P[seen].max(0) - P[seen].min(0)).max()), 1e-9)
+        middle = (P[shown].max(0) + P[shown].min(0)) / 2
+        extent = max(float((P[shown].max(0) - P[shown].min(0)).max()), 1e-9)
         at = (P - middle) / extent * (size - 36) + size / 2
         for (i, j), colour in zip(layout.edge_indices(), edge_colours(layout), strict=True):
-            if seen[i] and seen[j]:
+            if shown[i] and shown[j]:
                 (x1, y1), (x2, y2) = at[i], at[j]
                 parts.append(_stroke(x1, y1, x2, y2, colour, 2.5))
         parts.extend(
             _dot(at[k, 0], at[k, 1], 2.5, "#222222", layout.keypoints[k])
-            for k in np.flatnonzero(seen)
+            for k in np.flatnonzero(shown)
         )
-        if doubted is not None:
-            parts.extend(_ring(at[k, 0], at[k, 1]) for k in np.flatnonzero(seen & doubted))
+        if outliers is not None:
+            parts.extend(_ring(at[k, 0], at[k, 1]) for k in np.flatnonzero(shown & outliers))
     return _svg(size, size, parts, "keypoints")
 
 
@@ -113,10 +133,14 @@ def scene(
     mode: Points | None = None,
     turn: float = 0.0,
 ) -> dict[str, Any]:
-    """Return a shape (p, 3) in screen axes, and a mode (p, 3) to swing by, for the viewer.
+    """Return a 3D shape as data for viewer.js.
 
-    visible: (p,), what was seen; edges to the rest are pale. turn: degrees about the vertical by
-    which it is turned at first.
+    Args:
+        shape: (p, 3) in screen axes: x right, y up, z to the viewer.
+        layout: names and edges.
+        visible: (p,) bool; edges to other keypoints are pale.
+        mode: (p, 3) deformation to animate; None = a rigid shape.
+        turn: initial rotation about the vertical axis in degrees.
     """
     edges = layout.edge_indices()
     colours = zip(edges, edge_colours(layout), strict=True)
@@ -124,14 +148,14 @@ def scene(
         "points": np.round(shape, 4).tolist(),
         "mode": None if mode is None else np.round(mode, 4).tolist(),
         "edges": edges,
-        "colours": [c if visible[i] and visible[j] else GUESSED for (i, j), c in colours],
+        "colours": [c if visible[i] and visible[j] else MISSING for (i, j), c in colours],
         "names": list(layout.keypoints),
         "turn": turn,
     }
 
 
 def edge_colours(layout: KeypointLayout) -> list[str]:
-    """Return a colour for each edge: left blue, right red, the rest grey, told by the names."""
+    """Return the colour of each edge by the names of its keypoints: left, right or neither."""
     return [
         COLOURS.get(side, MIDDLE) if (side := _side(a)) and side == _side(b) else MIDDLE
         for a, b in layout.edges
@@ -139,7 +163,7 @@ def edge_colours(layout: KeypointLayout) -> list[str]:
 
 
 def _side(name: str) -> str:
-    """Return "left" or "right" if a keypoint's name begins so, else ""."""
+    """Return "left" or "right" if a keypoint's name begins with it, else ""."""
     word = name.partition("_")[0]
     return word if word in COLOURS else ""
 
@@ -151,10 +175,12 @@ def _round_step(least: float) -> float:
 
 
 def _cycle(number: int) -> list[str]:
+    """Return the colours of so many lines."""
     return [_LINES[k % len(_LINES)] for k in range(number)]
 
 
 def _svg(width: int, height: int, parts: Sequence[Markup], label: str) -> Markup:
+    """Return an SVG element with some parts."""
     opening = Markup(
         '<svg viewBox="0 0 {0} {1}" width="{0}" height="{1}" role="img" aria-label="{2}">'
     ).format(width, height, label)
@@ -162,12 +188,14 @@ def _svg(width: int, height: int, parts: Sequence[Markup], label: str) -> Markup
 
 
 def _text(x: float, y: float, words: str, anchor: str, kind: str = "tick") -> Markup:
+    """Return a text of a CSS class."""
     return Markup('<text x="{}" y="{}" text-anchor="{}" class="{}">{}</text>').format(
         f"{x:.1f}", f"{y:.1f}", anchor, kind, words
     )
 
 
 def _stroke(x1: float, y1: float, x2: float, y2: float, colour: str, width: float) -> Markup:
+    """Return a line."""
     ends = (f"{v:.1f}" for v in (x1, y1, x2, y2))
     return Markup('<line x1="{}" y1="{}" x2="{}" y2="{}" stroke="{}" stroke-width="{}"/>').format(
         *ends, colour, width
@@ -175,12 +203,14 @@ def _stroke(x1: float, y1: float, x2: float, y2: float, colour: str, width: floa
 
 
 def _dot(x: float, y: float, radius: float, colour: str, name: str) -> Markup:
+    """Return a dot with a tooltip."""
     return Markup('<circle cx="{}" cy="{}" r="{}" fill="{}"><title>{}</title></circle>').format(
         f"{x:.1f}", f"{y:.1f}", radius, colour, name
     )
 
 
 def _ring(x: float, y: float) -> Markup:
+    """Return a circle that marks an outlier."""
     return Markup(
         '<circle cx="{}" cy="{}" r="8" fill="none" stroke="{}" stroke-width="3"/>'
     ).format(f"{x:.1f}", f"{y:.1f}", _ACCENT)

@@ -1,4 +1,4 @@
-"""The report of a training: one HTML file, with all it needs inside."""
+"""The report of a training: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 REPORT_SUFFIX = ".html"
 
-_OTHERS = 12  # models that are compared with
-_FRAMES = 6  # best and worst frames that are shown
-_APART = 0.005  # of the data, by which they are
+_OTHERS = 12  # other models in the comparison
+_FRAMES = 6  # best frames, and worst frames
+_MIN_GAP = 0.005  # between two of these frames, as a share of the data
 _CURVES = {
     "loss": "reprojection error",
     "cycle_error": "cycle error",
@@ -46,11 +46,16 @@ _CAMERA_TO_SCREEN = np.array([1, -1, -1])  # x right, y down, z forward to x rig
 
 @dataclass(frozen=True)
 class Training:
-    """What there is to report.
+    """The content of a report.
 
-    model: as it was saved at `path`. dataset: what it was trained on, of which `curated` tells
-    where it comes from. progress: every report of the training, in order. warnings: whatever else
-    its user should know.
+    Attributes:
+        model: the trained model.
+        path: its file.
+        dataset: the frames it was trained on.
+        curated: what was dropped from the data.
+        sufficiency: how much the data varies.
+        progress: every progress report of the training, in order.
+        warnings: further sentences for the user.
     """
 
     model: Model
@@ -63,10 +68,15 @@ class Training:
 
 
 def write_report(training: Training, folders: Sequence[Path]) -> Path:
-    """Write the report next to the model and return its path; whole or not at all.
+    """Write the report next to the model, atomically, and return its path.
 
-    folders: where the models are that this one is compared with. Raises OSError, and ValueError
-    when the model lifts none of the frames.
+    Args:
+        training: the content.
+        folders: folders with the models to compare with.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: the model lifts none of the frames.
     """
     path = training.path.with_suffix(REPORT_SUFFIX)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
@@ -79,15 +89,15 @@ def write_report(training: Training, folders: Sequence[Path]) -> Path:
 
 
 def page(training: Training, folders: Sequence[Path] = ()) -> str:
-    """Return the report as HTML; names and other data are escaped."""
+    """Return the report as HTML, see `write_report`; names and other data are escaped."""
     model, dataset, sufficiency = training.model, training.dataset, training.sufficiency
-    found = lift_sample(model, dataset)
+    lifted = lift_sample(model, dataset)
     scenes: list[dict[str, Any]] = []
-    shapes = _shapes(model, found, dataset.visible.sum(0) > 0, scenes)
-    order = np.argsort(found.lifted.residual, kind="stable")
-    gap = _APART * len(dataset)
+    shapes = _shapes(model, lifted, dataset.visible.sum(0) > 0, scenes)
+    order = np.argsort(lifted.lifted.residual, kind="stable")
+    gap = _MIN_GAP * len(dataset)
     frames = {
-        title: _frames(spread_out(ranking, found.frames, gap, _FRAMES), found, training, scenes)
+        title: _frames(spread_out(ranking, lifted.frames, gap, _FRAMES), lifted, training, scenes)
         for title, ranking in (("Best", order), ("Worst", order[::-1]))
     }
     return render(
@@ -102,17 +112,17 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         comparison=_comparison(training, folders),
         shapes=shapes,
         frames=frames,
-        looked_at=len(found.frames),
-        residual=float(found.lifted.residual.mean()),
+        sample=len(lifted.frames),
+        residual=float(lifted.lifted.residual.mean()),
         sufficiency=sufficiency,
         spectrum=bars(sufficiency.spectrum[:12], "spectrum of the stacked keypoints, %"),
         curated=training.curated,
         hidden=sorted(
             (row for row in training.curated.hidden_by_keypoint if row[1]), key=lambda row: -row[1]
         ),
-        suspects=[
-            (suspect, skeleton(suspect.points, suspect.visible, model.layout, suspect.outliers))
-            for suspect in training.curated.outlier_frames
+        outliers=[
+            (each, skeleton(each.points, each.visible, model.layout, each.outliers))
+            for each in training.curated.outlier_frames
         ],
         provenance=_rows(model.provenance),
         scenes=embedded(scenes),
@@ -120,7 +130,7 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
 
 
 def _curve(progress: Sequence[Progress], field: str, label: str) -> Markup:
-    """Return the chart of one figure over the steps, a line for each seed."""
+    """Return the chart of a figure over the steps, with a line for each seed."""
     lines: dict[str, list[tuple[float, float]]] = {}
     for record in progress:
         lines.setdefault(f"seed {record.seed}", []).append((record.step, getattr(record, field)))
@@ -128,16 +138,16 @@ def _curve(progress: Sequence[Progress], field: str, label: str) -> Markup:
 
 
 def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return a row of label-free figures for this model and the others that are there."""
+    """Return a row of errors without labels for this model and for each other one."""
     models = [training.model]
-    seen = {training.path.resolve()}
+    resolved = {training.path.resolve()}
     for file in (f for folder in folders for f in sorted(folder.glob(f"*{MODEL_SUFFIX}"))):
-        if file.resolve() not in seen and len(models) <= _OTHERS:
-            seen.add(file.resolve())
+        if file.resolve() not in resolved and len(models) <= _OTHERS:
+            resolved.add(file.resolve())
             try:
                 models.append(load_model(file))
             except ModelFileError:
-                continue  # somebody else's file; this report is not about it
+                continue  # a damaged file of another model is no error of this report
     rows = []
     for model in models:
         here = None
@@ -150,10 +160,10 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
 
 
 def _shapes(
-    model: Model, found: LiftedFrames, visible: NDArray[np.bool_], scenes: list[dict[str, Any]]
+    model: Model, sample: LiftedFrames, visible: NDArray[np.bool_], scenes: list[dict[str, Any]]
 ) -> list[Any]:
-    """Return (caption, index of the scene) of the mean shape and of each mode."""
-    space = shape_space(model, found.lifted)
+    """Return (caption, index of its scene) of mean shape and modes; append the scenes."""
+    space = shape_space(model, sample.lifted)
     shown: list[Any] = [("mean shape", len(scenes))]
     scenes.append(scene(space.mean, model.layout, visible, turn=30))
     for k, (mode, share) in enumerate(zip(space.modes, space.shares, strict=True), 1):
@@ -163,24 +173,24 @@ def _shapes(
 
 
 def _frames(
-    chosen: Sequence[int], found: LiftedFrames, training: Training, scenes: list[dict[str, Any]]
+    chosen: Sequence[int], sample: LiftedFrames, training: Training, scenes: list[dict[str, Any]]
 ) -> list[Any]:
-    """Return (frame, residual, detections, index of the lifted scene) of the chosen places."""
+    """Return (frame, residual, drawing, index of its scene) of frames; append the scenes."""
     shown = []
     dataset, layout = training.dataset, training.model.layout
     for k in chosen:
-        frame = int(found.frames[k])
+        frame = int(sample.frames[k])
         visible = dataset.visible[frame]
         drawing = skeleton(dataset.points[frame], visible, layout)
-        place = int(training.curated.frames[frame])
-        shown.append((place, float(found.lifted.residual[k]), drawing, len(scenes)))
-        lifted = found.lifted.shapes[k] * _CAMERA_TO_SCREEN
+        number = int(training.curated.frames[frame])  # before curation
+        shown.append((number, float(sample.lifted.residual[k]), drawing, len(scenes)))
+        lifted = sample.lifted.shapes[k] * _CAMERA_TO_SCREEN
         scenes.append(scene(lifted, layout, visible, turn=60))
     return shown
 
 
 def _rows(values: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Return nested values as (dotted name, text)."""
+    """Return nested values as pairs (dotted name, text)."""
     if not isinstance(values, dict):
         return [(prefix, str(values))]
     return [

@@ -1,5 +1,5 @@
-// Plays a recording: 2D keypoints left, lifted skeletons right. Frames are in the page, or come from
-// the server. Lifted points are in camera axes: x right, y down, z forward.
+// Plays a recording: 2D keypoints left, lifted skeletons right. Frames are in the page, or are
+// received from the server. Lifted points are in camera axes: x right, y down, z forward.
 "use strict";
 const recording = JSON.parse(document.getElementById("recording").textContent);
 const live = recording.frames === null;
@@ -27,8 +27,8 @@ const toObject = (R, v) => [0, 1, 2].map(k => R[k] * v[0] + R[3 + k] * v[1] + R[
 
 function take(frame) {
   frame.objects.forEach(object => {
-    object.seen = triples(object.seen);
-    object.seen.filter(([, , c]) => c > 0).forEach(([x, y]) => {
+    object.keypoints = triples(object.keypoints);
+    object.keypoints.filter(([, , c]) => c > 0).forEach(([x, y]) => {
       [box[0], box[1]] = [Math.min(box[0], x), Math.min(box[1], y)];
       [box[2], box[3]] = [Math.max(box[2], x), Math.max(box[3], y)];
     });
@@ -37,12 +37,12 @@ function take(frame) {
     const radius = Math.max(...object.shape.map(p => Math.hypot(...p)));
     const weight = object.size ** 2;
     extents.size.push([radius, weight]);
-    extents.reach.push([Math.hypot(...object.place) + object.size * radius, weight]);
+    extents.reach.push([Math.hypot(...object.position) + object.size * radius, weight]);
   });
   frames.push(frame);
 }
 
-// What nearly all objects keep within, each counted by its size in the image.
+// The 90 % quantile of an extent over all objects, weighted by their size in the image.
 function extent(name) {
   const values = extents[name];
   if (values.length > 2 * MOST) values.splice(0, MOST);
@@ -51,15 +51,15 @@ function extent(name) {
   return found ? found[0] : 1;
 }
 
-// The two views: what is at [x, y, z] before the camera, to x right, y up, z to the viewer.
+// The two views, camera fixed or object fixed: from camera axes to x right, y up, z to the viewer.
 function viewOf(frame) {
   const chosen = frame.objects.find(o => o.shape && o.rotation);
-  if (!atRest) return { reach: 1.1 * extent("reach"), chosen, up: v => [v[0], -v[1], -v[2]], at: o => o.place, zoom: o => o.size };
+  if (!atRest) return { reach: 1.1 * extent("reach"), chosen, up: v => [v[0], -v[1], -v[2]], at: o => o.position, zoom: o => o.size };
   if (!chosen) return null;
   const turned = v => { const [x, y, z] = toObject(chosen.rotation, v); return [y, z, x]; };
   return {
     reach: 1.25 * extent("size"), chosen, up: turned, zoom: o => o.size / chosen.size,
-    at: o => scaled(add(o.place, scaled(chosen.place, -1)), 1 / chosen.size),
+    at: o => scaled(add(o.position, scaled(chosen.position, -1)), 1 / chosen.size),
   };
 }
 
@@ -71,12 +71,12 @@ function drawSeen() {
   pen.lineCap = "round";
   const frame = frames[index];
   if (!frame) return;
-  if (box[0] > box[2]) { write(pen, 12, 20, "none so far", "#888888"); return; }
+  if (box[0] > box[2]) { write(pen, 12, 20, "no keypoints yet", "#888888"); return; }
   const zoom = Math.min((width - 30) / (box[2] - box[0] || 1), (height - 30) / (box[3] - box[1] || 1));
   const place = ([x, y]) => [width / 2 + zoom * (x - (box[0] + box[2]) / 2),
                              height / 2 + zoom * (y - (box[1] + box[3]) / 2)];
   frame.objects.forEach(object => {
-    const at = object.seen.map(place), seen = object.seen.map(p => p[2] > 0);
+    const at = object.keypoints.map(place), seen = object.keypoints.map(p => p[2] > 0);
     recording.source.edges.forEach(([a, b], k) => {
       if (!seen[a] || !seen[b]) return;
       pen.strokeStyle = recording.source.colours[k];
@@ -85,7 +85,7 @@ function drawSeen() {
     });
     at.forEach((p, i) => {
       if (!seen[i]) return;
-      pen.fillStyle = colour(object.seen[i][2]);
+      pen.fillStyle = colour(object.keypoints[i][2]);
       pen.beginPath(); pen.arc(...p, 3.5, 0, 7); pen.fill();
     });
     const shown = at.filter((_, i) => seen[i]);
@@ -125,7 +125,7 @@ const orbit = new Orbit($("lifted"), 0, 0, () => {
   if (atRest && recording.upright) floor(view, frame).forEach(line => lines.push(line));
   if (!atRest || view.chosen.rotation) {
     const far = frame.camera ? Math.hypot(...frame.camera) : 1.8 * view.reach;
-    const tip = frame.camera ? add(frame.camera, atRest ? scaled(view.chosen.place, -1) : [0, 0, 0]) : [0, 0, -far];
+    const tip = frame.camera ? add(frame.camera, atRest ? scaled(view.chosen.position, -1) : [0, 0, 0]) : [0, 0, -far];
     frustum(tip, 0.22 * view.reach).forEach(([a, b]) => put(a, b, "#444444", 1, 2));
     put(tip, add(tip, [0, 0, 0.65 * far]), "#444444", 0.3, 1);
   }
@@ -133,8 +133,8 @@ const orbit = new Orbit($("lifted"), 0, 0, () => {
     const points = object.shape.map(p => add(view.at(object), scaled(p, view.zoom(object))));
     const at = points.map(project);
     recording.target.edges.forEach(([a, b], k) => {
-      const sure = Math.min(object.sure[a], object.sure[b]);
-      lines.push([at[a], at[b], recording.target.colours[k], 0.4 + 0.6 * sure]);
+      const confidence = Math.min(object.confidence[a], object.confidence[b]);
+      lines.push([at[a], at[b], recording.target.colours[k], 0.4 + 0.6 * confidence]);
     });
     const radius = Math.max(...object.shape.map(p => Math.hypot(...p)));
     if (object.rotation) AXES.forEach((stroke, k) => {
@@ -143,17 +143,17 @@ const orbit = new Orbit($("lifted"), 0, 0, () => {
       put(view.at(object), tip, stroke, 0.9, 1.5);
       words.push([project(tip), AXIS_NAMES[k], stroke]);
     });
-    orbit.joints.push({ identity: object.identity, at, sure: object.sure });
+    orbit.joints.push({ identity: object.identity, at, confidence: object.confidence });
   });
   orbit.lines(lines, view.reach);
-  orbit.joints.forEach(({ identity, at, sure }) => {
-    orbit.dots(at, sure.map(colour), 3.5);
+  orbit.joints.forEach(({ identity, at, confidence }) => {
+    orbit.dots(at, confidence.map(colour), 3.5);
     if (orbit.joints.length > 1) label(orbit.pen, at, identity);
   });
   words.forEach(([[x, y], word, fill]) => write(orbit.pen, x + 3, y + 4, word, fill));
 });
 
-// A grid under the lowest point of the object at rest.
+// A grid below the lowest point of the fixed object.
 function floor(view, frame) {
   const heights = view.chosen.shape.map(p => toObject(view.chosen.rotation, p)[2]);
   const low = Math.min(...heights), far = 1.2 * extent("size"), lines = [];
@@ -173,7 +173,7 @@ function show(next) {
   if (frame) {
     const seconds = frame.t - frames[0].t;
     $("time").value = `${seconds.toFixed(2)} s · ${index + 1} / ${frames.length}`;
-    $("objects").textContent = frame.objects.map(describe).join(" · ") || "nobody in this frame";
+    $("objects").textContent = frame.objects.map(describe).join(" · ") || "no object in this frame";
   }
   drawSeen();
   orbit.draw();
@@ -181,7 +181,7 @@ function show(next) {
 
 function describe(object) {
   if (!object.shape) return `${object.identity}: not lifted`;
-  const mean = object.sure.reduce((a, b) => a + b, 0) / object.sure.length;
+  const mean = object.confidence.reduce((a, b) => a + b, 0) / object.confidence.length;
   const residual = object.residual === null ? "" : `, residual ${object.residual.toFixed(3)}`;
   return `${object.identity}: confidence ${mean.toFixed(2)}${residual}`;
 }
@@ -214,7 +214,7 @@ function tick(now) {
 function reset() {
   [orbit.yaw, orbit.pitch] = atRest ? [-0.6, 0.3] : [0.75, 0.3];
   wheel = 1;
-  $("view").textContent = atRest ? "view: object at rest, camera moves" : "view: camera at rest";
+  $("view").textContent = atRest ? "view: object fixed, camera moves" : "view: camera fixed";
   show(index);
 }
 
@@ -246,8 +246,8 @@ $("ramp").style.background = `linear-gradient(90deg, ${[0, 1 / 3, 2 / 3, 1].map(
 if (live) {
   const stream = new EventSource("frames");
   stream.onopen = () => { $("state").textContent = "live: waiting for frames"; };
-  stream.onerror = () => { $("state").textContent = "the server is gone; what came can be played"; };
-  stream.addEventListener("end", () => { $("state").textContent = "that was all"; stream.close(); });
+  stream.onerror = () => { $("state").textContent = "connection lost; the received frames can be played"; };
+  stream.addEventListener("end", () => { $("state").textContent = "end of the recording"; stream.close(); });
   stream.onmessage = event => {
     take(JSON.parse(event.data));
     if (frames.length > MOST) { frames.shift(); index = Math.max(0, index - 1); }

@@ -1,4 +1,4 @@
-"""Recordings to look at: 2D keypoints beside the lifted 3D skeletons, with a time slider."""
+"""Pages that play recordings: 2D keypoints next to the lifted 3D skeletons, with a slider."""
 
 from __future__ import annotations
 
@@ -17,22 +17,25 @@ from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.reporting.drawing import edge_colours
 from deep_nrsfm_ros.reporting.template import embedded, render
 
-MOST_FRAMES = 2000  # that a page shows unless told otherwise: some 2 MB for one person
+MOST_FRAMES = 2000  # default limit of a page: about 2 MB for one person
 
 Scene = dict[str, Any]
-"""One frame for the page: see `Stage.scene`."""
+"""One frame for player.js: see `SceneTransform.scene`."""
 
 
 @dataclass
-class Stage:
-    """Where the camera of a recording and its objects stand: the same for all its frames.
+class SceneTransform:
+    """The transform from lifted objects to a common scene, the same for all frames of a recording.
 
-    The first object on it is the measure, unless `stage_of` has looked at them all. Objects that
-    are centred on themselves, as lifted without a known camera, are arranged as in the image, in
-    its proportions; others stay at their places before the camera.
+    Objects lifted without intrinsics are centred at the origin. The scene arranges them as in the
+    image. Objects lifted with intrinsics keep their position in front of the camera.
 
-    origin: what of the image (2,), or before the camera (3,), is in the middle. scale: pixels per
-    unit of the scene; 0 when points are in place.
+    Without values, the first object in a scene determines them.
+
+    Attributes:
+        origin: (2,) point of the image in pixels, or (3,) position in front of the camera, at the
+            origin of the scene.
+        scale: pixels per unit of the scene; 0 for objects at their position.
     """
 
     origin: NDArray[np.floating] | None = None
@@ -41,101 +44,117 @@ class Stage:
     def scene(
         self,
         stamp: int,
-        seen: Observation,
+        observation: Observation,
         lifted: Lifted | None = None,
         identities: Sequence[str] | None = None,
     ) -> Scene:
-        """Return a frame as the page wants it, short enough for thousands.
+        """Return a frame as player.js takes it, rounded to keep pages of many frames small.
 
-        stamp: ns. seen: its n objects; lifted: what came of them, if anything did; identities: of
-        the n objects, their places if None. The scene: `t` in s; `camera`, its place, None if
-        unknown; `objects`, each with `identity`, `seen` (q x 3), and if it was lifted `shape`
-        (p x 3, camera axes, centred), `sure` (p), `place` (3) and `size` of the shape, `rotation`
-        (9 or None) and `residual`.
+        Args:
+            stamp: time in ns.
+            observation: its n objects of q keypoints.
+            lifted: the n lifted objects of p keypoints; None = not lifted.
+            identities: of the n objects; None = their indices.
+
+        Returns:
+            `t` in s; `camera`, its position (3), or None if unknown; `objects`, each with
+            `identity` and `keypoints` (3 q: x, y, confidence). Lifted objects also have `shape`
+            (3 p, camera axes, centred), `confidence` (p), `position` (3) and `size` of the shape,
+            `rotation` (9 or None) and `residual` (or None).
         """
         objects = []
-        for i, points in enumerate(seen.points):
-            both = np.concatenate(
-                [_rounded(points, 5), _rounded(seen.confidence[i, :, None], 2)], 1
-            )
-            one: Scene = {
+        for i, points in enumerate(observation.points):
+            confidence = _rounded(observation.confidence[i, :, None], 2)
+            keypoints = np.concatenate([_rounded(points, 5), confidence], 1)
+            scene_object: Scene = {
                 "identity": str(i) if identities is None else identities[i],
-                "seen": _flat(both),
+                "keypoints": _flat(keypoints),
             }
             if lifted is not None and np.isfinite(lifted.shapes[i]).all():
-                one |= self._lifted(Lifted(*(part[i] for part in lifted)))
-            objects.append(one)
-        in_place = self.origin is not None and not self.scale
-        camera = _flat(_rounded(-self.origin, 4)) if in_place and self.origin is not None else None
+                scene_object |= self._lifted(Lifted(*(part[i] for part in lifted)))
+            objects.append(scene_object)
+        at_position = self.origin is not None and not self.scale
+        camera = None
+        if at_position and self.origin is not None:
+            camera = _flat(_rounded(-self.origin, 4))
         return {"t": round(stamp / 1e9, 4), "camera": camera, "objects": objects}
 
-    def _lifted(self, one: Lifted) -> Scene:
-        """Return what there is to draw of one lifted object."""
-        centre = one.shapes.mean(0)
-        shape = one.shapes - centre
-        known = np.isfinite(one.rotations).all()
+    def _lifted(self, lifted: Lifted) -> Scene:
+        """Return the part of a scene about one lifted object."""
+        centre = lifted.shapes.mean(0)
+        shape = lifted.shapes - centre
+        known = np.isfinite(lifted.rotations).all()
         if self.origin is None:
-            self._set(centre, shape, one)
-        if self.scale and np.isfinite(one.scale) and self.origin is not None:
-            place = np.append((one.translation - self.origin) / self.scale, 0)
-            size = float(one.scale) / self.scale
+            self._set(centre, shape, lifted)
+        if self.scale and np.isfinite(lifted.scale) and self.origin is not None:
+            position = np.append((lifted.translation - self.origin) / self.scale, 0)
+            size = float(lifted.scale) / self.scale
         else:
-            place = np.zeros(3) if self.scale or self.origin is None else centre - self.origin
+            position = np.zeros(3) if self.scale or self.origin is None else centre - self.origin
             size = 1.0
+        rotation = np.round(lifted.rotations.astype(np.float64), 4)
+        residual = lifted.residual
         return {
             "shape": _flat(_rounded(shape, 4)),
-            "sure": _flat(_rounded(one.confidence, 2)),
-            "place": _flat(_rounded(place, 4)),
+            "confidence": _flat(_rounded(lifted.confidence, 2)),
+            "position": _flat(_rounded(position, 4)),
             "size": round(size, 4),
-            "rotation": _flat(np.round(one.rotations.astype(np.float64), 4)) if known else None,
-            "residual": round(float(one.residual), 4) if np.isfinite(one.residual) else None,
+            "rotation": _flat(rotation) if known else None,
+            "residual": round(float(residual), 4) if np.isfinite(residual) else None,
         }
 
-    def _set(self, centre: NDArray[np.floating], shape: NDArray[np.floating], one: Lifted) -> None:
-        """Take an object as the measure of all."""
-        if in_place(centre, shape):
+    def _set(
+        self, centre: NDArray[np.floating], shape: NDArray[np.floating], lifted: Lifted
+    ) -> None:
+        """Take origin and scale from an object."""
+        if has_position(centre, shape):
             self.origin = centre
-        elif np.isfinite(one.scale) and one.scale > 0:
-            self.origin, self.scale = one.translation, float(one.scale)
+        elif np.isfinite(lifted.scale) and lifted.scale > 0:
+            self.origin, self.scale = lifted.translation, float(lifted.scale)
 
 
-def in_place(centre: NDArray[np.floating], shape: NDArray[np.floating]) -> bool:
-    """Tell whether a shape (p, 3) around `centre` (3,) is somewhere, not centred on itself."""
+def has_position(centre: NDArray[np.floating], shape: NDArray[np.floating]) -> bool:
+    """Return whether a shape (p, 3) with this centre (3,) has a position, or is at the origin."""
     return bool(np.linalg.norm(centre) > 1e-2 * np.linalg.norm(shape))
 
 
-def stage_of(recording: Recording) -> Stage:
-    """Return the stage in the middle of which a recording's objects are, by their medians."""
-    sound = recording.is_lifted
-    shapes = recording.lifted.shapes[sound]
+def scene_transform(recording: Recording) -> SceneTransform:
+    """Return the transform with the median position of a recording's objects at the origin."""
+    is_lifted = recording.is_lifted
+    shapes = recording.lifted.shapes[is_lifted]
     centres = shapes.mean(1)
-    if len(shapes) and in_place(np.median(np.abs(centres), 0), shapes[len(shapes) // 2]):
-        return Stage(np.median(centres, 0))
-    scale, translation = (part[sound] for part in recording.lifted[2:4])
+    if len(shapes) and has_position(np.median(np.abs(centres), 0), shapes[len(shapes) // 2]):
+        return SceneTransform(np.median(centres, 0))
+    scale, translation = (part[is_lifted] for part in recording.lifted[2:4])
     known = np.isfinite(scale) & (scale > 0)
     if not known.any():
-        return Stage()
-    return Stage(np.median(translation[known], 0), float(np.median(scale[known])))
+        return SceneTransform()
+    return SceneTransform(np.median(translation[known], 0), float(np.median(scale[known])))
 
 
-def scenes(recording: Recording, every: int = 1, stage: Stage | None = None) -> Iterator[Scene]:
-    """Yield the frames of a recording, each `every`-th one.
+def scenes(
+    recording: Recording, every: int = 1, transform: SceneTransform | None = None
+) -> Iterator[Scene]:
+    """Yield the frames of a recording as scenes.
 
-    stage: where its camera and objects stand, if it goes on from another recording.
+    Args:
+        recording: detections and lifted shapes.
+        every: yield every n-th frame.
+        transform: of an earlier recording that this one continues; None = its own.
     """
-    seen, lifted, stage = recording.detections, recording.lifted, stage or stage_of(recording)
-    ends = np.searchsorted(seen.frame, np.arange(len(seen.stamps) + 1))
-    for frame in range(0, len(seen.stamps), every):
+    detections, lifted = recording.detections, recording.lifted
+    transform = transform or scene_transform(recording)
+    ends = np.searchsorted(detections.frame, np.arange(len(detections.stamps) + 1))
+    for frame in range(0, len(detections.stamps), every):
         rows = slice(ends[frame], ends[frame + 1])
-        observation = Observation(seen.points[rows], seen.confidence[rows])
-        there = Lifted(*(part[rows] for part in lifted))
-        yield stage.scene(
-            int(seen.stamps[frame]), observation, there, seen.identities[rows].tolist()
-        )
+        observation = Observation(detections.points[rows], detections.confidence[rows])
+        in_frame = Lifted(*(part[rows] for part in lifted))
+        stamp, identities = int(detections.stamps[frame]), detections.identities[rows].tolist()
+        yield transform.scene(stamp, observation, in_frame, identities)
 
 
 def stride(recording: Recording, most: int) -> int:
-    """Return n such that every n-th frame makes at most `most` frames, and objects on average."""
+    """Return n such that every n-th frame is at most `most` frames, and objects on average."""
     return max(
         1, math.ceil(max(len(recording.detections.stamps), len(recording.detections)) / most)
     )
@@ -144,7 +163,14 @@ def stride(recording: Recording, most: int) -> int:
 def recording_page(
     recording: Recording, title: str, notes: Sequence[str] = (), most: int = MOST_FRAMES
 ) -> str:
-    """Return a recording as one HTML file; of a long one, every n-th frame, and it says so."""
+    """Return a recording as one HTML page.
+
+    Args:
+        recording: detections and lifted shapes.
+        title: of the page.
+        notes: sentences below the title.
+        most: frames at most; of a longer recording, every n-th frame, with a note.
+    """
     every = stride(recording, most)
     shown = list(scenes(recording, every))
     if every > 1:
@@ -156,7 +182,7 @@ def recording_page(
 
 
 def live_page(source: KeypointLayout, target: KeypointLayout, title: str) -> str:
-    """Return the page that fetches its frames from the server it came from."""
+    """Return a page that receives its frames from its server; see `serving`."""
     return _page(source, target, title, [], None)
 
 
@@ -167,7 +193,7 @@ def _page(
     notes: Sequence[str],
     shown: Sequence[Scene] | None,
 ) -> str:
-    """Return the page with its frames, or without if they are to come."""
+    """Return the page with frames, or, for None, one that receives them."""
     head = {
         "source": _drawn(source),
         "target": _drawn(target),
@@ -187,19 +213,19 @@ def _page(
 
 
 def _drawn(layout: KeypointLayout) -> dict[str, Any]:
-    """Return what there is to know to draw a layout."""
+    """Return names, edges and colours of a layout for player.js."""
     edges, colours = layout.edge_indices(), edge_colours(layout)
     return {"names": list(layout.keypoints), "edges": edges, "colours": colours}
 
 
 def _rounded(values: NDArray[np.floating], digits: int) -> NDArray[np.floating]:
-    """Return values with as many significant digits as their largest needs."""
+    """Return values rounded so that the largest has so many significant digits."""
     largest = float(np.abs(values).max(initial=0))
     places = digits - 1 - (math.floor(math.log10(largest)) if largest > 0 else 0)
     return np.round(values.astype(np.float64), places)
 
 
 def _flat(values: NDArray[np.floating]) -> list[float]:
-    """Return the numbers of an array, whole ones without a point: 1, not 1.0."""
+    """Return the numbers of an array; integers as int, which JSON writes shorter."""
     numbers: list[float] = values.astype(np.float64).ravel().tolist()
     return [int(number) if number.is_integer() else number for number in numbers]

@@ -1,4 +1,4 @@
-"""A page on localhost whose frames come as they happen: server-sent events, no library needed."""
+"""A live page on localhost: frames arrive as server-sent events, without a further library."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 HOST = "127.0.0.1"
-_NAMES = ("127.0.0.1", "localhost")  # by which browsers may ask, so that no other site can
-_HEARTBEAT = 5.0  # seconds after which a silent connection is tried
-_MOST = 3000  # frames that are kept for browsers that come later
+_HOSTS = ("127.0.0.1", "localhost")  # other Host headers are refused, against DNS rebinding
+_HEARTBEAT = 5.0  # seconds without a frame after which a connection is tested
+_MAX_FRAMES = 3000  # kept for browsers that connect later
 
 
 class Broadcast:
-    """Frames for every browser that looks: those that came before, then each as it comes."""
+    """Frames for all connected browsers: the last ones at once, each further one as it arrives."""
 
-    def __init__(self, most: int = _MOST) -> None:
-        """Keep the last `most` frames."""
+    def __init__(self, most: int = _MAX_FRAMES) -> None:
+        """Keep at most the last `most` frames for browsers that connect later."""
         self._frames: deque[str] = deque(maxlen=most)
         self._count, self._ended = 0, False
         self._changed = threading.Condition()
 
     def put(self, frame: Mapping[str, Any]) -> None:
-        """Add a frame."""
+        """Add a frame, a mapping that JSON can encode."""
         text = json.dumps(frame, allow_nan=False, separators=(",", ":"))
         with self._changed:
             self._frames.append(text)
@@ -35,15 +35,15 @@ class Broadcast:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Say that no frame will come any more."""
+        """End the events of all browsers."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
 
     def events(self, after: int = 0) -> Iterator[str]:
-        """Yield server-sent events for the frames after the number `after`, as long as they come.
+        """Yield server-sent events for the frames after number `after`, until `end`.
 
-        A comment in times of silence lets the server find out who is gone.
+        Without frames it yields a comment every 5 s, so that the server notices closed connections.
         """
         while True:
             with self._changed:
@@ -62,26 +62,32 @@ class Broadcast:
 
 
 def server(page: str, broadcast: Broadcast, port: int) -> ThreadingHTTPServer:
-    """Return a server of the page and its frames; `serve_forever` starts it, `shutdown` ends it.
+    """Return an HTTP server of a page and its frames; call `serve_forever` to start it.
 
-    port: 0 takes a free one. Raises OSError if the port is taken.
+    Args:
+        page: HTML.
+        broadcast: the frames.
+        port: TCP port; 0 = any free one.
+
+    Raises:
+        OSError: the port is in use.
     """
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             host = (self.headers.get("Host") or "").rpartition(":")[0]
-            if host not in _NAMES:
+            if host not in _HOSTS:
                 self.send_error(HTTPStatus.FORBIDDEN, "this server is for localhost alone")
             elif self.path == "/":
-                self._answer("text/html; charset=utf-8", [page])
+                self._respond("text/html; charset=utf-8", [page])
             elif self.path == "/frames":
                 last = self.headers.get("Last-Event-ID", "")
                 after = int(last) if last.isdigit() else 0
-                self._answer("text/event-stream", broadcast.events(after))
+                self._respond("text/event-stream", broadcast.events(after))
             else:
                 self.send_error(HTTPStatus.NOT_FOUND)
 
-        def _answer(self, kind: str, parts: Iterable[str]) -> None:
+        def _respond(self, kind: str, parts: Iterable[str]) -> None:
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", kind)
             self.send_header("Cache-Control", "no-store")
@@ -95,9 +101,9 @@ def server(page: str, broadcast: Broadcast, port: int) -> ThreadingHTTPServer:
         def log_message(self, *words: Any) -> None:
             pass
 
-    made = ThreadingHTTPServer((HOST, port), Handler)
-    made.daemon_threads = True
-    return made
+    http = ThreadingHTTPServer((HOST, port), Handler)
+    http.daemon_threads = True
+    return http
 
 
 def in_real_time(
@@ -105,11 +111,17 @@ def in_real_time(
     put: Callable[[Mapping[str, Any]], None],
     wait: Callable[[float], Any] = time.sleep,
 ) -> None:
-    """Put frames at the pace of their times `t` in s, the first at once."""
-    began, first = time.monotonic(), None
+    """Put frames at their times `t` in s, relative to the first.
+
+    Args:
+        frames: mappings with `t`.
+        put: called with each frame.
+        wait: called with the seconds to wait.
+    """
+    start, first = time.monotonic(), None
     for frame in frames:
         first = frame["t"] if first is None else first
-        left = frame["t"] - first - (time.monotonic() - began)
+        left = frame["t"] - first - (time.monotonic() - start)
         if left > 0:
             wait(left)
         put(frame)

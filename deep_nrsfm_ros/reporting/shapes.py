@@ -1,4 +1,4 @@
-"""What a model makes of the frames it was trained on: mean shape, modes, best and worst."""
+"""A model on its training frames: mean shape, modes of deformation, errors without labels."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import (
     align,
     centre,
+    centre_visible,
     random_cameras,
     rotation_from_camera,
 )
@@ -23,14 +24,18 @@ from deep_nrsfm_ros.nrsfm.normalisation import normalise
 Floats = NDArray[np.float64]
 
 _SAMPLE = 500  # frames that are lifted
-_ROUNDS = 3  # of alignment to the mean
+_ROUNDS = 3  # rounds of alignment to the mean shape
 
 
 class ShapeSpace(NamedTuple):
-    """A mean shape (p, 3), unit RMS radius, and its principal deformations.
+    """The mean shape and the principal deformations, in screen axes.
 
-    modes: (m, p, 3), each one standard deviation. shares: (m,) of the variance.
-    Axes as on a screen: x right, y up, z towards the viewer, who stands before the object.
+    The axes are x right, y up, z to a viewer in front of the object. The mean has RMS radius 1.
+
+    Attributes:
+        mean: (p, 3).
+        modes: (m, p, 3) one standard deviation of each principal component.
+        shares: (m,) shares of the variance, descending.
     """
 
     mean: Floats
@@ -39,26 +44,38 @@ class ShapeSpace(NamedTuple):
 
 
 class LiftedFrames(NamedTuple):
-    """Frames (n,) of a dataset as a model lifts them, the ones that cannot be lifted left out."""
+    """The n frames of a sample that a model lifts.
+
+    Attributes:
+        frames: (n,) indices into the dataset.
+        lifted: n objects.
+    """
 
     frames: NDArray[np.int64]
     lifted: Lifted
 
 
 class LabelFreeErrors(NamedTuple):
-    """Label-free errors of a model on given frames, means; relative to the size of the object.
+    """Mean errors of a model that need no labels, relative to the size of the object; 0 = perfect.
 
-    cycle: of the shape, as training measures it: the network alone on its own shapes, seen by
-    random cameras. turned: the same of shape and camera together, by the lifter.
+    Attributes:
+        reprojection: of the network, before correction; 0.05 typical.
+        cycle: difference between a lifted shape and the shape that the network lifts from a random
+            view of it, as training measures it.
+        lifter_cycle: the same by the whole lifter, including the rotation of the camera.
     """
 
     reprojection: float
     cycle: float
-    turned: float
+    lifter_cycle: float
 
 
 def lift_sample(model: Model, dataset: Dataset, most: int = _SAMPLE) -> LiftedFrames:
-    """Lift up to `most` frames, evenly spread; raise ValueError if none can be lifted."""
+    """Return up to `most` evenly spread frames of a dataset, lifted.
+
+    Raises:
+        ValueError: the model lifts none of them.
+    """
     frames = np.unique(np.linspace(0, len(dataset) - 1, min(most, len(dataset))).astype(int))
     chosen = dataset[frames]
     lifted = lift_all(Lifter(model).lift, chosen.points, chosen.visible.astype(np.float32))
@@ -69,22 +86,30 @@ def lift_sample(model: Model, dataset: Dataset, most: int = _SAMPLE) -> LiftedFr
 
 
 def handedness_warning(model: Model, dataset: Dataset) -> str:
-    """Return what the lifted frames say against the model's depth, "" if nothing.
+    """Return a warning if keypoints of lifted frames disagree on the depth, "" if they agree.
 
-    See `handedness.disagreement`; only keypoints that were seen count.
+    See `nrsfm.handedness.disagreement`.
     """
     try:
         frames, lifted = lift_sample(model, dataset)
     except ValueError:
-        return ""  # no frame is lifted: there is no depth to handedness_warning
+        return ""  # no frame is lifted: without a lifted frame there is no depth
     return disagreement(lifted.shapes, model.layout, dataset.visible[frames])
 
 
 def shape_space(model: Model, lifted: Lifted, modes: int = 4) -> ShapeSpace:
-    """Return the mean and the first modes of lifted shapes, aligned by proper rotations alone."""
-    S = centre(lifted.shapes.astype(np.float64) @ lifted.rotations)  # camera's axes to object's
+    """Return the mean and the principal components of lifted shapes.
+
+    Shapes are centred, scaled to RMS radius 1 and aligned by rotations without reflection.
+
+    Args:
+        model: its layout determines the screen axes.
+        lifted: n objects.
+        modes: number of components at most.
+    """
+    S = centre(lifted.shapes.astype(np.float64) @ lifted.rotations)  # in the object's axes
     S /= np.maximum(np.sqrt((S * S).sum(2).mean(1)), 1e-9)[:, None, None]
-    # Of shapes from a network that failed the mean may vanish; one of them never does.
+    # Start from a single shape: the mean of a failed network's shapes may be zero.
     mean = S[int(np.argmin(lifted.residual))]
     for _ in range(_ROUNDS):
         S = align(S, np.broadcast_to(mean, S.shape)).aligned
@@ -104,51 +129,50 @@ def shape_space(model: Model, lifted: Lifted, modes: int = 4) -> ShapeSpace:
 
 
 def _to_screen(model: Model, mean: Floats) -> Floats:
-    """Return the rotation (3, 3), applied on the right, from object axes to those of a screen.
+    """Return the rotation (3, 3), applied on the right, from object axes to screen axes.
 
-    An object without a known front stands upright along its longest extent.
+    An object without a handedness is upright along its longest extent.
     """
     if model.layout.handedness:
         return np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # x front, y left, z up
     axes = np.linalg.eigh(mean.T @ mean)[1]  # shortest first
-    turn: Floats = axes[:, [1, 2, 0]]
-    turn[:, 2] *= np.sign(np.linalg.det(turn))
-    return turn
+    rotation: Floats = axes[:, [1, 2, 0]]
+    rotation[:, 2] *= np.sign(np.linalg.det(rotation))
+    return rotation
 
 
 def label_free_errors(model: Model, dataset: Dataset, most: int = 128) -> LabelFreeErrors:
-    """Return how well a model explains up to `most` frames of its own layout.
+    """Return the errors of a model on up to `most` frames of its own layout.
 
-    Raises ValueError if it lifts none of them.
+    Raises:
+        ValueError: the model lifts none of them.
     """
-    frames, found = lift_sample(model, dataset, most)
-    T = centre(found.shapes) @ _turns(len(frames))
+    frames, lifted = lift_sample(model, dataset, most)
+    T = centre(lifted.shapes) @ _fixed_rotations(len(frames))
     views, confidence = T[..., :2].astype(np.float32), np.ones(T.shape[:2], np.float32)
     again = lift_all(Lifter(model).lift, views, confidence)
     sound = np.isfinite(again.scale)
-    after = again.shapes[sound] * again.scale[sound, None, None]
+    lifted_again = again.shapes[sound] * again.scale[sound, None, None]
     return LabelFreeErrors(
-        float(found.residual.mean()),
+        float(lifted.residual.mean()),
         cycle_error(model, dataset[frames]),
-        _difference(after, T[sound]),
+        _difference(lifted_again, T[sound]),
     )
 
 
 def cycle_error(model: Model, dataset: Dataset) -> float:
-    """Return the mean of ||S' - S|| / ||S||: S' is the network's shape of S seen from elsewhere."""
+    """Return the mean of ||S' - S|| / ||S||, S' being the network's shape of a random view of S."""
     mask = dataset.visible[..., None].astype(np.float32)
-    seen = normalise(model.network, model.normaliser, dataset.points, mask)
-    S, M = forward(model.network, seen.W * seen.gain)
-    residual = (seen.W - S @ M) * mask
-    residual -= mask * residual.sum(1, keepdims=True) / np.maximum(mask.sum(1, keepdims=True), 1)
-    S = centre(S + residual @ M.swapaxes(1, 2))
-    again = model.normaliser.encode(S @ _turns(len(S))[..., :2], np.ones_like(mask))
+    W, gain, _, _ = normalise(model.network, model.normaliser, dataset.points, mask)
+    S, M = forward(model.network, W * gain)
+    S = centre(S + centre_visible(W - S @ M, mask) @ M.swapaxes(1, 2))
+    again = model.normaliser.encode(S @ _fixed_rotations(len(S))[..., :2], np.ones_like(mask))
     S_again, _ = forward(model.network, again.W)
     return _difference(centre(S_again), S / again.unit)
 
 
-def _turns(n: int) -> NDArray[np.float32]:
-    """Return n rotations (n, 3, 3), always the same."""
+def _fixed_rotations(n: int) -> NDArray[np.float32]:
+    """Return n random rotations (n, 3, 3), the same in each call."""
     M = random_cameras(n, np.random.default_rng(0))
     return rotation_from_camera(M).swapaxes(1, 2)
 

@@ -1,4 +1,4 @@
-"""HTML pages that stand alone: everything they need is inside, and data never becomes markup."""
+"""Self-contained HTML pages: styles, scripts and data are inside, and data is escaped."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ from markupsafe import Markup
 
 
 def render(template: str, styles: Sequence[str], scripts: Sequence[str], **values: Any) -> str:
-    """Return a template of this package with `style` and `script` from files of this package."""
+    """Return a page from a template, with styles and scripts embedded.
+
+    Args:
+        template: file of this package, e.g. "report.html.j2".
+        styles: .css files of this package.
+        scripts: .js files of this package.
+        values: variables of the template; they are escaped.
+    """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return environment.from_string(_resource(template)).render(
         style=Markup("\n".join(map(_resource, styles))),
@@ -22,11 +29,11 @@ def render(template: str, styles: Sequence[str], scripts: Sequence[str], **value
 
 
 def embedded(value: Any) -> Markup:
-    """Return JSON that cannot end the script element it stands in."""
+    """Return a value as JSON for a script element, which the JSON cannot end."""
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c"))
 
 
 def _resource(name: str) -> str:
-    """Return a file of this package."""
+    """Return the text of a file of this package."""
     return (files(__package__) / name).read_text(encoding="utf-8")

@@ -77,7 +77,7 @@ def test_answers_are_shown_as_they_were_recorded(
     for one, expected in zip(objects, points / 1000, strict=True):
         found = np.reshape(one["shape"], (17, 3))
         np.testing.assert_allclose(found[:, :2], expected - expected.mean(0), atol=1e-3)
-        assert one["rotation"] == [1, 0, 0, 0, 1, 0, 0, 0, 1] and one["sure"] == [0.5] * 17
+        assert one["rotation"] == [1, 0, 0, 0, 1, 0, 0, 0, 1] and one["confidence"] == [0.5] * 17
     main([str(answered), "--lift-again", "--html", str(tmp_path / "again.html")])
     assert shown(tmp_path / "again.html")[0]["shape"] != objects[0]["shape"]
 

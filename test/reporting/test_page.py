@@ -22,7 +22,7 @@ from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
-from deep_nrsfm_ros.reporting.drawing import GUESSED
+from deep_nrsfm_ros.reporting.drawing import MISSING
 from deep_nrsfm_ros.reporting.page import Training, page, write_report
 
 EVIL = '</script><img src=x onerror="alert(1)">&'
@@ -134,12 +134,12 @@ def test_what_no_frame_shows_is_drawn_pale() -> None:
     blind = Dataset(kept.points, visible, HUMAN17, kept.source)
     for scene in scenes_of(page(training_of(dataset=blind))):
         pale = {
-            toe in edge: c == GUESSED
+            toe in edge: c == MISSING
             for edge, c in zip(scene["edges"], scene["colours"], strict=True)
         }
         assert pale[True]
     mean, *_ = scenes_of(page(training_of()))
-    assert GUESSED not in mean["colours"]
+    assert MISSING not in mean["colours"]
 
 
 def test_it_tells_what_was_left_out_and_hidden(text: str) -> None:
@@ -147,7 +147,7 @@ def test_it_tells_what_was_left_out_and_hidden(text: str) -> None:
     for count in (curated.total, curated.few_visible, curated.corrected, len(curated.dataset)):
         assert f'<td class="figure">{count}</td>' in text
     assert curated.corrected > 0 and HUMAN17.keypoints[3] in text
-    assert "times the usual: points hidden" in " ".join(text.split())
+    assert "times the typical distance: keypoints hidden" in " ".join(text.split())
 
 
 def test_warnings_come_first() -> None:

@@ -83,13 +83,13 @@ def test_scenes_say_what_was_lifted() -> None:
     np.testing.assert_allclose(
         np.reshape(one["rotation"], (3, 3)), recording.lifted.rotations[7], atol=1e-4
     )
-    assert one["size"] == 1 and one["place"] == [0, 0, 0] and shown[7]["camera"] is None
+    assert one["size"] == 1 and one["position"] == [0, 0, 0] and shown[7]["camera"] is None
 
 
 def test_points_in_place_have_a_camera() -> None:
     shown = list(scenes(recording_of(offset=4.0)))
     assert shown[0]["camera"] == pytest.approx([0, 0, -4], abs=1e-3)
-    assert shown[5]["objects"][0]["place"] == pytest.approx([0, 0, 0], abs=1e-3)
+    assert shown[5]["objects"][0]["position"] == pytest.approx([0, 0, 0], abs=1e-3)
 
 
 def test_unknown_scale_and_rotation_are_bearable() -> None:
@@ -98,7 +98,7 @@ def test_unknown_scale_and_rotation_are_bearable() -> None:
         part[:] = np.nan
     text = recording_page(recording, "mine")
     (one,) = head_of(text)["frames"][0]["objects"]
-    assert one["rotation"] is None and one["residual"] is None and one["place"] == [0, 0, 0]
+    assert one["rotation"] is None and one["residual"] is None and one["position"] == [0, 0, 0]
     assert "NaN" not in text
 
 

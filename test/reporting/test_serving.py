@@ -19,8 +19,14 @@ def frame(t: float) -> dict[str, Any]:
     """Return a frame with one person of whom all keypoints are on one line."""
     seen = [v for i in range(17) for v in (100 + i, 100 + 10 * i + t, 0.9)]
     shape = [v for i in range(17) for v in (0.1 * i - 0.8, 0.1 * i - 0.8 + t / 100, 0.0)]
-    lifted = {"shape": shape, "sure": [0.9] * 17, "place": [0, 0, 0], "size": 1, "residual": None}
-    one = {"identity": "0", "seen": seen, "rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1], **lifted}
+    lifted = {
+        "shape": shape,
+        "confidence": [0.9] * 17,
+        "position": [0, 0, 0],
+        "size": 1,
+        "residual": None,
+    }
+    one = {"identity": "0", "keypoints": seen, "rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1], **lifted}
     return {"t": t, "camera": None, "objects": [one]}
 
 
@@ -99,4 +105,4 @@ def test_a_browser_follows_until_it_is_held_back(
     broadcast.put(frame(70))
     tab.wait("index === 3")
     broadcast.end()
-    tab.wait("document.getElementById('state').textContent === 'that was all'")
+    tab.wait("document.getElementById('state').textContent === 'end of the recording'")
