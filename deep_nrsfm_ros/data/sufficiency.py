@@ -76,8 +76,8 @@ def assess_sufficiency(dataset: Dataset) -> Sufficiency:
         return _refused(
             frames,
             keypoints,
-            f"only {keypoints} keypoints are seen ({', '.join(names) or 'none'}); NRSfM needs at "
-            "least 4, better 8; check the layout and lower --min-confidence",
+            f"only {keypoints} keypoints are visible ({', '.join(names) or 'none'}); NRSfM needs "
+            "at least 4, better 8; check the layout and lower --min-confidence",
         )
     lines = np.zeros(len(dataset), bool)
     for part in slices(len(dataset)):
@@ -175,13 +175,13 @@ def _warnings(frames: int, span: float, deformation: float) -> tuple[str, ...]:
     if frames < _FEW_FRAMES:
         warnings.append(
             f"{frames} frames are few; expect a model of those frames alone, and record "
-            "thousands for one that knows others"
+            "thousands for a model of other frames too"
         )
     if span < _NARROW:
         warnings.append(
             f"the views span only {span:.0f} degrees around their mean, so that depth rests on "
             "deformation alone and may come out mirrored; record the object from more sides, "
-            "start from a model that knows it (--from, train.from), or let the layout help "
+            "start from a model of such an object (--from, train.from), or let the layout help "
             "(bone_length_weight, handedness_weight)"
         )
     if deformation < _RIGID:

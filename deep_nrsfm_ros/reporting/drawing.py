@@ -131,7 +131,7 @@ def scene(
     layout: KeypointLayout,
     visible: Points,
     mode: Points | None = None,
-    turn: float = 0.0,
+    yaw: float = 0.0,
 ) -> dict[str, Any]:
     """Return a 3D shape as data for viewer.js.
 
@@ -140,7 +140,7 @@ def scene(
         layout: names and edges.
         visible: (p,) bool; edges to other keypoints are pale.
         mode: (p, 3) deformation to animate; None = a rigid shape.
-        turn: initial rotation about the vertical axis in degrees.
+        yaw: initial rotation about the vertical axis in degrees.
     """
     edges = layout.edge_indices()
     colours = zip(edges, edge_colours(layout), strict=True)
@@ -150,7 +150,7 @@ def scene(
         "edges": edges,
         "colours": [c if visible[i] and visible[j] else MISSING for (i, j), c in colours],
         "names": list(layout.keypoints),
-        "turn": turn,
+        "yaw": yaw,
     }
 
 

@@ -1,4 +1,4 @@
-// A canvas with a 3D scene that is turned by dragging. Axes x right, y up, z to the viewer.
+// A canvas with a 3D scene that rotates when it is dragged. Axes x right, y up, z to the viewer.
 "use strict";
 
 class Orbit {
@@ -14,7 +14,7 @@ class Orbit {
     });
   }
 
-  // An empty canvas of its size on the page.
+  // Clear the canvas and match its resolution to its size on the page.
   clear() {
     const ratio = window.devicePixelRatio || 1, { canvas, pen } = this;
     [this.width, this.height] = [canvas.clientWidth, canvas.clientHeight];
@@ -23,7 +23,7 @@ class Orbit {
     pen.lineCap = "round";
   }
 
-  // The place of a point on the canvas, and how near it is.
+  // Return the position of a point on the canvas, and its depth, larger = nearer.
   project([x, y, z]) {
     const [c, s] = [Math.cos(this.yaw), Math.sin(this.yaw)];
     const [cp, sp] = [Math.cos(this.pitch), Math.sin(this.pitch)];
@@ -32,7 +32,7 @@ class Orbit {
             this.height / 2 - this.zoom * (cp * y - sp * depth), cp * depth + sp * y];
   }
 
-  // Lines [from, to, colour, opacity, width] between projected points, far ones first and fainter.
+  // Lines [from, to, colour, opacity, width] between projected points, drawn from far to near, far ones fainter.
   lines(lines, reach) {
     const pen = this.pen;
     [...lines].sort((e, f) => e[0][2] + e[1][2] - f[0][2] - f[1][2])

@@ -165,10 +165,10 @@ def _shapes(
     """Return (caption, index of its scene) of mean shape and modes; append the scenes."""
     space = shape_space(model, sample.lifted)
     shown: list[Any] = [("mean shape", len(scenes))]
-    scenes.append(scene(space.mean, model.layout, visible, turn=30))
+    scenes.append(scene(space.mean, model.layout, visible, yaw=30))
     for k, (mode, share) in enumerate(zip(space.modes, space.shares, strict=True), 1):
         shown.append((f"mode {k}: {100 * share:.0f} %", len(scenes)))
-        scenes.append(scene(space.mean, model.layout, visible, mode, turn=30))
+        scenes.append(scene(space.mean, model.layout, visible, mode, yaw=30))
     return shown
 
 
@@ -185,7 +185,7 @@ def _frames(
         number = int(training.curated.frames[frame])  # before curation
         shown.append((number, float(sample.lifted.residual[k]), drawing, len(scenes)))
         lifted = sample.lifted.shapes[k] * _CAMERA_TO_SCREEN
-        scenes.append(scene(lifted, layout, visible, turn=60))
+        scenes.append(scene(lifted, layout, visible, yaw=60))
     return shown
 
 

@@ -1,4 +1,4 @@
-// The report's shapes: drag to turn; those with a mode swing along it.
+// The 3D shapes of a report: drag to rotate; shapes with a mode are animated along it.
 "use strict";
 const scenes = JSON.parse(document.getElementById("scenes").textContent);
 const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -10,7 +10,7 @@ function view(canvas) {
     (p, i) => Math.hypot(...p) + (scene.mode ? 2 * Math.hypot(...scene.mode[i]) : 0)));
   const moved = (p, i) => p.map((v, k) => v + (scene.mode ? swing * scene.mode[i][k] : 0));
 
-  const orbit = new Orbit(canvas, scene.turn * Math.PI / 180, scene.mode ? 0.15 : 0, () => {
+  const orbit = new Orbit(canvas, scene.yaw * Math.PI / 180, scene.mode ? 0.15 : 0, () => {
     orbit.clear();
     orbit.zoom = 0.46 * orbit.width / reach;
     const at = scene.points.map((p, i) => orbit.project(moved(p, i)));

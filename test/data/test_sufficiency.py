@@ -109,7 +109,7 @@ def test_keypoints_that_are_never_seen_do_not_count() -> None:
     visible = np.zeros((400, P), bool)
     visible[:, [0, 5, 9]] = True
     found = assess_sufficiency(dataset(seen_from(shapes(400, 0.3), 90), visible))
-    assert "only 3 keypoints are seen (point_0, point_5, point_9)" in found.refusal
+    assert "only 3 keypoints are visible (point_0, point_5, point_9)" in found.refusal
 
 
 DOUBTFUL = {
@@ -143,7 +143,7 @@ def test_missing_points_do_not_look_like_variation() -> None:
 
 def test_an_empty_dataset_is_refused() -> None:
     nothing = assess_sufficiency(dataset(np.zeros((0, P, 2))))
-    assert "only 0 keypoints are seen (none)" in nothing.refusal
+    assert "only 0 keypoints are visible (none)" in nothing.refusal
 
 
 @settings(max_examples=25, deadline=None)
