@@ -16,6 +16,7 @@ from deep_nrsfm_ros.nrsfm.losses import Batch, Objective
 from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
+from deep_nrsfm_ros.training.adam import Adam
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.gradient_function import (
@@ -74,7 +75,7 @@ class Trainer:
         # All weights in one tensor: Adam costs a tenth of a step on one, a fifth on fifty.
         self.weights = weight_vector(self.initial)
         self.net = with_weights(self.initial, self.weights)
-        self.optimiser = torch.optim.Adam([self.weights], lr=recipe.learning_rate, fused=True)
+        self.optimiser = Adam(self.weights)
         self.objective = Objective(normaliser, recipe, layout_loss=layout_loss)
         self.gradient_function = GradientFunction(self.objective, self.net, self.batch)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
@@ -103,16 +104,14 @@ class Trainer:
 
     def _advance(self) -> None:
         began = time.process_time()
-        for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate(self.preset.recipe, self.step, self.time_gone)
         batch = self.sample(self.batch, self.step)
         losses, gradient = self.gradient_function(self.weights, batch, self.shapes, self.generator)
         self.shapes = losses.shapes
         if self.team.size > 1:
             gradient = gradient * (self.batch / self.preset.recipe.batch)
             self.team.total(gradient)
-        self.weights.grad = gradient
-        self.optimiser.step()
+        rate = learning_rate(self.preset.recipe, self.step, self.time_gone)
+        self.optimiser.update(gradient, rate)
         self.step += 1
         self.cpu_seconds += time.process_time() - began
 
@@ -140,7 +139,7 @@ class Trainer:
         tensors |= {"weights": self.weights, "L": self.initial.L}
         if self.shapes is not None:
             tensors["shapes"] = self.shapes
-        moments = self.optimiser.state.get(self.weights, {})
+        moments = self.optimiser.moments
         return tensors | {f"adam.{key}": value for key, value in moments.items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
@@ -158,11 +157,13 @@ class Trainer:
             self.weights.copy_(saved)
         if "shapes" in tensors:
             self.shapes = tensors["shapes"].to(device)
-        self.optimiser.state[self.weights] = {
-            name.removeprefix("adam."): value.to(device)
-            for name, value in tensors.items()
-            if name.startswith("adam.")
-        }
+        self.optimiser.restore(
+            {
+                name.removeprefix("adam."): value
+                for name, value in tensors.items()
+                if name.startswith("adam.")
+            }
+        )
         self.probe = self.sample(1024)
 
 

@@ -311,7 +311,7 @@ def second_a_step(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     def timed(trainer: Trainer) -> None:
         advance(trainer)
-        rates.append(trainer.optimiser.param_groups[0]["lr"])
+        rates.append(trainer.optimiser.learning_rate)
 
     monkeypatch.setattr(Trainer, "advance", timed)
     monkeypatch.setattr(time, "monotonic", lambda: float(len(rates)))
