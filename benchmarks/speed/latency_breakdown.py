@@ -35,7 +35,7 @@ OBJECTS = (1, 5, 20)
 STEPS: dict[str, tuple[tuple[Any, str], ...]] = {
     "decode": ((MessageReader, "__call__"),),
     "map": ((KeypointMap, "__call__"),),
-    "lift": ((lifting.Lifter, "__call__"),),
+    "lift": ((lifting.Lifter, "lift"),),
     "smooth (off)": ((Smoother, "__call__"),),
     "serialise": ((publishing, "point_cloud"), (publishing, "camera_rotation")),
 }
