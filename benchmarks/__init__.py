@@ -1,1 +1,1 @@
-"""The paper's experiments: one command a table, from a folder of data."""
+"""Benchmarks: each file is a program that prints its tables; README.md is the index."""

@@ -1,4 +1,4 @@
-"""What the benchmarks share: their command line, the motion capture, and trainings kept."""
+"""Command line, motion capture and kept trainings of the benchmarks that train on CMU."""
 
 from __future__ import annotations
 
@@ -30,51 +30,50 @@ from deep_nrsfm_ros.training.progress import Progress
 from deep_nrsfm_ros.training.trainer import Trainer
 
 SNAPSHOTS = 10
-"""Models kept of each training, evenly spaced; the last is its result."""
+"""Snapshots kept of each training, evenly spaced; the last is its result."""
 CHECKPOINT_SECONDS = 30.0
-"""An interrupted training loses no more than this."""
+"""Seconds between checkpoints."""
 LIFTING_LEGEND = {
-    "network alone": "one pass of the network, nothing after it",
-    "back-projected": "one pass, then moved within the image plane onto the keypoints",
+    "network alone": "one pass of the network",
+    "back-projected": "one pass, then moved onto the keypoints within the image plane",
     "without bones": f"mean over {LiftingOptions().test_time_rotations} in-plane rotations, then "
-    "corrected by what the model knows of its own errors",
-    "as shipped": "the same, and by how long the model knows the object's bones to be",
-    "as shipped, noise 0": "the same, told that the keypoints are without noise, as they are here: "
-    "they are met exactly",
+    "corrected by the model's error covariance",
+    "as shipped": "the same, corrected by the bone lengths of the model as well",
+    "as shipped, noise 0": "the same with the option noise = 0, as the keypoints here are exact",
 }
 
 
 @dataclass(frozen=True)
 class Session:
-    """What a benchmark was asked for."""
+    """The options of a benchmark."""
 
     data: Path  # holds cmu/NN/NN.asf and NN_MM.amc
     output: Path
     subjects: tuple[str, ...]
     seeds: tuple[int, ...]
-    steps: int | None  # instead of the presets'
+    steps: int | None  # instead of the steps of the presets
     stride: int  # every n-th frame
 
     def mocap(self, subjects: Sequence[str], split: str) -> Dataset:
-        """Return the trials "train", "held-out" or "all" of CMU subjects, with ground truth."""
+        """Return the dataset of the trials "train", "held-out" or "all" of CMU subjects."""
         return _mocap(self.data / "cmu", tuple(subjects), split, self.stride)
 
     def preset(self, name: str, seed: int, **recipe: Any) -> Preset:
-        """Return a preset with its seed and other fields of its recipe set."""
+        """Return the preset `name` with the seed and other fields of the recipe replaced."""
         if self.steps:
             recipe["steps"] = self.steps
         base = PRESETS[name]
         return base._replace(recipe=dataclasses.replace(base.recipe, seed=seed, **recipe))
 
     def trained(self, title: str, dataset: Dataset, preset: Preset) -> Model:
-        """Return the trained model, from the output folder if it is there."""
+        """Return the trained model, from the output folder if it exists."""
         return self.snapshots(title, dataset, preset)[-1]
 
     def snapshots(self, title: str, dataset: Dataset, preset: Preset) -> list[Model]:
-        """Return the model along its training, its result last; what is there is not trained again.
+        """Return the snapshots of a training, the result last, from the output folder if there.
 
-        An interrupted training goes on from its checkpoint. The folder's name tells everything
-        that shapes the model: `title` for people, a hash of frames, preset and version.
+        An interrupted training continues from its checkpoint. The name of the folder is `title` and
+        a hash of frames, preset and version.
         """
         folder = self.output / "models" / f"{title.replace(' ', '-')}-{_hash(dataset, preset)}"
         folder.mkdir(parents=True, exist_ok=True)
@@ -89,7 +88,7 @@ class Session:
     def _train(
         title: str, dataset: Dataset, preset: Preset, paths: dict[int, Path], checkpoint: Path
     ) -> None:
-        """Train, and save the model at every step of `paths`."""
+        """Train; save the model at each step of `paths`."""
 
         def keep(trainer: Trainer) -> None:
             if trainer.step in paths:
@@ -125,7 +124,7 @@ def _mocap(folder: Path, subjects: tuple[str, ...], split: str, stride: int) -> 
 
 
 def _hash(dataset: Dataset, preset: Preset) -> str:
-    """Return what tells a training from all others, in ten digits."""
+    """Return a hash of dataset, preset and version, ten digits."""
     digest = hashlib.sha256(f"{__version__} {preset}".encode())
     digest.update(dataset.points.tobytes())
     digest.update(dataset.visible.tobytes())
@@ -140,7 +139,12 @@ def with_proper(columns: Iterable[str]) -> list[str]:
 def errors_by_column(
     tests: Mapping[str, tuple[Model, Dataset]], options: LiftingOptions
 ) -> dict[str, float]:
-    """Return shape error and proper error (%) of a model on a test for each column."""
+    """Return shape error and proper error in % for each column.
+
+    Args:
+        tests: column -> model and test dataset.
+        options: options of lifting.
+    """
     row: dict[str, float] = {}
     for column, (model, dataset) in tests.items():
         errors = figures(evaluate(model, dataset, options))
@@ -155,14 +159,17 @@ def run_program(
     argv: Sequence[str] | None = None,
     seeds: Sequence[int] = (0, 1),
 ) -> None:
-    """Run a benchmark as a program: options in, its table out; exit code 2 for bad input."""
+    """Run a benchmark as a program: parse options, print and write its table.
+
+    Exit code 2 for bad input.
+    """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, required=True, help="folder that holds cmu/")
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     parser.add_argument("--subjects", nargs="+", default=list(subjects), help="CMU subjects")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(seeds))
-    parser.add_argument("--steps", type=int, help="train for so many steps only: a quick look")
-    parser.add_argument("--stride", type=int, default=1, help="take every n-th frame only")
+    parser.add_argument("--steps", type=int, help="steps of each training, to shorten a run")
+    parser.add_argument("--stride", type=int, default=1, help="use every n-th frame")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)

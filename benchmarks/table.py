@@ -1,4 +1,4 @@
-"""Tables of figures: markdown for people, CSV for programs, and a plot."""
+"""Tables of figures: Markdown, CSV and a plot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 
 class Row(NamedTuple):
-    """One run: what it is, its seed (None: nothing random) and its figures."""
+    """One run: labels, seed (None: not random) and figures."""
 
     labels: tuple[str, ...]
     seed: int | None
@@ -24,9 +24,18 @@ class Row(NamedTuple):
 
 
 class Table:
-    """Rows of figures, of which those with equal labels are the seeds of one method.
+    """Rows of figures; rows with equal labels are the seeds of one method.
 
-    Markdown and plot show their mean +- half their range; the CSV has a row for each.
+    Markdown and plot show the mean +- half the range of the seeds; the CSV has one row per seed.
+
+    Attributes:
+        name: file name without suffix.
+        title: heading.
+        labels: names of the label columns.
+        figures: names of the figure columns.
+        legend: meaning of labels and figures.
+        draw: draws the plot.
+        rows: the runs.
     """
 
     def __init__(
@@ -38,7 +47,7 @@ class Table:
         legend: Mapping[str, str],
         draw: Callable[[Table, Figure], None],
     ) -> None:
-        """Start empty; `name` is that of its files, `legend` says what labels and figures mean."""
+        """Create an empty table."""
         self.name, self.title, self.legend, self.draw = name, title, legend, draw
         self.labels, self.figures = tuple(labels), tuple(figures)
         self.rows: list[Row] = []
@@ -46,7 +55,11 @@ class Table:
     def add(
         self, labels: Sequence[str], figures: Mapping[str, float], seed: int | None = None
     ) -> None:
-        """Add a run; figures that it has not stay empty. Raises ValueError for unknown ones."""
+        """Add a run; missing figures stay empty.
+
+        Raises:
+            ValueError: unknown figures or a wrong number of labels.
+        """
         if len(labels) != len(self.labels) or not set(figures) <= set(self.figures):
             raise ValueError(
                 f"row {labels} {list(figures)} is none of {self.labels} {self.figures}"
@@ -54,7 +67,7 @@ class Table:
         self.rows.append(Row(tuple(labels), seed, figures))
 
     def values(self) -> dict[tuple[str, ...], dict[str, list[float]]]:
-        """Return labels -> figure -> its values over the seeds, rows in order of appearance."""
+        """Return labels -> figure -> values of the seeds, in order of appearance."""
         merged: dict[tuple[str, ...], dict[str, list[float]]] = {}
         for row in self.rows:
             for name, value in row.figures.items():
@@ -94,7 +107,7 @@ class Table:
 
 
 def _cell(values: Sequence[float]) -> str:
-    """Return the mean of the seeds, with half of their range if there are several."""
+    """Return the mean of the seeds, with half the range if there are several."""
     if not values:
         return ""
     mean = f"{np.mean(values):.2f}"
@@ -102,7 +115,7 @@ def _cell(values: Sequence[float]) -> str:
 
 
 def bars(*names: str) -> Callable[[Table, Figure], None]:
-    """Return a plot of some figures side by side, a group of bars a row."""
+    """Return a function that plots the figures `names` as one group of bars per row."""
 
     def draw(table: Table, figure: Figure) -> None:
         axes = figure.subplots()
@@ -121,7 +134,7 @@ def bars(*names: str) -> Callable[[Table, Figure], None]:
 
 
 def lines(names: Sequence[str], across: str, up: str) -> Callable[[Table, Figure], None]:
-    """Return a plot of figures along the columns `names`, a line a row."""
+    """Return a function that plots the columns `names` as one line per row."""
 
     def draw(table: Table, figure: Figure) -> None:
         axes = figure.subplots()

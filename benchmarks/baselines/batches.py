@@ -1,4 +1,4 @@
-"""The baselines on whole subjects, as the paper ran them: in shuffled batches, errors averaged."""
+"""The baselines on whole subjects, as in the paper: shuffled batches, mean of the errors."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
 
 RANKS = (2, 3, 4, 5, 6, 7, 8)
-"""Ranks K that the baselines may choose from."""
+"""Ranks K to choose from."""
 BASELINES: dict[str, Any] = {
     "rigid factorisation (Tomasi-Kanade)": rigid,
     "Simple (Dai et al.)": block_matrix,
     "EM-SfM (Torresani et al., EM-PPCA)": em_ppca,
 }
 LEGEND = {
-    "Simple, EM-SfM": f"shuffled batches of {BATCH} frames, each with a reflection of its own; "
-    "K is that of the lowest error against the ground truth on the first batch, which favours them",
+    "Simple, EM-SfM": f"shuffled batches of {BATCH} frames, each with its own reflection; "
+    "K has the lowest error against the ground truth on the first batch, which favours them",
 }
 
 
 class Solved(NamedTuple):
-    """A baseline on all frames."""
+    """The result of a baseline on all frames."""
 
     errors: ShapeErrors
-    rank: int  # 0: it has none
+    rank: int  # 0 if the method has no rank
     cpu_seconds: float  # without the search for the rank
 
 

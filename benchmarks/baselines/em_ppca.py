@@ -22,7 +22,7 @@ def em_ppca(W: Floats, K: int, *, iterations: int = 300) -> Floats:
 
     Torresani, Hertzmann and Bregler, "Nonrigid structure-from-motion: estimating shape and
     motion with hierarchical priors", PAMI 2008: EM-PPCA under orthography, without the linear
-    dynamics. Starts from rigid factorisation and the principal modes of what that leaves.
+    dynamics. Starts from rigid factorisation and the principal modes of its residual.
     """
     f, p, _ = W.shape
     Y = W.astype(np.float64).swapaxes(1, 2)
@@ -36,7 +36,7 @@ def em_ppca(W: Floats, K: int, *, iterations: int = 300) -> Floats:
     basis = np.concatenate((mean.T[None], modes))  # (1 + K, 3, p)
     for _ in range(iterations):
         z, zz = _posterior(Y, Q[:, :2], basis, variance)
-        Q = _turn(Y, Q, basis, z, zz)
+        Q = _update_rotations(Y, Q, basis, z, zz)
         basis, variance = _fit_basis(Y, Q[:, :2], z, zz)
     z, _ = _posterior(Y, Q[:, :2], basis, variance)
     S: Floats = np.einsum("fk,kdp->fpd", z, basis)
@@ -56,16 +56,16 @@ def _posterior(Y: Floats, R: Floats, basis: Floats, variance: float) -> tuple[Fl
     return z, zz
 
 
-def _turn(Y: Floats, Q: Floats, basis: Floats, z: Floats, zz: Floats) -> Floats:
+def _update_rotations(Y: Floats, Q: Floats, basis: Floats, z: Floats, zz: Floats) -> Floats:
     """Return rotations Q (f, 3, 3) after one Gauss-Newton step of the expected error.
 
     Q <- exp([w]) Q, with E|y - (x + w cross x)|^2 over the first two rows of x = Q s.
     """
     inner = np.einsum("kdp,lep->kdle", basis, basis)
     second = np.einsum("fkl,kdle->fde", zz, inner)  # E[S S^T]
-    crossed = np.einsum("fap,fk,kdp->fad", Y, z, basis) @ Q.swapaxes(1, 2)  # E[y x^T]
+    cross_moment = np.einsum("fap,fk,kdp->fad", Y, z, basis) @ Q.swapaxes(1, 2)  # E[y x^T]
     B = Q @ second @ Q.swapaxes(1, 2)  # E[x x^T]
-    E = crossed - B[:, :2]  # E[(y - x) x^T]
+    E = cross_moment - B[:, :2]  # E[(y - x) x^T]
     # The first row moves by w_y x_z - w_z x_y, the second by w_z x_x - w_x x_z.
     H = np.empty((len(Y), 3, 3))
     H[:, 0, 0] = H[:, 1, 1] = B[:, 2, 2]
@@ -77,16 +77,16 @@ def _turn(Y: Floats, Q: Floats, basis: Floats, z: Floats, zz: Floats) -> Floats:
     gradient = np.stack((-E[:, 1, 2], E[:, 0, 2], E[:, 1, 0] - E[:, 0, 1]), 1)
     w = np.linalg.solve(H, gradient[..., None])[..., 0]
     w *= np.minimum(1, 0.3 / np.maximum(np.linalg.norm(w, axis=1), 1e-12))[:, None]
-    turned: Floats = _rotation(w) @ Q
-    return turned
+    updated: Floats = _rotation(w) @ Q
+    return updated
 
 
 def _rotation(w: Floats) -> Floats:
     """Return exp([w]) (f, 3, 3) of rotation vectors w (f, 3), by Rodrigues' formula."""
     angle = np.maximum(np.linalg.norm(w, axis=1), 1e-12)[:, None, None]
     X = np.cross(np.eye(3), w[:, None, :] / angle)
-    turn: Floats = np.eye(3) + np.sin(angle) * X + (1 - np.cos(angle)) * X @ X
-    return turn
+    rotation: Floats = np.eye(3) + np.sin(angle) * X + (1 - np.cos(angle)) * X @ X
+    return rotation
 
 
 def _fit_basis(Y: Floats, R: Floats, z: Floats, zz: Floats) -> tuple[Floats, float]:

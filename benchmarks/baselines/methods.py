@@ -1,9 +1,9 @@
 """The classic methods that the paper compares with, written from their papers' equations.
 
 Each takes W (f, p, 2), one orthographic image a frame, centred on its points, and returns
-S (f, p, 3) in one object frame for all frames. Whether depth is mirrored no orthographic image
-tells, so each is up to one reflection of all its frames. Cameras are rotations without a scale.
-None uses the order of the frames.
+S (f, p, 3) in one object frame for all frames. An orthographic image does not determine the
+sign of depth, so the result is up to one reflection of all frames. Cameras are rotations without a
+scale. No method uses the order of the frames.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Floats = NDArray[Any]
 Method = Callable[[Floats], Floats]
 
 BATCH = 500
-"""Frames a run: what the paper gives its baselines, none of which scales to a whole subject."""
+"""Frames per run, as in the paper; no baseline scales to a whole subject."""
 
 
 def in_batches(

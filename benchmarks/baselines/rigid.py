@@ -1,4 +1,4 @@
-"""Rigid factorisation, and what the other factorisations build on."""
+"""Rigid factorisation, and functions shared with the other factorisations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MATLAB files of the classic sequences and of FRGC faces."""
+"""Readers of the MATLAB files of the classic sequences and of FRGC faces."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ from deep_nrsfm_ros.nrsfm.geometry import centre
 
 
 class Sequence(NamedTuple):
-    """A sequence of images with ground truth, both centred."""
+    """A sequence of images with ground truth, both centred.
+
+    Attributes:
+        dataset: images and truth.
+        in_camera_axes: whether the truth is in the axes of each camera, not of a fixed world.
+    """
 
     dataset: Dataset
     in_camera_axes: bool  # of the ground truth: x, y and depth of each frame, not of a fixed world
@@ -25,8 +30,10 @@ class Sequence(NamedTuple):
 def read_sequence(path: Path) -> Sequence:
     """Read W (2f, p) with rows x, y, x, ... and its truth: S (3f, p), or GT.shape3D.
 
-    A file with S has cameras, and its truth is in the axes of the world; GT.shape3D is in those
-    of the camera. Raises ValueError naming the file when they are missing or do not fit.
+    S is in the axes of the world, GT.shape3D in those of the camera.
+
+    Raises:
+        ValueError: arrays are missing or do not fit; the message names the file.
     """
     found = _load(path)
     try:
@@ -45,7 +52,8 @@ def read_sequence(path: Path) -> Sequence:
 def read_category(path: Path) -> NDArray[np.float64]:
     """Return the shapes X (3, p, n) of a category as (n, p, 3).
 
-    Raises ValueError naming the file when it has none.
+    Raises:
+        ValueError: the file has no such array; the message names the file.
     """
     X = _load(path).get("X")
     if X is None or X.ndim != 3 or X.shape[0] != 3:
@@ -54,7 +62,7 @@ def read_category(path: Path) -> NDArray[np.float64]:
 
 
 def observed(W: NDArray[Any], S: NDArray[Any], source: str) -> Dataset:
-    """Return images W (f, p, 2) with their truth S (f, p, 3) as a dataset of nameless points."""
+    """Return images W (f, p, 2) with truth S (f, p, 3) as a dataset of numbered keypoints."""
     layout = KeypointLayout.numbered(W.shape[1])
     points, shapes = (centre(X).astype(np.float32) for X in (W, S))
     return Dataset(points, np.ones(W.shape[:2], bool), layout, source, shapes)
@@ -65,4 +73,4 @@ def _load(path: Path) -> dict[str, Any]:
         with path.open("rb") as file:
             return dict(loadmat(file))
     except (MatReadError, NotImplementedError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is no MATLAB file that can be read: {error}") from error
+        raise ValueError(f"{path} is not a readable MATLAB file: {error}") from error

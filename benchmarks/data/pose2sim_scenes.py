@@ -1,4 +1,4 @@
-"""Pose2Sim's demo session for a benchmark: what four cameras, MediaPipe and the truth say of it."""
+"""Scenes of the pose2sim clip: detections of four cameras, MediaPipe's results and the truth."""
 
 from __future__ import annotations
 
@@ -20,23 +20,28 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 Floats = NDArray[Any]
 
 CACHE = Path(".cache")
-"""Where the demo keeps what it has fetched."""
+"""Download folder of the demo."""
 LIMBS = [MEDIAPIPE33.index(joint) for joint in JOINTS]
 
 
 class PoseDetections(NamedTuple):
-    """What MediaPipe made of the f images of a video; NaN and confidence 0 where nobody was."""
+    """Results of MediaPipe on the f images of a video; NaN and confidence 0 without a person."""
 
     points: Floats  # (f, 33, 2) pixels
     confidence: Floats  # (f, 33)
     world: Floats  # (f, 33, 3) metres, camera axes
-    seconds: Floats  # (f,) that it took
+    seconds: Floats  # (f,) processing time
 
 
 class Scene(NamedTuple):
-    """What one camera saw of one trial.
+    """One trial seen by one camera.
 
-    truth: (f, 12, 3) mm, `JOINTS` in the camera's axes. given: the detections that come with it.
+    Attributes:
+        camera: name of the camera.
+        intrinsics: its intrinsics.
+        truth: (f, 12, 3) mm, `JOINTS` in the camera's axes.
+        mediapipe: results of MediaPipe.
+        detections: the detections that come with the clip, None if there are none.
     """
 
     camera: str
@@ -47,7 +52,7 @@ class Scene(NamedTuple):
 
 
 def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]:
-    """Return the two trials, and the mean pixels by which their truths miss the detections."""
+    """Return the scenes of both trials, and the mean reprojection errors of their truths (px)."""
     wheel = fetch_wheel(CACHE)
     session = read_session(wheel)
     cameras = [view.camera for view in session.views]
@@ -71,9 +76,10 @@ def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]
 
 
 def detect_trial(wheel: Path, trial: str, output: Path) -> dict[str, PoseDetections]:
-    """Return what MediaPipe sees in the videos of a trial; what is in the output is not run again.
+    """Return camera -> results of MediaPipe, from the output folder if they exist.
 
-    Raises ValueError where MediaPipe is wanted and is not installed.
+    Raises:
+        ValueError: MediaPipe is needed and not installed.
     """
     folder = output / "mediapipe-0.10.14" / trial
     found = {}

@@ -1,7 +1,7 @@
-"""An excavator at work, seen by a camera that goes around it: the machine of excavator.yaml.
+"""A synthetic excavator, seen by a camera that moves around it; layout excavator.yaml.
 
-Metres; x to the front of the tracks, y to their left, z up. The upper structure turns on the
-tracks, boom, arm and bucket move in its middle plane.
+Metres; x to the front of the tracks, y left, z up. The upper structure rotates on the tracks; boom,
+arm and bucket move in its middle plane.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ Floats = NDArray[Any]
 RATE = 10.0
 """Frames a second."""
 CAMERA, DISTANCE = Intrinsics((1000.0, 1000.0), (640.0, 360.0)), 25.0
-"""Pixels, and metres to the middle of the machine."""
+"""Intrinsics in pixels, and distance to the middle of the machine in metres."""
 NOISE = 1.0
 """Standard deviation of the keypoints in pixels."""
 _TRACKS = ((1.8, 1.2, 0.5), (1.8, -1.2, 0.5), (-1.8, 1.2, 0.5), (-1.8, -1.2, 0.5))
 _UPPER = ((1.2, 0.9, 2.9), (-0.2, 0.9, 2.9), (-2.2, 1.2, 1.6), (-2.2, -1.2, 1.6), (0.6, 0.0, 1.8))
 _ARM = ((5.0, 20, 65), (2.6, -130, -70), (1.3, -100, -20))
-"""Boom, arm and bucket: length, and lowest and highest angle to the one before in degrees."""
+"""Boom, arm, bucket: length (m), lowest and highest angle to the previous part (degrees)."""
 
 
 class Recording(NamedTuple):
-    """What the camera saw, points (f, 13, 2) in pixels, and truth (f, 13, 3), m in its axes."""
+    """Points (f, 13, 2) in pixels and truth (f, 13, 3) in metres in the camera's axes."""
 
     points: Floats
     truth: Floats
 
 
 def record(frames: int, seed: int) -> Recording:
-    """Return so many frames of random work."""
+    """Return `frames` frames of random motion."""
     rng = np.random.default_rng(seed)
     machine = _machine(frames, rng)
     around, above = _wander(frames, rng, -360, 360, 60), _wander(frames, rng, 10, 45, 30)
@@ -67,7 +67,7 @@ def _machine(frames: int, rng: np.random.Generator) -> Floats:
 def _wander(
     frames: int, rng: np.random.Generator, low: float, high: float, seconds: float
 ) -> Floats:
-    """Return a smooth random walk (f,) from low to high that turns around every few `seconds`."""
+    """Return a smooth random path (f,) between low and high with periods of 1 to 4 `seconds`."""
     periods, phases = seconds * rng.uniform(1, 4, 5), rng.uniform(0, 2 * np.pi, 5)
     times = np.arange(frames)[:, None] / RATE
     waves = np.sin(2 * np.pi * times / periods + phases).mean(1)

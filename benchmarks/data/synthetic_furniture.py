@@ -1,8 +1,7 @@
-"""Furniture with random sizes and proportions: a stand-in for the IKEA data of the paper.
+"""Synthetic furniture with random sizes: a substitute for the IKEA data of the paper.
 
-Real furniture varies in more ways: here a category is what a few random lengths and angles leave
-of it, and with or without arms or footboard. Lengths in metres, angles in radians; x to the right,
-y to the front, z up; left and right alike.
+A category has a few random lengths and angles, and arms or a footboard in half of its objects; real
+furniture varies more. Metres and radians; x right, y front, z up; left and right are symmetric.
 """
 
 from __future__ import annotations

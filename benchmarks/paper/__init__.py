@@ -1,1 +1,1 @@
-"""The paper's tables and what its method depends on."""
+"""The experiments of the paper."""

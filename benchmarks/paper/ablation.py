@@ -1,4 +1,4 @@
-"""Ablation: what each part of the default recipe is worth, in short trainings."""
+"""Ablation: the default recipe with one part changed, in short trainings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS = 10_000
 
 
 class Variant(NamedTuple):
-    """What is changed in the default preset."""
+    """Changes to the default preset: fields of its architecture and of its recipe."""
 
     architecture: dict[str, Any] = {}
     recipe: dict[str, Any] = {}
@@ -38,7 +38,7 @@ _SHOWN = ("shape %", "proper %", "mirrored %")
 
 
 def trained(session: Session, subject: str, dataset: Dataset, name: str, seed: int) -> Model:
-    """Return the model of a variant, trained for a third of the default's steps."""
+    """Return the model of the variant `name`, trained for `STEPS` steps."""
     variant = VARIANTS[name]
     preset = session.preset("default", seed, steps=session.steps or STEPS, **variant.recipe)
     architecture = dataclasses.replace(preset.architecture, **variant.architecture)
@@ -50,7 +50,7 @@ def trained(session: Session, subject: str, dataset: Dataset, name: str, seed: i
 
 
 def benchmark(session: Session) -> Table:
-    """Train every variant on each subject and compare in-sample."""
+    """Train each variant on each subject; return the table of errors on the training frames."""
     table = Table(
         "ablation",
         f"Ablation, {session.steps or STEPS} steps, in-sample",

@@ -1,4 +1,4 @@
-"""Table 6, classic sequences: drink, pickup and a face, as short as the method was not made for."""
+"""Classic sequences: drink, pickup and a face; shorter than the method needs."""
 
 from __future__ import annotations
 
@@ -33,19 +33,18 @@ ERRORS = {
     "e3D": "mean distance of points over the mean standard deviation of the true coordinates "
     "(Akhter et al. 2008, Dai et al. 2014): one rotation or reflection aligns the whole sequence "
     "in the axes of the ground truth, those of the world, or of the camera for face_mocap",
-    "e3D by frame": "the same with a rotation or reflection of its own for each frame, which "
-    "forgives wrong cameras and mirrored frames",
+    "e3D by frame": "the same with one rotation or reflection per frame, which ignores wrong "
+    "cameras and mirrored frames",
 }
 _LEGEND = {
-    "frames": "few: the network sees each thousands of times, nothing keeps it from learning them "
-    "by heart, and its figures are in-sample like those of the others",
-    "K": "of the lowest shape error against the ground truth, which favours the baselines; they "
-    "solve the whole sequence at once",
+    "frames": "few: the network overfits them; all figures are of the training frames",
+    "K": "chosen by the lowest shape error against the ground truth, which favours the baselines; "
+    "they solve the whole sequence at once",
 }
 
 
 def normalised_error(S: Floats, truth: Floats, *, by_frame: bool = False) -> float:
-    """Return the e3D of S (f, p, 3): see `ERRORS`. Sizes stay as they are."""
+    """Return the e3D of S (f, p, 3), see `ERRORS`, without rescaling."""
     S, T = centre(S), centre(truth)
     deviation = T.std(1).mean()
     if not by_frame:
@@ -55,7 +54,7 @@ def normalised_error(S: Floats, truth: Floats, *, by_frame: bool = False) -> flo
 
 
 def in_camera_axes(S: Floats, W: Floats) -> Floats:
-    """Return S (f, p, 3) in the axes of the cameras that explain W (f, p, 2) best."""
+    """Return S (f, p, 3) in the axes of the cameras that fit W (f, p, 2) best."""
     rows = polar((np.linalg.pinv(S) @ W).swapaxes(1, 2))
     turned: Floats = S @ rotation_from_camera(rows.swapaxes(1, 2)).swapaxes(1, 2)
     return turned
@@ -68,7 +67,7 @@ def lift_in_object_axes(model: Model, dataset: Dataset, options: LiftingOptions)
 
 
 def best_rank(name: str, dataset: Dataset) -> tuple[int, Floats]:
-    """Return the rank that suits a baseline best, by the ground truth, and its shapes."""
+    """Return the rank of a baseline with the lowest error against the truth, and its shapes."""
     solved = ((K, BASELINES[name](dataset.points, K)) for K in tqdm(RANKS, name, leave=False))
     return min(solved, key=lambda errors: shape_errors(errors[1], _truth(dataset)).shape)
 
@@ -88,7 +87,7 @@ def reconstructions(
 
 
 def benchmark(session: Session) -> Table:
-    """Train and solve each sequence on its own frames and compare."""
+    """Train and solve each sequence; return the table of errors on its frames."""
     errors = {name: CONVENTIONS[name] for name in _SHOWN}
     table = Table(
         "classic_sequences",

@@ -1,4 +1,4 @@
-"""Table 7, coherence as guide: does a figure that needs no truth tell the error?"""
+"""Label-free model selection: correlation of coherence and other figures with the error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SUBJECTS = ("01", "05", "127")
 GUIDES = ("coherence", "combined", "reprojection_error", "cycle_error")
 PRESETS = ("default", "paper")
 VARIANTS = ("no cycle loss", "no whitening", "no cycle loss, no whitening", "paper's widths")
-"""Models of every quality, from the ablation."""
+"""Variants of the ablation, for models of different quality."""
 LEGEND = {
     "figures": "Spearman's rank correlation of the guide with the error: +1 if the guide falls "
     "exactly when the error falls; the network alone",
@@ -29,8 +29,8 @@ LEGEND = {
     "along": "snapshots at each tenth of one training",
     "across": f"the results of all trainings of a subject: {', '.join(PRESETS)}, and the default "
     f"of {STEPS} steps with {'; '.join(VARIANTS)}",
-    "chosen by": "error of the snapshot (or model) that has the lowest coherence, the lowest "
-    "combined measure, or the lowest error, which takes the truth to know",
+    "chosen by": "error of the snapshot (or model) with the lowest coherence or the lowest "
+    "combined measure; best: with the lowest error, which needs the truth",
     "shape %": CONVENTIONS["shape %"],
     "proper %": CONVENTIONS["proper %"],
 }
@@ -38,18 +38,18 @@ CHOSEN = ("chosen by coherence", "chosen by combined", "best")
 
 
 class Point(NamedTuple):
-    """One model in the scatter: its label-free quality and its errors in %."""
+    """One model in the scatter plot: its label-free quality and its errors in %."""
 
     quality: Mapping[str, float]
     error: Mapping[str, float]
 
 
 def benchmark(session: Session) -> Table:
-    """Correlate errors and guides along trainings and across models."""
+    """Return the table of correlations along trainings and across models."""
     clouds: dict[str, dict[str, list[Point]]] = {}
     table = Table(
         "coherence",
-        "Coherence as guide",
+        "Label-free model selection",
         ("subject", "models", "error"),
         (*GUIDES, *CHOSEN),
         LEGEND,
@@ -75,7 +75,7 @@ def benchmark(session: Session) -> Table:
 
 
 def measure(model: Model, dataset: Dataset, every: int = 10) -> Point:
-    """Return the guides of a model and its errors on each `every`-th frame."""
+    """Return the label-free figures of a model and its errors on every `every`-th frame."""
     step = max(1, min(every, len(dataset) // 100))
     errors = evaluate(model, dataset[slice(None, None, step)], ALONE)
     return Point(model.quality, {"shape %": 100 * errors.shape, "proper %": 100 * errors.proper})
@@ -84,7 +84,7 @@ def measure(model: Model, dataset: Dataset, every: int = 10) -> Point:
 def _correlate(
     table: Table, labels: tuple[str, str], points: Sequence[Point], seed: int | None
 ) -> None:
-    """Add the correlations with both errors, and what each guide would have chosen."""
+    """Add the correlations with both errors, and the error of the model that each chooses."""
     for error in ("shape %", "proper %"):
         errors = [point.error[error] for point in points]
         row = {}
@@ -97,7 +97,7 @@ def _correlate(
 
 
 def scatter(clouds: Mapping[str, Mapping[str, Sequence[Point]]], figure: Figure) -> None:
-    """Draw the error against coherence and against the combined measure, a row a subject."""
+    """Plot the error against coherence and the combined measure, one row per subject."""
     guides = ("coherence", "combined")
     figure.set_size_inches(9, 3.5 * len(clouds))
     axes = figure.subplots(len(clouds), len(guides), squeeze=False)

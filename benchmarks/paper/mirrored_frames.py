@@ -1,4 +1,4 @@
-"""The mirror: frames that come out mirrored in depth, for every seed of the default recipe."""
+"""Share of frames with mirrored depth, for each seed of the default recipe."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SHOWN = ("shape %", "proper %", "mirrored %")
 
 
 def benchmark(session: Session) -> Table:
-    """Train with each seed and count mirrored frames; a row for each, as a mean would hide one."""
+    """Train with each seed; return the table of mirrored frames with one row per seed."""
     table = Table(
         "mirrored_frames",
         "Mirrored frames, seed by seed",

@@ -1,4 +1,4 @@
-"""Table 1, NRSfM on CMU motion capture: the first 80 % of a subject's trials, in-sample."""
+"""Table 1 of the paper, NRSfM on CMU: errors on the training frames, 80 % of the trials."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ OURS: dict[str, tuple[str, dict[str, LiftingOptions]]] = {
     "paper's network, ours": ("paper", {"network alone": ALONE}),
     "default recipe": ("default", LIFTING),
 }
-TIME = {"CPU min": "training (of baselines: solving) on this machine"}
+TIME = {"CPU min": "CPU time of training (of baselines: of solving) on this machine"}
 
 
 def benchmark(session: Session) -> Table:
-    """Train, solve and compare each subject on its own frames."""
+    """Train and solve each subject; return the table of errors on its training frames."""
     printed = f"as printed; the ratio of its cm and % fits skeletons 1 / {HEIGHT_18:.3f} as high"
     table = Table(
         "table1_cmu",

@@ -1,4 +1,4 @@
-"""Table 5, structure from category: many objects of one kind, each rigid, none seen in 3D."""
+"""Table 2 of the paper in spirit, structure from category: many rigid objects of one kind."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors
 
 FACES = "faces"
 OBJECTS, CAMERAS = 400, 5
-"""Objects of a category, and random cameras that see each: 2000 images, as many as in the paper."""
+"""Objects of a category, and random cameras of each object: 2000 images, as in the paper."""
 # Kong and Lucey, "Deep Interpretable Non-Rigid Structure from Motion", arXiv 1902.10840, Table 2.
 PAPER = {
     "Deep NRSfM": {"bed": 0.23, "chair": 1.15, "sofa": 0.35, "table": 0.81},
     "Simple": {"bed": 17.81, "chair": 33.32, "sofa": 14.78, "table": 12.40},
     "SfC": {"bed": 22.51, "chair": 27.58, "sofa": 13.35, "table": 11.78},
 }
-"""Shape errors in % printed for the IKEA data: other objects than ours, so no comparison."""
+"""Shape errors in % printed for the IKEA data: other objects, not comparable."""
 _SHOWN = [name for name in CONVENTIONS if name != "point cm"]
 _LEGEND = {name: CONVENTIONS[name] for name in _SHOWN} | {
     FACES: f"FRGC, one shape a person, {CAMERAS} random cameras each",
@@ -37,9 +37,10 @@ _LEGEND = {name: CONVENTIONS[name] for name in _SHOWN} | {
 
 
 def images(session: Session, category: str) -> Dataset:
-    """Return the images of a category with ground truth, cameras and sizes fixed by their seed.
+    """Return the images of a category with ground truth; cameras and sizes have a fixed seed.
 
-    Raises ValueError that lists the categories if there is none of that name.
+    Raises:
+        ValueError: unknown category; the message lists the categories.
     """
     rng = np.random.default_rng(0)
     if category == FACES:
@@ -55,7 +56,7 @@ def images(session: Session, category: str) -> Dataset:
 
 
 def benchmark(session: Session) -> Table:
-    """Train and solve each category on its own images and compare."""
+    """Train and solve each category; return the table of errors on its images."""
     table = Table(
         "table2_categories",
         "Structure from category, in-sample",

@@ -1,4 +1,4 @@
-"""Table 2, unseen data: a subject's last trials, and subjects never trained on."""
+"""Table 3 of the paper in spirit, unseen data: held-out trials and other subjects."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SIMILARITY = {
 
 
 def benchmark(session: Session) -> Table:
-    """Train on some trials and compare on others."""
+    """Train on some trials; return the table of errors on others."""
     table = Table(
         "table3_unseen",
         "Unseen data",
@@ -67,7 +67,7 @@ def _compare(
     dataset: Dataset,
     tests: dict[str, Dataset],
 ) -> None:
-    """Add a row for each test, seed and way of lifting."""
+    """Add a row for each test, seed and lifting option."""
     for seed in session.seeds:
         title_of_seed = f"{title} default seed {seed}"
         model = session.trained(title_of_seed, dataset, session.preset("default", seed))
@@ -77,7 +77,7 @@ def _compare(
 
 
 def errors(model: Model, test: Dataset, options: LiftingOptions) -> dict[str, float]:
-    """Return the figures of a model on a dataset with ground truth, the paper's metric too."""
+    """Return the errors of a model on a dataset with ground truth, the paper's metric included."""
     if test.shapes is None:
         raise ValueError(f"{test.source} has no ground truth to compare with")
     S = reconstruct(Lifter(model, options), test)

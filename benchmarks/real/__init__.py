@@ -1,1 +1,1 @@
-"""Real detections with measured truth."""
+"""Real detections and recorded bags."""

@@ -1,6 +1,6 @@
-"""Real detections: one person seen by four cameras; ours, MediaPipe's own 3D and the mean shape.
+"""One person seen by four cameras: the lifter, MediaPipe's own 3D and a mean shape.
 
-MediaPipe is wanted here: `make demo-live` installs it. The videos come from PyPI, as the demo's.
+Needs MediaPipe, which `make demo-live` installs, and downloads the pose2sim clip from PyPI.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from deep_nrsfm_ros.nrsfm.metrics import camera_errors, rotation_angles
 Floats = NDArray[Any]
 
 SUBJECTS = ("01", "02", "05", "14", "49", "60", "61", "86", "127")
-"""Those that the model `human` was trained on."""
+"""The subjects that the model `human` was trained on."""
 ON_CLIP, ON_MEDIAPIPE = "ours, clip's 2D", "ours, MediaPipe's 2D"
 WITH_INTRINSICS = ", intrinsics"
 WORLD, MEAN_SHAPE = "MediaPipe 3D", "mean shape"
 FIGURES = {
-    "frames": "with a person found and the truth wholly known; all figures are of these",
+    "frames": "with a detected person and complete truth; all figures are of these frames",
     "PA mm": "mean distance after similarity alignment by a proper rotation, frame by frame",
     "camera mm": "the same after the best scale and shift only: the camera's rotation, known from "
     "the calibration, must be right too",
@@ -48,28 +48,28 @@ FIGURES = {
     "mirrored %": "frames that a reflection would fit better",
     "jitter deg": "angle between the shapes of one frame and the next in the camera's axes, "
     "median; of the standing person alone, where it should be 0",
-    "ms": "median time of a frame from what the system is given, on this machine as busy as it was",
+    "ms": "median time per frame from the input of the system, at the current load of the machine",
 }
 SYSTEMS = (
     *(ON_CLIP, ON_CLIP + WITH_INTRINSICS, ON_MEDIAPIPE, ON_MEDIAPIPE + WITH_INTRINSICS),
     *(WORLD, MEAN_SHAPE),
 )
 LEGEND = {
-    ON_CLIP: "our model `human`, trained on 2D projections of motion capture; given the detections "
-    "that come with the clip (OpenPose BODY_25B, the largest person), frame by frame",
-    ON_MEDIAPIPE: "the same model; given the 2D landmarks that MediaPipe found in the videos, "
-    "which MediaPipe has smoothed over time",
-    WITH_INTRINSICS.strip(", "): "the same, which knows the camera's lens and focal length "
-    "(`camera_info`); MediaPipe cannot be told",
-    WORLD: "world landmarks of MediaPipe Pose 0.10.14, which was trained with 3D labels; given the "
-    "images, in which it finds the person itself; smoothed over time as it comes",
+    ON_CLIP: "our model `human`, trained on 2D projections of motion capture; input: the "
+    "detections of the clip (OpenPose BODY_25B, the largest person), frame by frame",
+    ON_MEDIAPIPE: "the same model; input: the 2D landmarks of MediaPipe in the videos, "
+    "smoothed over time by MediaPipe",
+    WITH_INTRINSICS.strip(", "): "the same with the camera's intrinsics (`camera_info`), "
+    "which MediaPipe does not take",
+    WORLD: "world landmarks of MediaPipe Pose 0.10.14, trained with 3D labels; input: "
+    "the images; smoothed over time by MediaPipe",
     MEAN_SHAPE: "one rigid shape, the mean of the motion capture that `human` was trained on; "
-    "given, in each frame, the rotation and scale that fit the truth best",
+    "with the rotation and scale that fit the truth of each frame best",
 }
 
 
 def benchmark(session: Session) -> Table:
-    """Compare the systems camera by camera, and on the mean of the cameras."""
+    """Return the table of errors of each system for each camera and their mean."""
     balancing, standing, pixels = scenes(session.output)
     lifter = Lifter(load_model(find_model("human", model_folders(session.output / "models"))))
     folder = session.data / "cmu"
@@ -81,13 +81,13 @@ def benchmark(session: Session) -> Table:
     trials = {
         "balancing": "100 frames; the truth is triangulated from the detections that come with the "
         f"clip ({pixels[0]:.1f} px mean reprojection error), refined as in the demo",
-        "standing": "11 frames; the detections that come with them are made up, so the truth is "
-        f"triangulated from MediaPipe's 2D ({pixels[1]:.1f} px) and has its idea of the joints",
+        "standing": "11 frames; the detections that come with the clip are synthetic, so the truth "
+        f"is triangulated from MediaPipe's 2D ({pixels[1]:.1f} px), with its definition of joints",
     }
     scope = {"scope": "one person, one room, one clip: figures of these four views, no more"}
     table = Table(
         "mediapipe_comparison",
-        "Real detections of a person by four cameras, 12 limb joints",
+        "One person seen by four cameras, 12 limb joints",
         ("trial", "system", "camera"),
         tuple(FIGURES),
         {**LEGEND, **trials, **FIGURES, **scope},
@@ -132,7 +132,7 @@ def figures(system: str, scene: Scene, lifter: Lifter, mean: Floats) -> dict[str
 
 
 def scores(shapes: Floats, truth: Floats) -> dict[str, float]:
-    """Return those of the FIGURES that shapes and truth (f, 12, 3) tell."""
+    """Return the errors of shapes (f, 12, 3) against the truth (f, 12, 3)."""
     valid = np.isfinite(shapes).all((1, 2)) & np.isfinite(truth).all((1, 2))
     error = camera_errors(shapes[valid], truth[valid])
     return {
@@ -177,7 +177,7 @@ def jitter(shapes: Floats) -> float:
 
 
 def mean_shape(shapes: Floats) -> Floats:
-    """Return the mean (p, 3) of shapes (f, p, 3) of equal size, each turned onto it."""
+    """Return the mean (p, 3) of shapes (f, p, 3), normalised in size and aligned by rotation."""
     S = centre(shapes.astype(float))
     S /= np.linalg.norm(S, axis=(1, 2), keepdims=True)
     mean: Floats = S[0]

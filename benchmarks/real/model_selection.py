@@ -1,7 +1,7 @@
-"""Where detectors see joints, where motion capture has them, and what models make of both.
+"""Figures for the choice of a model of people, without the pose2sim clip.
 
-Nothing of the pose2sim clip enters here: by these figures the model `human` was chosen, on that
-clip it is tested (`benchmarks.real.mediapipe_comparison`).
+Proportions of detectors' joints and of motion capture, and errors of models on both. The model
+`human` was chosen by them; `benchmarks.real.mediapipe_comparison` tests it on the clip.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ Floats = NDArray[Any]
 HELD_OUT = ("03", "131")
 STRIDE = 20
 VIDEO_STRIDE = 5
-MIN_CONFIDENCE = 0.5  # confidence of the joints that are measured
-MIN_SHOULDER_WIDTH = 0.65  # torso lengths between the shoulders of who faces the camera
+MIN_CONFIDENCE = 0.5  # lowest confidence of measured joints
+MIN_SHOULDER_WIDTH = 0.65  # of a person who faces the camera, in torso lengths
 CAMERA = Intrinsics((1600.0, 1600.0), (960.0, 540.0))
 NOISE = 0.04  # of a frame's size
 MISSING = 0.05  # of the joints
@@ -46,13 +46,14 @@ LEGEND = f"""hips, shoulders: distance of left and right in torso lengths, 90th 
     frames; nose: its height above the neck along the torso, median; CMU: the first trials of the
     nine subjects that `human` was trained on
 residual: of the network on the video's detections, relative, median; no label is needed
-the others: CMU {" and ".join(HELD_OUT)}, whom no model saw, before a perspective camera 3 to 5 m
-    away that looks down by 12 +- 10 degrees and rolls by 8, {NOISE:.0%} noise, {MISSING:.0%} of the
-    joints missing; 12 limb joints, means of the two; errors as in real_detections"""
+the others: CMU {" and ".join(HELD_OUT)}, not used in training, in front of a perspective
+    camera 3 to 5 m away that looks down by 12 +- 10 degrees and rolls by 8, {NOISE:.0%} noise,
+    {MISSING:.0%} of the joints missing; 12 limb joints, means of the two subjects; errors as in
+    mediapipe_comparison"""
 
 
 class Observations(NamedTuple):
-    """What a camera sees of n people."""
+    """Simulated observations of n people."""
 
     points: Floats  # (n, 17, 2) pixels
     confidence: Floats  # (n, 17)
@@ -60,7 +61,7 @@ class Observations(NamedTuple):
 
 
 def proportions(X: Floats) -> dict[str, float]:
-    """Return the proportions of people X (n, 4 or 5, 2 or 3), shoulders, hips and perhaps nose."""
+    """Return the proportions of people X (n, 4 or 5, 2 or 3): shoulders, hips, perhaps nose."""
     left, right, left_hip, right_hip = X.swapaxes(0, 1)[:4]
     neck = (left + right) / 2
     up = neck - (left_hip + right_hip) / 2
@@ -76,7 +77,7 @@ def proportions(X: Floats) -> dict[str, float]:
 
 
 def facing_trunks(clip: Clip) -> Floats:
-    """Return the trunk and nose (n, 5, 2) of who faces the camera."""
+    """Return trunk and nose (n, 5, 2) of the people who face the camera."""
     places = [HUMAN17.index(joint) for joint in _TRUNK]
     X = clip.points[:, places][(clip.confidence[:, places] > MIN_CONFIDENCE).all(1)].astype(float)
     facing_camera = [proportions(person[None])["shoulders"] > MIN_SHOULDER_WIDTH for person in X]
@@ -92,7 +93,7 @@ def read_shapes(paths: Sequence[Path], layout: KeypointLayout) -> Floats:
 
 
 def simulate_camera(shapes: Floats, rng: np.random.Generator) -> Observations:
-    """Return what a camera would see of shapes (n, 17, 3) in metres, y up."""
+    """Return the observations of shapes (n, 17, 3), metres, y up, by a random camera."""
     n = len(shapes)
     roll, tilt = rng.normal(0, 8, n), rng.normal(12, 10, n)
     angles = np.column_stack((roll, tilt, rng.uniform(0, 360, n)))
@@ -109,7 +110,7 @@ def simulate_camera(shapes: Floats, rng: np.random.Generator) -> Observations:
 
 
 def errors(lifter: Lifter, observations: Observations, *, intrinsics: bool) -> dict[str, float]:
-    """Return the errors of a lifter that is told the camera's intrinsics or not."""
+    """Return the errors of a lifter with or without the camera's intrinsics."""
     limbs = [HUMAN17.index(joint) for joint in JOINTS]
 
     def placed(points: Floats, confidence: Floats) -> Lifted:

@@ -1,4 +1,4 @@
-"""What tells good lifted people from bad ones without any truth: which way round, how steady."""
+"""Label-free measures of lifted people: facing, knees, toes, bone lengths, depth."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SIDES = ("left", "right")
 BENT = 20.0
 """Degrees from which a knee counts as bent."""
 FIGURES = {
-    "faces %": "frames with the nose before the plane of neck and hips",
+    "faces %": "frames with the nose in front of the plane of neck and hips",
     "knees %": f"knees bent by {BENT:.0f} degrees or more that bend to the front",
-    "toes %": "feet with the toes before the ankle",
-    "bones %": "how far a bone's share of all bones varies: half of what lies between the 16th and "
-    "the 84th percentile, over the median, mean of the bones",
+    "toes %": "feet with the toes in front of the ankle",
+    "bones %": "spread of a bone's share of the total length: half the distance of the 16th and "
+    "84th percentile over the median, mean of the bones",
     "depth %": "RMS depth over RMS size: 0 is flat",
 }
-"""Only keypoints that were seen count. A mirrored person has 0 % where a real one has 100."""
+"""Only visible keypoints count. A mirrored person has 0 % where a real one has 100 %."""
 _VIEWS = ("camera", "right", "above")
 _COLOURS = {"left": "tab:blue", "right": "tab:red"}
 
@@ -55,7 +55,7 @@ def figures(S: Floats, visible: NDArray[np.bool_]) -> dict[str, float]:
 def draw(
     figure: Figure, dataset: Dataset, lifted: Mapping[str, Floats], frames: Sequence[int]
 ) -> None:
-    """Draw the keypoints of some frames, and below them each method's people from three sides."""
+    """Draw the keypoints of some frames and, below, each method's people from three sides."""
     rows = [("seen", None), *((name, view) for name in lifted for view in _VIEWS)]
     figure.set_size_inches(1.9 * len(frames), 2.2 * len(rows))
     axes = figure.subplots(len(rows), len(frames), squeeze=False)
@@ -90,7 +90,7 @@ def _joint(S: Floats, name: str) -> Floats:
 
 
 def _forward_direction(S: Floats) -> Floats:
-    """Return where people (f, p, 3) face by trunk alone: across the hips' line and the spine."""
+    """Return the facing direction of people (f, p, 3): normal of hip line and spine."""
     left = _joint(S, "left_hip") - _joint(S, "right_hip")
     forward: Floats = np.cross(left, _joint(S, "neck") - _joint(S, "mid_hip"))
     return forward

@@ -1,8 +1,7 @@
-"""From recorded bags to models: a real video, a machine, and CMU 01 through the lifter's service.
+"""Models trained from bags: a real video, an excavator, and CMU 01 through the lifter's service.
 
-Each is written to a bag as a detector would publish it, trained by the program a user runs (or by
-the lifter), and lifted from the bag. What is trained already is not trained again; what was cut off
-goes on.
+Each is written to a bag as a detector would publish it, trained by the program `train` or by the
+lifter, and lifted from the bag. Finished trainings are kept; interrupted ones continue.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import argparse
 import gzip
 import os
-import random
 import shutil
 import subprocess
 import sys
@@ -26,6 +24,7 @@ from tqdm import tqdm
 from benchmarks.baselines.methods import rigid
 from benchmarks.data import synthetic_excavator as excavator
 from benchmarks.real import plausibility
+from benchmarks.speed.timing import random_domain
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, lifter
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate
@@ -53,7 +52,7 @@ VIDEO = "detections/long_video_body25.jsonl.gz"
 VIDEO_RATE, CMU_RATE = 30.0, 120.0
 EXCAVATOR = Path(__file__).parents[2] / "config/layouts/excavator.yaml"
 TRAINING_FRAMES, TEST_FRAMES = 6000, 1500
-"""Frames of the machine to learn from, and of other work to lift."""
+"""Frames of the excavator for training and for the test."""
 STEPS = {"video": 30_000, "layout_loss": 6000, "tuned": 100, "machine": 8000, "mocap": 3000}
 QUALITY = {
     "reprojection": "label-free, from the training's report: error of the network alone",
@@ -69,11 +68,11 @@ NO_CURATION = {
     "train.min_visible": "0",
     "train.keep_best": "false",
 }
-"""Curation and choice of the state off, as they are for motion capture."""
+"""Curation and the choice of the best checkpoint off, as for motion capture."""
 
 
 class Session(NamedTuple):
-    """What the benchmark was asked for."""
+    """The options of the benchmark."""
 
     data: Path
     output: Path
@@ -86,9 +85,9 @@ class Session(NamedTuple):
         return self.output / "models"
 
     def bag(self, name: str, messages: Callable[[], Iterable[Frame]]) -> Path:
-        """Return a bag of the messages, written the first time."""
+        """Return the bag `name`; write the messages if it does not exist."""
         path = self.output / name
-        if not (path / "metadata.yaml").exists():  # comes last
+        if not (path / "metadata.yaml").exists():  # written last
             shutil.rmtree(path, ignore_errors=True)
             path.parent.mkdir(parents=True, exist_ok=True)
             print(f"{write_bag(path, TOPIC, messages())} messages in {path}", flush=True)
@@ -121,11 +120,11 @@ def video(session: Session) -> Table:
     shipped = load_model(find_model("human", model_folders(session.models)))
     models = {
         "this video alone": session.trained("video", "video", *alone),
-        "its layout heeded": session.trained(
+        "this video, losses of the layout": session.trained(
             "video_layout_loss", "layout_loss", *alone, *_LAYOUT_LOSS
         ),
         "the same, longer": session.trained("video_layout_loss", "video", *alone, *_LAYOUT_LOSS),
-        "human, tuned to it": session.trained("tuned", "tuned", *arguments, "--from", "human"),
+        "human, fine-tuned": session.trained("tuned", "tuned", *arguments, "--from", "human"),
         "human": shipped,
     }
     dataset = read_bags([bag], BODY25, HUMAN17, ReadOptions(TOPIC, min_confidence=0.1)).dataset
@@ -141,10 +140,10 @@ def video(session: Session) -> Table:
     legend = {
         "residual %": "relative reprojection error, median of the objects",
         "mirrored to human %": "objects that are more like the mirror image of what the model "
-        "human makes of them, which is no truth either",
-        "human, flat": "the same without its depth, for comparison",
-        "its layout heeded": f"this video alone, with `{' '.join(_LAYOUT_LOSS)}`: its training was "
-        "told what faces, knees, toes and bones measure, so that these say little of it",
+        "human returns for them, which is not the truth either",
+        "human, depth set to 0": "the same without its depth, for comparison",
+        "this video, losses of the layout": f"this video alone, with `{' '.join(_LAYOUT_LOSS)}`; "
+        "its training optimises faces, knees, toes and bones, so their figures say little",
     }
     chosen = np.linspace(0, len(lifted_by_all) - 1, _DRAWN).astype(int).tolist()
     table = Table(
@@ -164,7 +163,7 @@ def video(session: Session) -> Table:
         }
         table.add((name, str(model.provenance["step"])), row | _quality(model))
     flat = plausibility.figures(shapes["human"] * [1, 1, 0], kept.visible)
-    table.add(("human, flat", ""), {name: flat[name] for name in ("bones %", "depth %")})
+    table.add(("human, depth set to 0", ""), {name: flat[name] for name in ("bones %", "depth %")})
     return table
 
 
@@ -181,8 +180,8 @@ def machine(session: Session) -> Table:
     legend = {
         "metres": "mean distance of points, aligned by a proper rotation only: the output is in "
         f"metres, as the layout file gives a length; the machine is about {_size(recordings)}",
-        "camera known": "lifted with the camera's intrinsics, as with camera_info; the model has "
-        "seen the machine without",
+        "with intrinsics": "lifted with the camera's intrinsics, as with camera_info; the "
+        "model was trained without them",
         "rigid": "factorisation (Tomasi-Kanade) of the same frames",
         "proper %, mirrored %": "forgive a mirrored depth of all frames alike; metres do not",
     }
@@ -199,8 +198,8 @@ def machine(session: Session) -> Table:
         confidence = dataset.visible.astype(np.float32)
         truth = centre(recording.truth)
         shapes = {
-            "this machine's model": lift_all(Lifter(model).lift, dataset.points, confidence).shapes,
-            "the same, camera known": _at_place(model, dataset.points, confidence),
+            "trained model": lift_all(Lifter(model).lift, dataset.points, confidence).shapes,
+            "trained model, with intrinsics": _at_place(model, dataset.points, confidence),
         }
         labels = (name, str(len(dataset)))
         for method, S in shapes.items():
@@ -220,10 +219,8 @@ def mocap(session: Session) -> Table:
     arguments = ("--cmu", str(folder), "--subjects", "01", "--object", CMU31.name, *suffix)
     models = {
         "train --cmu": session.trained("direct", "mocap", *arguments),
-        "~/train, as the motion capture is": _trained_by_service(
-            session, "served", bag, NO_CURATION
-        ),
-        "~/train, curated": _trained_by_service(session, "curated", bag, {}),
+        "~/train, without curation": _trained_by_service(session, "served", bag, NO_CURATION),
+        "~/train, with curation": _trained_by_service(session, "curated", bag, {}),
     }
     table = Table(
         "from_mocap",
@@ -333,9 +330,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--stride", type=int, default=1, help="take every n-th CMU frame only")
     args = parser.parse_args(argv)
     session = Session(args.data, args.output, args.steps, args.stride)
-    # A domain of its own, and never beyond this machine.
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(random.randrange(1, 102))
+    os.environ["ROS_DOMAIN_ID"] = str(random_domain())
     try:
         if unknown := set(args.parts) - set(PARTS):
             raise ValueError(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")

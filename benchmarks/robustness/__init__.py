@@ -1,1 +1,1 @@
-"""Noise, missing points, perspective, long runs and damaged data."""
+"""Noise, missing keypoints, perspective, confidence, smoothing, corrupted data, long runs."""

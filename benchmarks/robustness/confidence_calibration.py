@@ -1,4 +1,4 @@
-"""Reliability of the confidence: how often points are near where they are said to be."""
+"""Calibration of the confidence: share of correct points against the published confidence."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_
 Floats = NDArray[Any]
 
 SUBJECTS = ("131", "03")
-"""The first is what the calibration is fitted to, the others rate it; no model saw any of them."""
+"""The calibration is fitted to the first, tested on the others; none was used in training."""
 MODELS = ("human", "cmu31")
 STRIDE = 8
 NOISE = (0.0, 0.02, 0.05, 0.1, 0.2)
@@ -41,8 +41,8 @@ DISTANCE = (5.0, 20.0)
 ASIDE = 15.0
 CACHE = Path(".cache")
 BINS = 10
-_FEWEST = 30  # points that a bin needs to be shown
-_STEPS = 30  # of Newton's method: a few are enough
+_FEWEST = 30  # points in a bin to be shown
+_STEPS = 30  # of Newton's method
 LEGEND = {
     "rated on": f"CMU subjects, each frame seen by a random perspective camera {DISTANCE[0]:g} to "
     f"{DISTANCE[1]:g} RMS radii away and up to {ASIDE:g} degrees beside the optical axis, with a "
@@ -54,7 +54,7 @@ LEGEND = {
     "near %": f"how many are in truth within {CORRECT_DISTANCE:.0%} of the object's size, 2 RMS "
     "radii, of where they should be, in the camera's axes after the best scale",
     "error %": "their mean distance from there, in the object's size",
-    "off %": "over the bins, how far confidence and truth are apart on average",
+    "off %": "mean difference of confidence and share of correct points over the bins",
     "rank points, objects": "Spearman correlation of confidence and error, of single points, and "
     "of objects by the means over their points; -1 would be perfect",
 }
@@ -66,10 +66,10 @@ ALL = "all"
 
 
 class Predictions(NamedTuple):
-    """k points of n objects: what was told of them, and how far off they are."""
+    """Confidence and error of k points of n objects."""
 
     confidence: Floats  # (n, k)
-    error: Floats  # (n, k) in sizes of the object
+    error: Floats  # (n, k) relative to the size of the object
     log_odds_terms: Floats  # (n, k, 5) of which the log odds are a sum, ordered as `Calibration`
 
 
@@ -90,10 +90,10 @@ class EvidenceRecorder(NumpyBackend):
 
 
 class RecordingLifter(Lifter):
-    """A lifter as shipped, with a witness."""
+    """A lifter with default options that records the evidence of its confidence."""
 
     def __init__(self, model: Model) -> None:
-        """Take the model."""
+        """Create the lifter of a model."""
         super().__init__(model)
         self.backend = self.recorder = EvidenceRecorder(self.constants)
 
@@ -104,14 +104,14 @@ class RecordingLifter(Lifter):
 
 
 def benchmark(session: Session) -> Table:
-    """Fit the calibration to the first subject and rate it on the others and on real detections."""
+    """Fit the calibration to the first subject; return its table on the others and on pose2sim."""
     fitted_to, *others = session.subjects
     folders = model_folders(default_models_dir())
     lifters = [RecordingLifter(load_model(find_model(name, folders))) for name in MODELS]
     fitted = fit([on_mocap(session, lifter, fitted_to, 0) for lifter in lifters])
     table = Table(
         "confidence_calibration",
-        "Reliability of the confidence",
+        "Calibration of the confidence",
         ("model", "rated on", "confidence"),
         FIGURES,
         LEGEND
@@ -128,12 +128,12 @@ def benchmark(session: Session) -> Table:
     if wheel.exists():
         _add(table, lifters[0], "pose2sim", on_detections(lifters[0], wheel))
     else:
-        print(f"no {wheel}, so nothing is rated on pose2sim; `make demo` fetches it")
+        print(f"no {wheel}, no rows of pose2sim; `make demo` downloads it")
     return table
 
 
 def on_mocap(session: Session, lifter: RecordingLifter, subject: str, seed: int) -> Predictions:
-    """Lift a subject's frames, seen and spoiled at random, and compare with the truth."""
+    """Lift a subject's frames with random views, noise and gaps; compare with the truth."""
     layout, rng = lifter.model.layout, np.random.default_rng(seed)
     stride = session.stride if session.stride > 1 else STRIDE
     truth = read_split(
@@ -145,7 +145,7 @@ def on_mocap(session: Session, lifter: RecordingLifter, subject: str, seed: int)
 
 
 def project(truth: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
-    """Return shapes (n, p, 3) as random cameras see them: turned; points; confidence, 0 or 1."""
+    """Return shapes (n, p, 3) in the axes of random cameras, points and confidence (0 or 1)."""
     n, p, _ = truth.shape
     T = centre(truth @ rotation_from_camera(random_cameras(n, rng)).swapaxes(1, 2))
     T /= radius(T)[:, None, None]
@@ -197,9 +197,9 @@ def compare(
 
 
 def fit(parts: Sequence[Predictions]) -> Calibration:
-    """Return the calibration under which what happened is likeliest: logistic regression.
+    """Return the calibration with the highest likelihood, by logistic regression.
 
-    Takes points that were surely seen or surely missing: of confidence 1 or 0.
+    Points must have a confidence of 1 or 0.
     """
     X = np.concatenate([part.log_odds_terms.reshape(-1, 5) for part in parts]).astype(float)
     y = np.concatenate([part.error.ravel() < CORRECT_DISTANCE for part in parts])
@@ -239,7 +239,7 @@ def spearman(a: Floats, b: Floats) -> float:
 
 
 def draw(table: Table, figure: Figure) -> None:
-    """Draw what is near, and how large the error is, against the confidence."""
+    """Plot the share of correct points and the mean error against the confidence."""
     figure.set_size_inches(9, 4.5)
     left, right = figure.subplots(1, 2)
     for labels in dict.fromkeys(row.labels[:2] for row in table.rows):

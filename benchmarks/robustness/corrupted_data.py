@@ -1,4 +1,4 @@
-"""Curation: how many of the swaps and jumps put into clean motion capture are found."""
+"""Share of inserted jumps and left-right swaps that curation finds in motion capture."""
 
 from __future__ import annotations
 
@@ -28,20 +28,25 @@ SWAPS = (
     ("knee", "ankle"),
     ("hip", "knee", "ankle"),
 )
-"""Parts that change sides together."""
+"""Body parts that are swapped together."""
 FIGURES = {
-    "clean points %": "hidden without need, in frames that were left alone",
-    "clean frames %": "frames left alone in which a point was hidden",
-    "jumps %": "points thrown off by 0.7 to 3 RMS radii that were hidden",
-    "swaps %": "frames with swapped limbs in which a point was hidden, of those in which the swap "
-    f"moved a point by more than {MIN_SWAP} RMS radii",
-    "swapped points %": "of the points so moved, those that were hidden; the others lost a "
-    "neighbour instead",
+    "clean points %": "keypoints hidden in uncorrupted frames",
+    "clean frames %": "uncorrupted frames with a hidden keypoint",
+    "jumps %": "keypoints displaced by 0.7 to 3 RMS radii that were hidden",
+    "swaps %": "frames with swapped limbs in which a keypoint was hidden, of those in which the "
+    f"swap moved a keypoint by more than {MIN_SWAP} RMS radii",
+    "swapped points %": "swapped keypoints that were hidden; else a neighbour may be hidden",
 }
 
 
 class Corrupted(NamedTuple):
-    """Points (f, p, 2), and by how much, in RMS radii, each was moved (f, p) by which mistake."""
+    """Corrupted keypoints.
+
+    Attributes:
+        points: (f, p, 2).
+        jumps: (f, p) displacement by jumps in RMS radii.
+        swaps: (f, p) displacement by swaps in RMS radii.
+    """
 
     points: NDArray[np.float32]
     jumps: NDArray[np.float64]
@@ -49,10 +54,10 @@ class Corrupted(NamedTuple):
 
 
 def benchmark(session: Session) -> Table:
-    """Spoil each subject's frames and count what is found."""
+    """Corrupt the frames of each subject; return the table of detection rates."""
     table = Table(
         "corrupted_data",
-        "Curation of spoiled frames",
+        "Curation of corrupted frames",
         ("subject",),
         tuple(FIGURES),
         FIGURES,
@@ -67,7 +72,7 @@ def benchmark(session: Session) -> Table:
 
 
 def corrupt(dataset: Dataset, seed: int) -> Corrupted:
-    """Return noisy points of which SHARE of the frames jump or swap, in turn."""
+    """Return noisy keypoints; `CORRUPTED_FRACTION` of the frames have a jump or a swap."""
     rng = np.random.default_rng(seed)
     P = dataset.points.astype(np.float64)
     f, p, _ = P.shape
@@ -87,7 +92,7 @@ def corrupt(dataset: Dataset, seed: int) -> Corrupted:
 
 
 def detection_rates(dataset: Dataset, corrupted: Corrupted) -> dict[str, float]:
-    """Return the FIGURES of curation's default."""
+    """Return the `FIGURES` of curation with its default options."""
     hidden, _ = find_outliers(corrupted.points, dataset.visible, Curation().outlier_threshold)
     jumps, swaps = corrupted.jumps > 0, corrupted.swaps > MIN_SWAP
     clean = ~((corrupted.jumps > 0) | (corrupted.swaps > 0)).any(1)

@@ -1,4 +1,4 @@
-"""Table 4, missing points: some of 31 at random, and whole limbs."""
+"""Error against missing keypoints: some of 31 at random, and whole limbs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from deep_nrsfm_ros.nrsfm.network import reconstruct
 SUBJECTS = ("01",)
 COUNTS = (0, 1, 3, 6, 9)
 TEST_STRIDE = 5
-"""Trained on all frames, tested on every so many-th of them."""
+"""Models are trained on all frames and tested on every n-th."""
 LIMBS = {
     "arm": ("humerus", "radius", "wrist", "hand", "fingers", "thumb"),
     "leg": ("femur", "tibia", "foot", "toes"),
@@ -37,10 +37,10 @@ LEGEND = {
     + " of one side, drawn for each frame",
     "masked": f"default recipe, up to {TRAINED['masked']['mask']:.0%} of the points hidden at each "
     "training step",
-    ZERO_FILL: "missing points are zero in the network's input; the network alone",
-    "expected": "they go where the second moment of the keypoints expects them; the lifted shape "
-    "is corrected by the points that are seen",
-    "refilled": f"they then follow the lifted shape, {LiftingOptions().refill} rounds",
+    ZERO_FILL: "missing keypoints are zero in the network's input; network alone",
+    "expected": "missing keypoints get their conditional mean under the second moment of the "
+    "keypoints; the lifted shape is corrected by the visible ones",
+    "refilled": f"missing keypoints then follow the lifted shape, {LiftingOptions().refill} rounds",
     "figures": f"shape error in % of every {TEST_STRIDE}th frame, over all points: "
     f"{CONVENTIONS['shape %']}",
     "proper": CONVENTIONS["proper %"],
@@ -48,15 +48,15 @@ LEGEND = {
 
 
 def benchmark(session: Session) -> Table:
-    """Hide points of the training frames from trained models."""
+    """Return the table of errors with hidden keypoints of the training frames."""
     columns = [*map(str, COUNTS), *LIMBS]
     table = Table(
         "missing_keypoints",
-        "Missing points",
+        "Missing keypoints",
         ("subject", "trained", "lifting"),
         with_proper(columns),
         LEGEND,
-        lines(columns, "missing points", "shape error %"),
+        lines(columns, "missing keypoints", "shape error %"),
     )
     for subject in session.subjects:
         dataset = session.mocap([subject], "train")
@@ -76,7 +76,7 @@ def benchmark(session: Session) -> Table:
 
 
 def zero_fill_errors(model: Model, tests: Mapping[str, Dataset]) -> dict[str, float]:
-    """Return the errors (%) of the network alone with zeros for what is missing."""
+    """Return the errors in % of the network alone with zeros for missing keypoints."""
     row: dict[str, float] = {}
     for column, test in tests.items():
         encoded = model.normaliser.encode(test.points, test.visible[..., None].astype(np.float32))
@@ -88,7 +88,7 @@ def zero_fill_errors(model: Model, tests: Mapping[str, Dataset]) -> dict[str, fl
 
 
 def hide(dataset: Dataset, column: str, seed: int = 0) -> Dataset:
-    """Return the dataset without so many points a frame, or without a limb of `LIMBS`."""
+    """Return the dataset with hidden keypoints: a number per frame, or a limb of `LIMBS`."""
     rng = np.random.default_rng(seed)
     f, p = dataset.visible.shape
     visible: NDArray[np.bool_] = np.ones((f, p), bool)

@@ -1,4 +1,4 @@
-"""Table 3, noise: keypoints disturbed by 0 to 20 % of their size, trained with and without."""
+"""Error against noise of 0 to 20 % of the frame size, for training with and without noise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIFTING: dict[str, Callable[[float], LiftingOptions]] = {
     "noise known": lambda ratio: LiftingOptions(noise=max(ratio, LiftingOptions().noise)),
 }
 TEST_STRIDE = 5
-"""Trained on all frames, tested on every so many-th of them."""
+"""Models are trained on all frames and tested on every n-th."""
 TRAINED: dict[str, dict[str, float]] = {
     "default": {},
     "augmented by noise": {"noise": max(RATIOS.values())},
@@ -30,18 +30,17 @@ TRAINED: dict[str, dict[str, float]] = {
 LEGEND = {
     "noise": "||noise||_F / ||W||_F of each frame, Gaussian; the truth is without",
     "default": "default recipe, trained on the frames without noise",
-    "augmented by noise": "the same frames, noise up to the highest ratio added to the input at "
-    "each step",
+    "augmented by noise": "the same frames with noise up to the highest ratio added at each step",
     "network alone": LIFTING_LEGEND["network alone"],
     "as shipped": f"corrected for keypoints of {LiftingOptions().noise:.0%} noise",
-    "noise known": "corrected for keypoints as noisy as they are (option `noise`)",
+    "noise known": "corrected with the true noise level (option `noise`)",
     "N %": f"shape error of every {TEST_STRIDE}th frame: {CONVENTIONS['shape %']}",
     "N % proper": CONVENTIONS["proper %"],
 }
 
 
 def add_noise(dataset: Dataset, ratio: float, seed: int = 0) -> Dataset:
-    """Return the dataset with Gaussian noise of `ratio` times the norm of each (centred) frame."""
+    """Return the dataset with Gaussian noise of `ratio` times the norm of each centred frame."""
     if not ratio:
         return dataset
     rng = np.random.default_rng(seed)
@@ -52,7 +51,7 @@ def add_noise(dataset: Dataset, ratio: float, seed: int = 0) -> Dataset:
 
 
 def benchmark(session: Session) -> Table:
-    """Compare models trained with and without noise at every ratio."""
+    """Return the table of errors of models trained with and without noise at each ratio."""
     table = Table(
         "noise",
         "Noise",

@@ -1,4 +1,4 @@
-"""Intrinsics: people before a perspective camera, lifted without and with knowing it."""
+"""People in front of a perspective camera, lifted without and with its intrinsics."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 SUBJECTS = ("03", "131")
 MODEL = "human"
 CAMERA = Intrinsics((1700.0, 1700.0), (540.0, 960.0), (-0.05, 0.14, 0.0006, 0.0007))
-"""Like those of the demo's clip."""
+"""Similar to the cameras of the pose2sim clip."""
 DISTANCE = 3.5
 SPREAD = np.array([0.25, 0.35])
-"""How far from the axis people stand at most, relative to their distance."""
+"""Largest offset of people from the optical axis, relative to their distance."""
 NOISE = 0.02
 FIGURES = {
     "PA mm": "mean distance of the points after the best similarity with a proper rotation",
@@ -38,16 +38,22 @@ FIGURES = {
     "the subject's own",
 }
 LEGEND = {
-    "subject": f"of CMU, all trials, none of them seen in training; random rotations, {DISTANCE} m "
-    f"away, anywhere in the image, {NOISE:.0%} noise",
-    "without": "as shipped, of pixels",
+    "subject": f"of CMU, all trials, none used in training; random rotations and image positions, "
+    f"{DISTANCE} m away, {NOISE:.0%} noise",
+    "without": "as shipped, from pixels",
     "with": "as shipped, with the camera's intrinsics",
     **FIGURES,
 }
 
 
 class Scene(NamedTuple):
-    """People before the camera: shapes (f, p, 3) in its optical frame, m, and what it sees."""
+    """People in front of the camera.
+
+    Attributes:
+        shapes: (f, p, 3) metres in the camera's optical frame.
+        pixels: (f, p, 2) keypoints with noise.
+        reference_length: metres.
+    """
 
     shapes: NDArray[np.float64]
     pixels: NDArray[np.float32]
@@ -55,7 +61,7 @@ class Scene(NamedTuple):
 
 
 def benchmark(session: Session) -> Table:
-    """Lift each subject's frames both ways."""
+    """Return the table of errors of each subject without and with intrinsics."""
     drawn = bars("PA mm", "camera mm")
     table = Table("perspective", "Intrinsics", ("subject", "lifted"), tuple(FIGURES), LEGEND, drawn)
     model = load_model(find_model(MODEL, model_folders(Path("models"))))
@@ -70,7 +76,7 @@ def benchmark(session: Session) -> Table:
 
 
 def random_scene(dataset: Dataset, seed: int) -> Scene:
-    """Turn every frame at random and put it somewhere before the camera."""
+    """Return the frames with random rotations at random places in front of the camera."""
     rng = np.random.default_rng(seed)
     shapes = centre(np.asarray(dataset.shapes, np.float64))
     pair = dataset.layout.reference
@@ -88,7 +94,7 @@ def random_scene(dataset: Dataset, seed: int) -> Scene:
 
 
 def lifting_errors(model: Model, scene: Scene, intrinsics: Intrinsics | None) -> dict[str, float]:
-    """Return the figures of one way of lifting."""
+    """Return the `FIGURES` of lifting with the intrinsics, or without if None."""
     lifter = Lifter(model, LiftingOptions(reference_length=scene.reference_length))
     confidence = np.ones(scene.pixels.shape[:2], np.float32)
     if intrinsics is None:

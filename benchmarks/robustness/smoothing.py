@@ -1,4 +1,4 @@
-"""Steadiness: how much the lifted trembles, and how late it comes, filtered and not."""
+"""Jitter, error and lag of lifted shapes with the temporal filter off and on."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from deep_nrsfm_ros.nrsfm.metrics import procrustes_distances, rotation_angles
 Floats = NDArray[Any]
 
 SUBJECTS = ("03",)
-"""Walks on uneven ground; no model saw them."""
+"""CMU subjects that walk on uneven ground and were not used in training."""
 VIDEO = "detections/long_video_body25.jsonl.gz"
 VIDEO_RATE = 30.0
 MIN_CONFIDENCE = 0.1
@@ -40,11 +40,10 @@ STRIDES = (1, 2, 4)  # every so many of them
 FIGURES = {
     "rotation deg": "rotation of the object from one frame to the next, median",
     "points %": "movement of its points, in the camera's axes, in RMS radii, median over frames",
-    "shake %": "the same of what no steady motion explains: x(t+1) - 2 x(t) + x(t-1)",
+    "acceleration %": "the same of the second difference: x(t+1) - 2 x(t) + x(t-1)",
     "error mm": "mean distance from the truth after the best similarity, 12 limb joints",
     "camera mm": "the same after the best scale and translation: the rotation must fit too",
-    "lag ms": "delay at which it fits what was lifted without a filter best; only where no noise "
-    "hides it",
+    "lag ms": "delay at which the filtered shapes fit the unfiltered ones best; without noise only",
 }
 FILTERS = {"off": SmoothingOptions(), "on": SmoothingOptions(enabled=True)}
 CACHE = Path(".cache")
@@ -52,7 +51,7 @@ _LAGS = np.arange(0, 0.3, 0.001)
 
 
 class Clip(NamedTuple):
-    """Keypoints of one object over time, in the model's layout, and where it was in truth."""
+    """Keypoints of one object over time, in the model's layout, with the truth if known."""
 
     points: Floats  # (f, p, 2)
     confidence: Floats  # (f, p)
@@ -62,13 +61,13 @@ class Clip(NamedTuple):
 
 
 def benchmark(session: Session) -> Table:
-    """Lift each clip, with the filter and without."""
+    """Lift each clip; return the table with the filter off and on."""
     lifter = Lifter(load_model(find_model("human", model_folders(default_models_dir()))))
     table = Table(
-        *("smoothing", "Steadiness of what is lifted", ("clip", "filter")),
+        *("smoothing", "Temporal smoothing", ("clip", "filter")),
         tuple(FIGURES),
         FIGURES,
-        bars("rotation deg", "points %", "shake %"),
+        bars("rotation deg", "points %", "acceleration %"),
     )
     for name, clip in clips(session).items():
         lifted = lift_all(lifter.lift, clip.points, clip.confidence)
@@ -79,7 +78,7 @@ def benchmark(session: Session) -> Table:
 
 
 def clips(session: Session) -> dict[str, Clip]:
-    """Return a held-out subject's motion, at two rates, and what real detections there are."""
+    """Return title -> clip: a held-out subject at several rates, and available real detections."""
     result = {}
     for subject in session.subjects:
         motion = walking_motion(session, subject)
@@ -98,14 +97,14 @@ def clips(session: Session) -> dict[str, Clip]:
             clip = Clip(*to_model(view.points, view.confidence), RATE, view.truth)
             result[f"pose2sim {view.camera.name}, {RATE:.0f} Hz"] = clip
     else:
-        print(f"no {wheel}, so nothing is said of pose2sim; `make demo` fetches it")
+        print(f"no {wheel}, no rows of pose2sim; `make demo` downloads it")
     if video.exists():
         result[f"{VIDEO}, {VIDEO_RATE:.0f} Hz"] = video_clip(video)
     return result
 
 
 def walking_motion(session: Session, subject: str) -> Floats:
-    """Return the first trial of a subject (f, 17, 3) in mm, seen a little from above."""
+    """Return the first trial of a subject (f, 17, 3) in mm, seen from 20 degrees above."""
     folder = session.data / "cmu"
     skeleton = read_asf(folder / subject / f"{subject}.asf")
     S = 1000 * human17(read_amc(trials(folder, subject)[0], skeleton))[:LENGTH]
@@ -115,7 +114,7 @@ def walking_motion(session: Session, subject: str) -> Floats:
 
 
 def simulate_clip(S: Floats, rate: float, noise: float = NOISE) -> Clip:
-    """Return what a detector would see of a motion S (f, 17, 3)."""
+    """Return the simulated detections of a motion S (f, 17, 3)."""
     rng = np.random.default_rng(0)
     size = np.sqrt((S * S).sum(2).mean())
     W = S[..., :2] + noise * size * rng.standard_normal((*S.shape[:2], 2)) / np.sqrt(2)
@@ -140,7 +139,7 @@ def video_clip(video: Path) -> Clip:
 
 
 def smoothed(lifted: Lifted, rate: float, options: SmoothingOptions) -> Lifted:
-    """Return one object's frames (n = f), as a filter answers them one by one."""
+    """Return the frames (n = f) of one object, filtered one by one."""
     smoothed_frames = Smoother(options)
     outputs = [
         smoothed_frames(Lifted(*(part[i : i + 1] for part in lifted)), ("0",), i / rate)[0]
@@ -150,14 +149,14 @@ def smoothed(lifted: Lifted, rate: float, options: SmoothingOptions) -> Lifted:
 
 
 def figures(lifted: Lifted, smoothed_frames: Lifted, clip: Clip) -> dict[str, float]:
-    """Return the `FIGURES` of the answers `steady` of a filter to what was lifted."""
+    """Return the `FIGURES` of the filtered frames of a clip."""
     S, R = smoothed_frames.shapes.astype(float), smoothed_frames.rotations
     S = S / np.sqrt((S * S).sum(2).mean(1))[:, None, None]
     angles = rotation_angles(R[1:] @ R[:-1].swapaxes(1, 2))
     shown: dict[str, float] = {
         "rotation deg": float(np.nanmedian(angles)),
         "points %": 100 * _median_length(np.diff(S, axis=0)),
-        "shake %": 100 * _median_length(np.diff(S, 2, axis=0)),
+        "acceleration %": 100 * _median_length(np.diff(S, 2, axis=0)),
     }
     if not clip.noisy:
         shown["lag ms"] = 1000 * lag(lifted.shapes, smoothed_frames.shapes, clip.rate)
@@ -177,7 +176,7 @@ def errors(shapes: Floats, truth: Floats) -> Mapping[str, float]:
 
 
 def lag(before: Floats, after: Floats, rate: float) -> float:
-    """Return by how many seconds `after` (f, p, 3) comes later than `before`."""
+    """Return the delay in seconds of `after` (f, p, 3) relative to `before` (f, p, 3)."""
     valid = np.isfinite(before).all((1, 2)) & np.isfinite(after).all((1, 2))
     times = np.arange(len(before))[valid] / rate
     a, b = (X[valid].reshape(valid.sum(), -1) for X in (before, after))

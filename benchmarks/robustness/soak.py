@@ -34,24 +34,24 @@ from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
 P = 17
 WINDOW = 10.0
-SETTLED = 3  # windows after which memory shall grow no more
+SETTLED = 3  # windows after which memory must not grow
 RELIABLE = {"reliability": "reliable", "history": "keep_all"}
 COLUMNS = "{:>8} {:>9} {:>7} {:>9} {:>8} {:>8} {:>8} {:>8} {:>8}"
 COUNTERS = ("lifted", "without objects", "rejected", "dropped")
 
 
 def random_views(f: int, rng: np.random.Generator) -> NDArray[np.floating]:
-    """Return (f, 17, 2) pixels of a made-up object that deforms, seen by random cameras."""
+    """Return (f, 17, 2) pixels of a random deforming object, seen by random cameras."""
     shapes = centre(rng.standard_normal((P, 3)) + 0.3 * rng.standard_normal((f, P, 3)))
     pixels: NDArray[np.floating] = 100 * (shapes @ random_cameras(f, rng)) + [320, 240]
     return pixels
 
 
 class SoakClient:
-    """A client that sends at a rate and measures the answers."""
+    """A client that sends messages at a rate and measures the latency of the answers."""
 
     def __init__(self, points: NDArray[np.floating], rate: float) -> None:
-        """Send the views `points` (f, 17, 2), over and over, `rate` a second."""
+        """Prepare to send the views `points` (f, 17, 2) repeatedly, `rate` per second."""
         rclpy.init()
         self._node = rclpy.create_node("soak")
         self._executor = SingleThreadedExecutor()
@@ -78,7 +78,7 @@ class SoakClient:
         return {name: self._reported[name] - self._base[name] for name in COUNTERS}
 
     def send(self, seconds: float) -> NDArray[np.floating]:
-        """Send for so long; return the latencies (k) in ms of what was answered meanwhile."""
+        """Send for `seconds`; return the latencies (k,) in ms of the answers."""
         self._latencies.clear()
         begin, number = time.perf_counter(), 0
         while (now := time.perf_counter()) < begin + seconds:
@@ -101,7 +101,7 @@ class SoakClient:
             if self._spin(lambda: self._last == self._number - 1, 1.0):
                 break
         before = self._reports
-        self._spin(lambda: self._reports >= before + 2, seconds)  # the first may be of earlier
+        self._spin(lambda: self._reports >= before + 2, seconds)  # the first report may be older
         return dict(self._reported)
 
     def call(self, service: str) -> str:
@@ -117,7 +117,7 @@ class SoakClient:
         return str(answer.message)
 
     def close(self) -> None:
-        """Leave the domain."""
+        """Destroy the node."""
         self._executor.shutdown()
         self._node.destroy_node()
         rclpy.shutdown()
@@ -131,14 +131,14 @@ class SoakClient:
         self.sent, self._number = self.sent + 1, self._number + 1
 
     def _spin(self, condition: Callable[[], bool], seconds: float) -> bool:
-        """Spin until the condition holds, or so long; return whether it holds."""
+        """Spin until the condition holds or `seconds` have passed; return whether it holds."""
         end = time.perf_counter() + seconds
         while not condition() and time.perf_counter() < end:
             self._executor.spin_once(timeout_sec=0.1)
         return condition()
 
     def _receive(self, message: PointCloud2) -> None:
-        """Note an answer; what was sent before it and has none will have none."""
+        """Store the latency of an answer; older unanswered messages count as lost."""
         self._last = message.header.stamp.sec
         sent = self._waiting.get(self._last)
         for number in [n for n in self._waiting if n <= self._last]:
@@ -148,14 +148,14 @@ class SoakClient:
             self._latencies.append((time.perf_counter() - sent) * 1e3)
 
     def _store_report(self, message: DiagnosticArray) -> None:
-        """Note what the lifter says of itself."""
+        """Store the counters of a diagnostics report."""
         reported = {pair.key: pair.value for status in message.status for pair in status.values}
         self._reported = {name: int(reported[f"messages {name}"]) for name in COUNTERS}
         self._reports += 1
 
 
 def _message(view: NDArray[np.floating]) -> PointCloud2:
-    """Return keypoints (17, 2) as a message of its own."""
+    """Return keypoints (17, 2) as a PointCloud2."""
     zeros = np.zeros(1, np.float32)
     points = np.concatenate([view, np.zeros((P, 1))], -1)[None].astype(np.float32)
     pixels = Lifted(points, zeros, zeros, zeros, zeros, confidence=np.ones((1, P), np.float32))
@@ -163,7 +163,7 @@ def _message(view: NDArray[np.floating]) -> PointCloud2:
 
 
 def soak(args: argparse.Namespace, folder: Path) -> bool:
-    """Run; return whether every message was counted and memory stayed."""
+    """Run; return whether every message was counted and memory did not grow."""
     rng = np.random.default_rng(0)
     write_bag(folder / "bag", "/keypoints", frames(random_views(500, rng), np.ones((500, P))))
     overrides = RELIABLE if args.reliable else {}
@@ -223,10 +223,10 @@ def soak(args: argparse.Namespace, folder: Path) -> bool:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the soak test on the domain of the environment."""
     parser = argparse.ArgumentParser(prog="soak", description=__doc__)
-    parser.add_argument("--minutes", type=float, default=2.0, help="how long (default: 2)")
-    parser.add_argument("--rate", type=float, default=200.0, help="messages a second")
+    parser.add_argument("--minutes", type=float, default=2.0, help="duration (default: 2)")
+    parser.add_argument("--rate", type=float, default=200.0, help="messages per second")
     parser.add_argument(
-        "--reliable", action="store_true", help="queue what comes while another is lifted"
+        "--reliable", action="store_true", help="queue messages that arrive during a lift"
     )
     parser.add_argument("--growth", type=float, default=5.0, help="MB that memory may grow")
     args = parser.parse_args(argv)

@@ -46,7 +46,7 @@ def test_a_steady_turn_does_not_shake() -> None:
     found = smoothing.figures(lifted, lifted, clip)
     assert found["rotation deg"] == pytest.approx(2, abs=1e-2)
     assert 1 < found["points %"] < 100 * np.radians(2)
-    assert found["shake %"] < 0.2 and found["lag ms"] == 0
+    assert found["acceleration %"] < 0.2 and found["lag ms"] == 0
 
 
 def test_a_delay_is_the_lag() -> None:
