@@ -33,7 +33,7 @@ LIBASAN = $(shell $(SANITIZE_CC) -print-file-name=libasan.so)
 LIBSTDCXX = $(shell $(SANITIZE_CC) -print-file-name=libstdc++.so.6)
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g
 SANITIZE_TESTS := test/kernel test/fuzz/test_kernel.py test/lifting/test_compiled_backend.py \
-    test/messages/test_serialised.py test/training/test_compiled_network.py
+    test/messages/test_serialised.py $(wildcard test/training/test_compiled_*.py)
 SANITIZE_FUZZ ?= 1000
 
 PYTHON := .venv/bin/python
@@ -72,7 +72,7 @@ else
 	rm -rf build/sanitize
 	CC=$(SANITIZE_CC) CFLAGS="$(SANITIZERS)" LDFLAGS="$(SANITIZERS)" DEEP_NRSFM_REQUIRE_KERNEL=1 $(PYTHON) setup.py -q build \
 	    --build-base build/sanitize --build-lib build/sanitize/lib
-	LD_PRELOAD="$(LIBASAN) $(LIBSTDCXX)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONMALLOC=malloc \
+	LD_PRELOAD="$(LIBASAN) $(LIBSTDCXX)" ASAN_OPTIONS=detect_leaks=0:quarantine_size_mb=16 UBSAN_OPTIONS=print_stacktrace=1 PYTHONMALLOC=malloc \
 	    DEEP_NRSFM_REQUIRE_KERNEL=1 FUZZ=$(SANITIZE_FUZZ) $(PYTHON) -m pytest -q --capture sys -p no:cacheprovider \
 	    -o pythonpath="build/sanitize/lib ." --timeout 0 $(SANITIZE_TESTS)
 endif
