@@ -1,7 +1,6 @@
-"""The lifter's sums as one compiled call: `kernel/`, where it was compiled at installation.
+"""The lifter's computation as one call of the compiled kernel, for networks that it supports.
 
-Without it, and for options of the network that the default recipe does not use, `fitting` does the
-same some ten times slower.
+`numpy_backend` computes the same for all networks, some ten times slower; one test compares the two.
 """
 
 from __future__ import annotations
@@ -21,10 +20,17 @@ from deep_nrsfm_ros.nrsfm.network import completion_matrix
 
 
 class CompiledBackend:
-    """A lifter's constants, laid out for the kernel."""
+    """Lifts with the kernel, which holds the lifter's constants in its own layout (a plan)."""
 
     def __init__(self, constants: LifterConstants) -> None:
-        """Take the constants, of a network that the kernel `supports`."""
+        """Lay out the constants.
+
+        Args:
+            constants: of a network that `kernel.supports`.
+
+        Raises:
+            ValueError: A constant is out of the kernel's range.
+        """
         net, p = constants.network, constants.network.p
         options = net.architecture
         covariance = np.eye(3 * p) if constants.covariance is None else constants.covariance
@@ -42,14 +48,14 @@ class CompiledBackend:
         header += [*bones.ends.T.flat]
         floats = [_panels(net.L), _panels(net.L_inverse)]
         for i, (D, b, b_) in enumerate(zip(net.D, net.b, net.b_, strict=True)):
-            # Of shapes, the coordinates stand one after the other, (3, p).
+            # The kernel stores shapes with the keypoints last, (3, p).
             encoder = D if i else _padded(D).reshape(p, -1)
             decoder = D.T if i else _padded(D.transpose(2, 1, 0)).reshape(D.shape[2], -1)
             floats += [_panels(encoder), _padded(b), _panels(decoder), _padded(b_ if i else b_.T)]
         last = options.widths[-1]
         code_head = _padded(net.code_head.reshape(6, last, last).swapaxes(1, 2)).swapaxes(1, 2)
         floats += [_panels(code_head.reshape(-1, last)), net.camera_head, constants.error_std]
-        # Three rows for each point: (p, 3, 3, p), both p filled up.
+        # Three rows for each keypoint: (p, 3, 3, p), both p padded.
         rows = _padded(covariance.reshape(p, 3, p, 3).swapaxes(2, 3), _kernel.DOUBLES)
         rows = _padded(rows.swapaxes(0, 3), _kernel.DOUBLES).swapaxes(0, 3)
         floats += [rows]
@@ -69,33 +75,39 @@ class CompiledBackend:
     def __call__(
         self, points: NDArray[np.float32], confidence: NDArray[np.float32], perspective: bool
     ) -> tuple[tuple[NDArray[np.float32], ...], NDArray[np.bool_]]:
-        """Return the fields of `lifting.Lifted`, and (n,) where there is nothing to lift.
+        """Return the fields of `lifting.Lifted`, and (n,) True for objects that are not lifted.
 
-        Arguments as those of `Lifter.__call__`, their shapes checked.
+        Args:
+            points: (n, p, 2) as in `Lifter.__call__`.
+            confidence: (n, p) in [0, 1], 0 = missing.
+            perspective: as in `Lifter.__call__`.
+
+        Raises:
+            ValueError: The shapes do not fit the model.
         """
         n, p = confidence.shape
         shapes = ((n, p, 3), (n, 3, 3), n, (n, 2), n, (n, p))
         lifted = tuple(np.empty(shape, np.float32) for shape in shapes)
-        lost = np.empty(n, np.bool_)
+        not_lifted = np.empty(n, np.bool_)
         _kernel.lift(
             self._plan,
             np.ascontiguousarray(points, np.float32),
             np.ascontiguousarray(confidence, np.float32),
             perspective,
             *lifted,
-            lost,
+            not_lifted,
         )
-        return lifted, lost
+        return lifted, not_lifted
 
 
 def _padded(A: NDArray[Any], multiple: int | None = None) -> NDArray[Any]:
-    """Return A (..., n) filled up with zeros to n a multiple, by default of FLOATS."""
+    """Return A (..., n) padded with zeros to n a multiple, by default of FLOATS."""
     more = -A.shape[-1] % (multiple or _kernel.FLOATS)
     return np.pad(A, ((0, 0),) * (A.ndim - 1) + ((0, more),))
 
 
 def _panels(A: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return A (k, n) in panels of some columns, (panels, k, columns), as the kernel reads it."""
+    """Return A (k, n) in panels of FLOATS columns, (panels, k, FLOATS), as the kernel reads it."""
     return _padded(A).reshape(len(A), -1, _kernel.FLOATS).swapaxes(0, 1)
 
 
