@@ -203,7 +203,7 @@ def test_an_object_that_is_no_preset_is_trained_anew_from_its_model_and_by_numbe
     refused = client.call("/lifter/train")
     assert not refused.success and "no model 'nobody'; there are" in refused.message
     client.set_parameters(train__from="paw", train__name="tuned")
-    tuned = trained("tuned", mirrored)
+    tuned = trained("tuned", "")  # the start passes its handedness on
     assert tuned.layout == PAW and tuned.provenance["from"]["model"] == "paw"
     assert tuned.network.architecture == paw.network.architecture
 
