@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -55,22 +56,30 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         )
 
 
-@pytest.fixture
-def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """Give the test a DDS domain that no other test on this machine has."""
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROMPT_DISCOVERY))
-    for number in random.sample(range(1, 102), 101):
-        path = Path(tempfile.gettempdir()) / f"ros_domain_{number}_in_test.lock"
-        with path.open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-            yield number
-            return
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """Take a DDS domain that no other test on this machine has, and set it for this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROMPT_DISCOVERY))
+        for number in random.sample(range(1, 102), 101):
+            path = Path(tempfile.gettempdir()) / f"ros_domain_{number}_in_test.lock"
+            with path.open("w") as lock:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    continue
+                patch.setenv("ROS_DOMAIN_ID", str(number))
+                yield number
+                return
     pytest.fail("all DDS domains are taken by other tests")
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """Give the test a DDS domain of its own."""
+    with own_domain() as number:
+        yield number
 
 
 def save_random_model(folder: Path, name: str, layout: KeypointLayout) -> Path:
@@ -82,14 +91,18 @@ def save_random_model(folder: Path, name: str, layout: KeypointLayout) -> Path:
     return path
 
 
-@pytest.fixture
-def models(tmp_path: Path) -> Path:
-    """Return a folder of models: `person` of human17, `joints` of cmu31, a damaged `broken`."""
-    folder = tmp_path / "models"
+def write_models(folder: Path) -> Path:
+    """Write models `person` of human17, `joints` of cmu31 and a damaged `broken` to a folder."""
     save_random_model(folder, "person", HUMAN17)
     save_random_model(folder, "joints", CMU31)
     (folder / "broken.safetensors").write_bytes(b"\x00" * 100)
     return folder
+
+
+@pytest.fixture
+def models(tmp_path: Path) -> Path:
+    """Return a folder of models: `person` of human17, `joints` of cmu31, a damaged `broken`."""
+    return write_models(tmp_path / "models")
 
 
 class LifterProcess:
@@ -144,9 +157,9 @@ StartLifter = Callable[..., LifterProcess]
 """Starts a lifter: start(program, listens, **parameters), see `start_lifter`."""
 
 
-@pytest.fixture
-def start_lifter(domain: int, models: Path, tmp_path: Path) -> Iterator[StartLifter]:
-    """Start a lifter with the model `person` and the parameters given; it must end cleanly."""
+@contextmanager
+def lifters(models: Path, folder: Path) -> Iterator[StartLifter]:
+    """Start lifters with the model `person` and the parameters given; each must end cleanly."""
     started: list[LifterProcess] = []
 
     def start(
@@ -154,9 +167,9 @@ def start_lifter(domain: int, models: Path, tmp_path: Path) -> Iterator[StartLif
         listens: bool = True,
         **parameters: Any,
     ) -> LifterProcess:
-        folders = {"models_dir": str(models), "bags_dir": str(tmp_path)}
+        folders = {"models_dir": str(models), "bags_dir": str(folder)}
         parameters = {"model": "person"} | folders | parameters
-        lifter = LifterProcess([*program], parameters, tmp_path / f"lifter{len(started)}")
+        lifter = LifterProcess([*program], parameters, folder / f"lifter{len(started)}")
         started.append(lifter)
         if listens:
             lifter.wait_for_log("subscribed to")
@@ -170,6 +183,13 @@ def start_lifter(domain: int, models: Path, tmp_path: Path) -> Iterator[StartLif
             finally:
                 lifter.process.kill()
                 lifter.process.wait()
+
+
+@pytest.fixture
+def start_lifter(domain: int, models: Path, tmp_path: Path) -> Iterator[StartLifter]:
+    """Return the function that starts a lifter of the test's own, as `lifters` says."""
+    with lifters(models, tmp_path) as start:
+        yield start
 
 
 class Client:
@@ -192,7 +212,7 @@ class Client:
         for topic, (kind, qos) in self.TOPICS.items():
             self.listen(topic, kind, qos)
         self._parameters = AsyncParameterClient(self.node, "/lifter")
-        self._publishers: dict[str, Any] = {}
+        self._publishers: list[Any] = []
 
     def listen(self, topic: str, kind: Any, qos: Any = 100) -> None:
         self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
@@ -203,8 +223,14 @@ class Client:
     def publisher(self, kind: type, qos: QoSProfile | int = 100, topic: str = "keypoints") -> Any:
         """Return a publisher that the lifter has found."""
         publisher = self.node.create_publisher(kind, topic, qos)
+        self._publishers.append(publisher)
         self.wait(publisher.get_subscription_count, "the lifter to find the publisher")
         return publisher
+
+    def destroy_publishers(self) -> None:
+        """Destroy what `publisher` has returned."""
+        while self._publishers:
+            self.node.destroy_publisher(self._publishers.pop())
 
     def wait(self, condition: Callable[[], Any], what: str, seconds: float = DEADLINE) -> Any:
         """Spin until the condition holds and return its value; fail after so many seconds."""

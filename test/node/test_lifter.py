@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import signal
+import time
 from array import array
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,15 @@ from deep_nrsfm_ros.messages.decoding import (
     POLYGON,
     pack_points,
 )
-from test.node.conftest import Connect, StartLifter
+from test.node.conftest import (
+    Client,
+    Connect,
+    LifterProcess,
+    StartLifter,
+    lifters,
+    own_domain,
+    write_models,
+)
 
 P = len(HUMAN17)
 
@@ -75,6 +85,42 @@ def unpack(message: PointCloud2) -> np.ndarray:
     ]
     assert message.row_step == message.width * message.point_step
     return np.frombuffer(message.data, np.float32).reshape(message.height, message.width, 4)
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LifterProcess, Client]]:
+    """Start a lifter with default parameters and its client, once for all tests of this file."""
+    folder = tmp_path_factory.mktemp("running")
+    with own_domain() as number, lifters(write_models(folder / "models"), folder) as start:
+        lifter, client = start(), Client(number)
+        yield lifter, client
+        client.close()
+
+
+@pytest.fixture
+def client(running: tuple[LifterProcess, Client]) -> Iterator[Client]:
+    """Return a client of the shared lifter. A test that sets parameters sets them back.
+
+    The lifter has answered all messages of the tests before, and the client has heard nothing.
+    """
+    lifter, client = running
+    assert lifter.process.poll() is None, lifter.log
+    publisher, message = client.publisher(PointCloud2), cloud(pixels(1))
+    answers, sent = client.heard["/lifter/points"], [0.0]
+
+    def answered() -> bool:
+        if time.monotonic() - sent[0] > 0.5:  # best effort may lose a message
+            sent[0] = time.monotonic()
+            message.header.stamp.sec += 1
+            publisher.publish(message)
+        return bool(answers) and answers[-1].header.stamp == message.header.stamp
+
+    client.wait(answered, "the answer to the last message")
+    client.destroy_publishers()
+    for heard in client.heard.values():
+        heard.clear()
+    yield client
+    client.destroy_publishers()
 
 
 @pytest.mark.parametrize(
@@ -165,11 +211,7 @@ def test_a_detector_that_sees_nobody_is_no_trouble(
     assert unpack(client.exchange(publisher, cloud(pixels(1)))).shape == (1, P, 4)
 
 
-def test_nothing_but_bad_input_is_an_error_and_silence_a_warning(
-    start_lifter: StartLifter, connect: Connect
-) -> None:
-    start_lifter()
-    client = connect()
+def test_nothing_but_bad_input_is_an_error_and_silence_a_warning(client: Client) -> None:
     publisher = client.publisher(PointCloud2)
     sender = client.node.create_timer(0.1, lambda: publisher.publish(cloud(pixels(1, 5))))
     status = client.wait_for_health(lambda status, _: status.level == b"\x02")
@@ -180,13 +222,10 @@ def test_nothing_but_bad_input_is_an_error_and_silence_a_warning(
     client.exchange(publisher, cloud(pixels(1)))
     sender = client.node.create_timer(0.1, lambda: publisher.publish(cloud(pixels(1))))
     client.wait_for_health(lambda status, v: v["model"] == "person" and float(v["rate [Hz]"]) > 0)
+    client.node.destroy_timer(sender)
 
 
-def test_an_object_with_too_few_keypoints_is_nan_beside_the_others(
-    start_lifter: StartLifter, connect: Connect
-) -> None:
-    start_lifter()
-    client = connect()
+def test_an_object_with_too_few_keypoints_is_nan_beside_the_others(client: Client) -> None:
     confidence = np.ones((2, P))
     confidence[0, 3:] = 0
     publisher = client.publisher(PointCloud2)
@@ -196,9 +235,7 @@ def test_an_object_with_too_few_keypoints_is_nan_beside_the_others(
     assert np.isfinite(xyzc[1]).all() and not points.is_dense
 
 
-def test_markers_come_when_someone_listens(start_lifter: StartLifter, connect: Connect) -> None:
-    start_lifter()
-    client = connect()
+def test_markers_come_when_someone_listens(client: Client) -> None:
     publisher = client.publisher(PointCloud2)
     client.exchange(publisher, cloud(pixels(2)))
     client.listen_to_markers()
@@ -249,10 +286,9 @@ def test_smoothing_follows_slower_and_fills_a_gap(
 
 
 def test_parameters_change_what_the_next_message_gets(
-    start_lifter: StartLifter, connect: Connect
+    running: tuple[LifterProcess, Client], client: Client
 ) -> None:
-    lifter = start_lifter()
-    client = connect()
+    lifter, _ = running
     publisher = client.publisher(PointCloud2)
     human, cmu = cloud(pixels(1)), cloud(pixels(1, 31))
     first = unpack(client.exchange(publisher, human)).copy()
@@ -285,13 +321,10 @@ def test_parameters_change_what_the_next_message_gets(
     assert 0 < certain[toe] < certain[HUMAN17.index("left_hip")]
     assert len(COCO17) == P  # the same number in another order
     assert lifter.process.poll() is None
+    assert client.set_parameters(keypoint_layout="model", reference_length=0.0) == ""
 
 
-def test_a_model_is_changed_and_changed_back_by_one_parameter(
-    start_lifter: StartLifter, connect: Connect
-) -> None:
-    start_lifter()
-    client = connect()
+def test_a_model_is_changed_and_changed_back_by_one_parameter(client: Client) -> None:
     publisher = client.publisher(PointCloud2)
     human, cmu = cloud(pixels(1)), cloud(pixels(1, 31))
     first = unpack(client.exchange(publisher, human)).copy()
@@ -330,9 +363,7 @@ def test_the_detectors_order_may_come_from_a_layout_file(
     np.testing.assert_allclose(own_order, backwards, atol=1e-4)
 
 
-def test_parameters_describe_themselves(start_lifter: StartLifter, connect: Connect) -> None:
-    start_lifter()
-    client = connect()
+def test_parameters_describe_themselves(client: Client) -> None:
     model, share, layout, bags = client.describe_parameters(
         "model", "noise", "keypoint_layout", "train.bags"
     )
