@@ -32,6 +32,7 @@ from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
 _SMALLEST_EXTENT = 1e-4  # of the largest one; a frame of less has no extent
+_ROUNDING = 1e-5  # of the largest coordinate of a frame; an extent of less is that of float32
 
 
 @dataclass(frozen=True)
@@ -286,9 +287,10 @@ def _frames_with_extent(points: NDArray[np.float32], visible: NDArray[np.bool_])
     """
     frames = FrameStore.of(points, visible)
     extent, done = np.zeros(len(frames), np.float32), 0
-    for block in frames.blocks():
-        norms = visible_centre(*block).norm(dim=(-2, -1))
-        extent[done : done + len(norms)] = norms.numpy()
+    for block, mask in frames.blocks():
+        norms = visible_centre(block, mask).norm(dim=(-2, -1))
+        rounding = _ROUNDING * (block * mask).abs().amax(dim=(-2, -1))
+        extent[done : done + len(norms)] = torch.where(norms > rounding, norms, 0.0).numpy()
         done += len(norms)
     usable = torch.from_numpy(extent > _SMALLEST_EXTENT * extent.max(initial=0))
     if not usable.any():
