@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  the usual name
 
 from deep_nrsfm_ros.nrsfm.geometry import polar
+from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.losses import frobenius
 from deep_nrsfm_ros.nrsfm.network import Network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
@@ -60,9 +61,16 @@ class PlainNetwork(nn.Module):
 class PlainTraining:
     """Training by two passes of the network and torch's Adam."""
 
-    def __init__(self, net: Network, points: Tensor, preset: Preset) -> None:
+    def __init__(
+        self,
+        net: Network,
+        points: Tensor,
+        preset: Preset,
+        layout_loss: LayoutLoss | None = None,
+    ) -> None:
         """Prepare to train a `PlainNetwork` of `net` on points (f, p, 2)."""
         self.net, self.points, self.preset = PlainNetwork(net), points, preset
+        self.layout_loss = layout_loss
         self.optimiser = torch.optim.Adam(self.net.parameters(), lr=preset.recipe.learning_rate)
 
     def advance(self) -> None:
@@ -73,7 +81,7 @@ class PlainTraining:
         self.optimiser.step()
 
     def loss(self, points: Tensor) -> Tensor:
-        """Return the loss of points (b, p, 2): reprojection and, if in the recipe, cycle."""
+        """Return the loss of points (b, p, 2): reprojection, and cycle and layout loss if any."""
         W = self._normalised(points)
         S, M = self.net(W)
         residual = W - (S @ M - (S @ M).mean(-2, keepdim=True))
@@ -91,6 +99,8 @@ class PlainTraining:
             T = shapes / unit
             error = again - again.mean(-2, keepdim=True) - T
             loss = loss + self.preset.recipe.cycle * self._relative(error, T)
+        if self.layout_loss:
+            loss = loss + self.layout_loss(S, M)
         return loss
 
     def _normalised(self, points: Tensor) -> Tensor:

@@ -16,7 +16,9 @@ import torch
 from benchmarks.speed.plain_torch import PlainTraining
 from benchmarks.speed.timing import interleaved, print_and_write, speed_parser
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
+from deep_nrsfm_ros.layouts.presets import CMU31
+from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Preset
 from deep_nrsfm_ros.training.distributed import join
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.trainer import Trainer
@@ -30,9 +32,11 @@ LEGEND = {
     "ratio": f"to {PLAIN}: above 1 is faster",
     PLAIN: "one convolution per layer, SVD, autograd, torch.optim.Adam with one tensor per "
     "weight; the cycle loss by a second pass, where ours uses the shapes of the previous batch",
-    "network": "default: the default recipe; paper: its 12 dictionaries and its loss, the same "
-    "batch",
+    "network": "default: the default recipe; default, bones: with bone_length_weight 1; paper: its "
+    "12 dictionaries and its loss, the same batch",
 }
+CASES = {"default": ("default", 0.0), "default, bones": ("default", 1.0), "paper": ("paper", 0.0)}
+"""Preset and bone_length_weight of each case of the table."""
 
 
 def preset(name: str, batch: int) -> Preset:
@@ -47,11 +51,14 @@ def frames(f: int) -> FrameStore:
     return FrameStore.of(points, np.ones((f, P), bool))
 
 
-def contenders(name: str, data: FrameStore) -> tuple[Trainer, PlainTraining]:
-    """Return our trainer and plain torch, with the same weights."""
+def contenders(case: str, data: FrameStore) -> tuple[Trainer, PlainTraining]:
+    """Return our trainer and plain torch, with the same weights and losses."""
+    name, bone_length_weight = CASES[case]
+    weights = LayoutLossWeights(bone_length_weight=bone_length_weight)
+    layout_loss = LayoutLoss(weights, CMU31) if bone_length_weight else None
     chosen = preset(name, BATCH)
-    ours = Trainer(data, chosen, 0)
-    return ours, PlainTraining(ours.net, data.points, chosen)
+    ours = Trainer(data, chosen, 0, layout_loss=layout_loss)
+    return ours, PlainTraining(ours.net, data.points, chosen, layout_loss)
 
 
 def steps(args: Namespace) -> Table:
@@ -66,15 +73,15 @@ def steps(args: Namespace) -> Table:
         bars("ratio"),
     )
     before, data = torch.get_num_threads(), frames(200 if args.quick else 10_000)
-    for name in PRESETS:
+    for case in CASES:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            ours, plain = contenders(name, data)
+            ours, plain = contenders(case, data)
             calls = {PLAIN: plain.advance, OURS: ours.advance}
             rates = {n: BATCH / t.mean() for n, t in interleaved(calls, rounds, seconds).items()}
             for by, rate in rates.items():
                 figures = {"samples/s": float(rate), "ratio": float(rate / rates[PLAIN])}
-                table.add((name, str(threads), by), figures)
+                table.add((case, str(threads), by), figures)
     torch.set_num_threads(before)
     return table
 
@@ -116,16 +123,16 @@ def torchrun_worker(batch: int, seconds: float) -> None:
     """Train as one of the processes started by torchrun; rank 0 prints the samples per second."""
     torch.set_num_threads(1)
     group = join()
-    trainer = Trainer(frames(10_000), preset("default", batch), 0, team=group)
+    trainer = Trainer(frames(10_000), preset("default", batch), 0, group=group)
     (durations,) = interleaved({"": trainer.advance}, 8, 0.0).values()
     # All processes take the number of steps of rank 0, or they would wait for each other.
-    steps = group.tell(max(1, round(seconds / float(np.median(durations)))))
+    steps = group.broadcast(max(1, round(seconds / float(np.median(durations)))))
     began = time.perf_counter()
     for _ in range(steps):
         trainer.advance()
     if not group.rank:
         print(steps * batch / (time.perf_counter() - began))
-    group.leave()
+    group.close()
 
 
 def benchmark(args: Namespace) -> Iterator[Table]:

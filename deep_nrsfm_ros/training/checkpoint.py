@@ -1,4 +1,4 @@
-"""Checkpoints: named tensors in a file that is whole or not there."""
+"""Checkpoints: named tensors in a file that is complete or does not exist."""
 
 from __future__ import annotations
 
@@ -11,16 +11,20 @@ from torch import Tensor
 
 
 def write_checkpoint(path: Path, state: dict[str, Tensor]) -> None:
-    """Write a state whole or not at all; a file that is there is replaced only by a whole one."""
+    """Write a state to a file; a crash leaves the file that was there."""
     partial = path.with_name(f"{path.name}.partial")
     save_file({name: tensor.contiguous().cpu() for name, tensor in state.items()}, partial)
     with partial.open("rb") as file:
-        os.fsync(file.fileno())  # or a power cut may leave the new name on an empty file
+        os.fsync(file.fileno())  # otherwise a power cut may leave an empty file
     partial.replace(path)
 
 
 def read_checkpoint(path: Path) -> dict[str, Tensor]:
-    """Return a saved state; raise ValueError if the file is damaged."""
+    """Return a saved state.
+
+    Raises:
+        ValueError: the file is damaged or missing.
+    """
     try:
         return load_file(path)
     except (OSError, SafetensorError) as error:

@@ -1,9 +1,9 @@
-"""Several processes that train one model, as torchrun starts them; a process alone pays nothing.
+"""Several processes that train one model, as torchrun starts them; one process alone pays nothing.
 
-Each has its shard of the frames and draws its share of every batch from it. Gradients are summed
-after each step, so all processes have the same weights without ever sending them. What one
-decides for all (to stop, that the time is up) is settled every few steps, at the same ones
-everywhere. The first process alone reports and writes files.
+Each process has its shard of the frames and draws its share of every batch from it. Gradients are
+summed after each step, so all processes have the same weights without sending them. Decisions for
+all, to stop or that the time is up, are made every few steps, at the same steps everywhere. Only
+the first process reports and writes files.
 """
 
 from __future__ import annotations
@@ -18,53 +18,60 @@ Value = TypeVar("Value")
 
 
 class ProcessGroup:
-    """The processes of a training; this one is alone, and all its word is the team's."""
+    """The processes of a training; this class is the group of one process.
+
+    Attributes:
+        rank: index of this process, 0 = first.
+        size: number of processes.
+        stop_interval: steps from one `any_stop` to the next.
+    """
 
     rank = 0
     size = 1
-    settle_every = 1  # steps from one `agree` to the next
+    stop_interval = 1
 
-    def share(self, whole: int) -> int:
-        """Return this process's part of `whole`; the parts of all add up to it."""
-        return whole * (self.rank + 1) // self.size - whole * self.rank // self.size
+    def share(self, n: int) -> int:
+        """Return this process's part of n items; the parts of all processes sum to n."""
+        return n * (self.rank + 1) // self.size - n * self.rank // self.size
 
     def shard(self, frames: Tensor) -> Tensor:
-        """Return this process's frames of all: every n-th, so that each sees every recording."""
+        """Return this process's frames: every `size`-th, so that it has some of each recording."""
         return frames if self.size == 1 else frames[self.rank :: self.size].contiguous()
 
-    def total(self, *tensors: Tensor) -> None:
+    def sum_in_place(self, *tensors: Tensor) -> None:
         """Replace each tensor by its sum over the processes."""
 
     def mean(self, values: tuple[float, float]) -> tuple[float, float]:
         """Return the means over the processes."""
         return values
 
-    def agree(self, stop: bool, time_gone: float) -> tuple[bool, float]:
-        """Return whether anybody wants to stop, and the share of the time that is gone."""
-        return stop, time_gone
+    def any_stop(self, stop: bool, time_fraction: float) -> tuple[bool, float]:
+        """Return whether any process wants to stop, and the largest fraction of time elapsed."""
+        return stop, time_fraction
 
-    def tell(self, value: Value) -> Value:
-        """Return what the first process passed."""
+    def broadcast(self, value: Value) -> Value:
+        """Return the value of the first process."""
         return value
 
-    def leave(self) -> None:
-        """End the connection; the process is on its own from here."""
+    def close(self) -> None:
+        """Close the connection to the other processes."""
 
 
 ALONE = ProcessGroup()
 
 
-class _Torchrun(ProcessGroup):
-    """A process of several."""
+class _TorchrunGroup(ProcessGroup):
+    """Several processes that torchrun has started."""
 
-    settle_every = 16  # a stop can wait so long, and messages cost time
+    stop_interval = 16  # each decision costs a message, and a stop may wait for so many steps
 
     def __init__(self) -> None:
         import torch
         import torch.distributed
 
-        # Its functions keep, as their default, the group that there is when they are imported, at
-        # the latest by torch.optim; its threads would outlive `leave`, and may abort the process.
+        # Its functions keep the group that exists when they are imported, at the latest by
+        # torch.optim, as a default argument: imported later, its threads would outlive `close`
+        # and might abort the process.
         import torch.distributed.nn
 
         self._torch, self._group = torch, torch.distributed
@@ -75,7 +82,7 @@ class _Torchrun(ProcessGroup):
         self._group.init_process_group("nccl" if gpu else "gloo")
         self.rank, self.size = self._group.get_rank(), self._group.get_world_size()
 
-    def total(self, *tensors: Tensor) -> None:
+    def sum_in_place(self, *tensors: Tensor) -> None:
         for tensor in tensors:
             self._group.all_reduce(tensor)
 
@@ -83,36 +90,39 @@ class _Torchrun(ProcessGroup):
         first, second = self._reduced(values, self._group.ReduceOp.SUM)
         return first / self.size, second / self.size
 
-    def agree(self, stop: bool, time_gone: float) -> tuple[bool, float]:
-        anyone, latest = self._reduced((float(stop), time_gone), self._group.ReduceOp.MAX)
-        return bool(anyone), latest
+    def any_stop(self, stop: bool, time_fraction: float) -> tuple[bool, float]:
+        any_stop, latest = self._reduced((float(stop), time_fraction), self._group.ReduceOp.MAX)
+        return bool(any_stop), latest
 
-    def tell(self, value: Value) -> Value:
-        held = [value]
-        self._group.broadcast_object_list(held)
-        return held[0]
+    def broadcast(self, value: Value) -> Value:
+        values = [value]
+        self._group.broadcast_object_list(values)
+        return values[0]
 
-    def leave(self) -> None:
+    def close(self) -> None:
         self._group.destroy_process_group()
 
-    def _reduced(self, values: tuple[float, float], how: object) -> list[float]:
+    def _reduced(self, values: tuple[float, float], operation: object) -> list[float]:
         tensor = self._torch.tensor(values, dtype=self._torch.float64, device=self._device)
-        self._group.all_reduce(tensor, how)
+        self._group.all_reduce(tensor, operation)
         return [float(value) for value in tensor]
 
 
 def rank() -> int:
-    """Return which process of a team this will be, before it joins: 0 for the first, or alone."""
+    """Return the rank that this process will have in its group, 0 for the first or only one."""
     return int(os.environ["RANK"]) if _started_by_torchrun() else 0
 
 
 def join() -> ProcessGroup:
-    """Return the team that torchrun has started this process for, or the process alone."""
+    """Return the group that torchrun has started this process for, or the group of one."""
     if _started_by_torchrun() and int(os.environ["WORLD_SIZE"]) > 1:
-        return _Torchrun()
+        return _TorchrunGroup()
     return ALONE
 
 
 def _started_by_torchrun() -> bool:
-    """Tell torchrun from other launchers, whose variables look alike and mean something else."""
+    """Return whether torchrun started this process.
+
+    Other launchers set variables of the same names with another meaning.
+    """
     return "TORCHELASTIC_RUN_ID" in os.environ

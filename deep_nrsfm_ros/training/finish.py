@@ -65,17 +65,17 @@ def _provenance(trainer: Trainer, source: str) -> dict[str, Any]:
     """Return how the model was made, for its file."""
     provenance: dict[str, Any] = {
         "data": source,
-        "frames": trainer.frames_in_all,
+        "frames": trainer.total_frames,
         "recipe": dataclasses.asdict(trainer.preset.recipe),
     }
     if trainer.objective.layout_loss is not None:
         provenance["layout_loss"] = dataclasses.asdict(trainer.objective.layout_loss.weights)
     provenance |= {"seed": trainer.seed, "step": trainer.step}
-    if trainer.kept is not None:
-        provenance["kept_step"] = trainer.kept
+    if trainer.kept_step is not None:
+        provenance["kept_step"] = trainer.kept_step
     provenance["cpu_seconds"] = round(trainer.cpu_seconds, 2)  # of the first process
-    if trainer.team.size > 1:
-        provenance["processes"] = trainer.team.size
+    if trainer.group.size > 1:
+        provenance["processes"] = trainer.group.size
     provenance["versions"] = {"deep_nrsfm_ros": __version__, "torch": torch.__version__}
     return provenance
 

@@ -1,4 +1,4 @@
-"""The frames of a training in memory: all of them once, and copies of a batch at a time."""
+"""The frames of a training in memory, and batches of them."""
 
 from __future__ import annotations
 
@@ -16,41 +16,47 @@ from deep_nrsfm_ros.nrsfm.losses import Batch
 
 @dataclass(frozen=True)
 class FrameStore:
-    """The frames to train on, where and as they were given."""
+    """The frames to train on; they stay in the caller's arrays.
 
-    points: Tensor  # (f, p, 2), anything where not visible
-    visible: Tensor  # (f, p) bool
-    usable: Tensor  # (u,) which to train on
+    Attributes:
+        points: (f, p, 2) keypoints, any value where not visible.
+        visible: (f, p) bool.
+        usable: (u,) indices of the frames to train on.
+    """
+
+    points: Tensor
+    visible: Tensor
+    usable: Tensor
 
     @classmethod
     def of(cls, points: NDArray[np.float32], visible: NDArray[np.bool_]) -> FrameStore:
-        """Return all of points (f, p, 2) with visibility (f, p); they are not copied."""
+        """Return the store of points (f, p, 2) and visibility (f, p), all usable, not copied."""
         W = torch.from_numpy(np.require(points, np.float32, ["C", "W"]))
         mask = torch.from_numpy(np.require(visible, np.bool_, ["C", "W"]))
         return cls(W, mask, torch.arange(len(points)))
 
     def __len__(self) -> int:
-        """Return how many are usable."""
+        """Return the number of usable frames."""
         return len(self.usable)
 
     @property
     def device(self) -> torch.device:
-        """Return where the frames are."""
+        """Return the device of the frames."""
         return self.points.device
 
     def to(self, device: torch.device) -> FrameStore:
-        """Return the pool on a device; another one than its own gets copies of what is usable."""
+        """Return the store on a device; on another one it holds copies of the usable frames."""
         if device == self.device:
             return self
         points, visible = (tensor[self.usable].to(device) for tensor in (self.points, self.visible))
         return FrameStore(points, visible, torch.arange(len(self), device=device))
 
-    def batch(self, which: Tensor | slice) -> Batch:
-        """Return the chosen of the usable frames, 0 where a point is missing."""
-        frames = self.usable[which]
+    def batch(self, indices: Tensor | slice) -> Batch:
+        """Return the usable frames of these indices, with 0 where a point is missing."""
+        frames = self.usable[indices]
         visible = self.visible[frames][..., None]
         return Batch(self.points[frames].where(visible, 0.0), visible.float())
 
-    def blocks(self) -> Iterator[Batch]:
-        """Return all usable frames, some at a time."""
+    def batches(self) -> Iterator[Batch]:
+        """Return all usable frames in batches of `batched.slices`."""
         return map(self.batch, slices(len(self)))

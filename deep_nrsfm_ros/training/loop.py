@@ -134,7 +134,7 @@ def train(
         checkpointing = dataclasses.replace(checkpointing, file=None)
     loop = _Loop(part, preset, setup, callbacks, checkpointing)
     file = checkpointing.file
-    saved = group.tell(read_checkpoint(file) if file is not None and file.exists() else None)
+    saved = group.broadcast(read_checkpoint(file) if file is not None and file.exists() else None)
     if saved is not None:
         loop.restore(saved)
     return loop.train()
@@ -166,7 +166,7 @@ class _Loop:
         self.best = BestCheckpoint(setup.limits, recipe)
         self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
         self.saved = time.monotonic()
-        self.stopped, self.time_gone = False, 0.0
+        self.stopped, self.time_fraction = False, 0.0
         self.iterations = 0  # of this process, over all seeds
 
     def train(self) -> Trainer:
@@ -181,11 +181,11 @@ class _Loop:
                 write_checkpoint(self.checkpointing.file, self.state())
             trainer = self.leader or trainer
         elif self.best.standstill:
-            trainer.ended = "its quality no longer improved"
+            trainer.end_reason = "its quality no longer improved"
         else:
             finished = trainer.step == self.preset.recipe.steps
-            trainer.ended = "all steps were taken" if finished else "its time was up"
-        self.best.put_back(trainer)
+            trainer.end_reason = "all steps were taken" if finished else "its time was up"
+        self.best.restore_best(trainer)
         if not self.group.rank:
             self.callbacks.on_progress(self.clock.progress(trainer))
         return trainer
@@ -225,16 +225,16 @@ class _Loop:
         if chosen:
             self.callbacks.on_step(trainer)
         while trainer.step < steps and not (best and best.standstill):
-            if self.iterations % self.group.settle_every == 0:
-                wishes = self.callbacks.should_stop(), self.clock.gone()
-                self.stopped, self.time_gone = self.group.agree(*wishes)
+            if self.iterations % self.group.stop_interval == 0:
+                wishes = self.callbacks.should_stop(), self.clock.elapsed_fraction()
+                self.stopped, self.time_fraction = self.group.any_stop(*wishes)
             self.iterations += 1
-            trainer.time_gone = self.time_gone
-            if self.stopped or (trainer.step and trainer.time_gone >= time_share):
+            trainer.time_fraction = self.time_fraction
+            if self.stopped or (trainer.step and trainer.time_fraction >= time_share):
                 return
             trainer.advance()
             if best:
-                best.look(trainer)
+                best.update(trainer)
                 self.callbacks.on_step(trainer)
             self._save_if_due()
             if not self.group.rank and self.clock.due():
@@ -263,7 +263,7 @@ class _Loop:
         """Continue from a `state`; raise ValueError if it belongs to another training."""
         self.trainer.restore(tensors)
         self.best.restore(tensors)
-        self.clock.before = float(tensors.get("seconds", 0.0))
+        self.clock.earlier_seconds = float(tensors.get("seconds", 0.0))
         last_seed = self.first_seed + self.preset.recipe.seeds - 1
         if "screening" not in tensors:
             self.screening = False
@@ -287,7 +287,7 @@ def _frames_with_extent(points: NDArray[np.float32], visible: NDArray[np.bool_])
     """
     frames = FrameStore.of(points, visible)
     extent, done = np.zeros(len(frames), np.float32), 0
-    for block, mask in frames.blocks():
+    for block, mask in frames.batches():
         norms = visible_centre(block, mask).norm(dim=(-2, -1))
         rounding = _ROUNDING * (block * mask).abs().amax(dim=(-2, -1))
         extent[done : done + len(norms)] = torch.where(norms > rounding, norms, 0.0).numpy()

@@ -69,7 +69,7 @@ def _train_and_save(
     start = load_model(Path(config.start)) if config.start else None
     _describe(prepared, reporter, starts_anew=start is None)
     trainer = _train(config, prepared, checkpoint, reporter, should_stop)
-    if trainer.team.rank:
+    if trainer.group.rank:
         return
     if not trainer.step:
         checkpoint.unlink(missing_ok=True)
@@ -130,19 +130,19 @@ def _train(
         Callbacks(on_progress=reporter.training, should_stop=should_stop),
         Checkpointing(checkpoint),
     )
-    group.leave()
+    group.close()
     return trainer
 
 
 def _ending(trainer: Trainer, path: Path, model: Model, checkpoint: Path) -> tuple[str, str]:
     """Return the state and the message with which the training ends; remove a used checkpoint."""
-    if not trainer.ended:
+    if not trainer.end_reason:
         message = "cancelled; the model holds what was learned so far"
         return "cancelled", message + (", --resume goes on" if checkpoint.exists() else "")
     checkpoint.unlink(missing_ok=True)
     message, steps = f"{path} {json.dumps(model.quality)}", trainer.preset.recipe.steps
     if trainer.step < steps:
-        message += f"; after {trainer.step} of {steps} steps {trainer.ended}"
+        message += f"; after {trainer.step} of {steps} steps {trainer.end_reason}"
     return "finished", message
 
 

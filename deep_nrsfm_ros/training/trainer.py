@@ -1,4 +1,4 @@
-"""One initialisation in training: what a step does, and what it needs to go on later."""
+"""The training of one initialisation: its steps, its label-free errors and its saved state."""
 
 from __future__ import annotations
 
@@ -27,12 +27,23 @@ from deep_nrsfm_ros.training.gradient_function import (
 
 
 class Trainer:
-    """One initialisation in training: network, optimiser and step, all of it resumable.
+    """One initialisation in training: network, optimiser and step.
 
-    The randomness of a step depends on the seed and the step alone, so a training resumed from a
-    checkpoint goes on exactly as if it had not stopped, on as many threads of such a processor:
-    others add up in another order. In a team it depends on the process too,
-    and all go on with the shapes of the first one's last batch.
+    The random numbers of a step depend on the seed, the step and the process alone, so a resumed
+    training computes the same bits as one that was not stopped, with the same number of threads
+    on the same kind of processor. A resumed group starts from the shapes of the first process's
+    last batch.
+
+    Attributes:
+        net: the network; its learned weights are views of `weights`.
+        weights: (n,) all learned weights.
+        shapes: (b, p, 3) reconstructions of the last batch, for the cycle loss; None at first.
+        step: steps taken.
+        time_fraction: fraction of the time limit that has elapsed, 0 without a limit.
+        kept_step: step of the weights where they are not those of the last step, else None.
+        end_reason: why the training has ended; "" if it was stopped or goes on.
+        total_frames: frames of all processes.
+        cpu_seconds: processor time of this process in steps.
     """
 
     def __init__(
@@ -41,24 +52,30 @@ class Trainer:
         preset: Preset,
         seed: int,
         start: Network | None = None,
-        team: ProcessGroup = ALONE,
+        group: ProcessGroup = ALONE,
         layout_loss: LayoutLoss | None = None,
     ) -> None:
-        """Initialise the network from `seed`, or take that of `start`.
+        """Initialise the network, and whiten it by the frames unless it has a whitening.
 
-        Either is whitened by the frames, unless it has a whitening already. `frames` are those of
-        this process; all processes of a team make their trainers and take their steps together.
+        Args:
+            frames: those of this process.
+            preset: architecture, normaliser and recipe.
+            seed: of the initialisation and of all steps.
+            start: a network to start from instead of a random one.
+            group: the processes that train together; all make their trainers and take their
+                steps at the same time.
+            layout_loss: a loss besides the preset's.
         """
         architecture, normaliser, recipe = preset
         self.frames, self.preset, self.seed, self.step = frames, preset, seed, 0
-        self.team, self.batch = team, team.share(preset.recipe.batch)
+        self.group, self.batch = group, group.share(preset.recipe.batch)
         self.cpu_seconds = 0.0
         count = torch.tensor(len(frames), device=frames.device)
-        team.total(count)
-        self.frames_in_all = int(count)
-        self.time_gone = 0.0  # share of the time there is, if that is limited
-        self.kept: int | None = None  # the step of the weights, where that is not the last one
-        self.ended = ""  # why there is nothing left to be done; "" if it was stopped
+        group.sum_in_place(count)
+        self.total_frames = int(count)
+        self.time_fraction = 0.0
+        self.kept_step: int | None = None
+        self.end_reason = ""
         device = frames.device
         initial = start or initialise(
             architecture,
@@ -67,12 +84,12 @@ class Trainer:
             paper_initialisation=recipe.paper_initialisation,
         )
         if architecture.whitening and np.array_equal(initial.L, np.eye(initial.p)):
-            moment = second_moment(frames, normaliser, team)
+            moment = second_moment(frames, normaliser, group)
             exponent, floor = architecture.whitening, architecture.whitening_floor
             L, L_inverse = whitening(moment, exponent, floor)
             initial = dataclasses.replace(initial, L=L, L_inverse=L_inverse)
         self.initial = initial.map(lambda w: torch.from_numpy(w).to(device))
-        # All weights in one tensor: Adam costs a tenth of a step on one, a fifth on fifty.
+        # One tensor of all weights, since Adam on fifty tensors takes twice as long.
         self.weights = weight_vector(self.initial)
         self.net = with_weights(self.initial, self.weights)
         self.optimiser = Adam(self.weights)
@@ -81,20 +98,25 @@ class Trainer:
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)
-        self.shapes: Tensor | None = None  # of the last batch, for the cycle loss
+        self.shapes: Tensor | None = None
         self.probe = self.sample(1024)
 
     @property
     def progress(self) -> float:
-        """Return how much of the training is over, 0 to 1: of its steps, or of its time."""
-        return max(self.step / self.preset.recipe.steps, min(self.time_gone, 1.0))
+        """Return the fraction of the steps or of the time limit that is over, the larger one."""
+        return max(self.step / self.preset.recipe.steps, min(self.time_fraction, 1.0))
 
     def sample(self, size: int, step: int = -1) -> Batch:
-        """Return the random batch of a step; leaves the generator ready for its cameras."""
-        self.generator.manual_seed((self.seed << 32) + (self.team.rank << 24) + step + 1)
-        pool, generator = self.frames, self.generator
-        return pool.batch(
-            torch.randint(len(pool), (size,), generator=generator, device=pool.device)
+        """Return the random batch of a step, and leave the generator seeded for its cameras.
+
+        Args:
+            size: frames of the batch.
+            step: -1 for frames that no step takes.
+        """
+        self.generator.manual_seed((self.seed << 32) + (self.group.rank << 24) + step + 1)
+        frames, generator = self.frames, self.generator
+        return frames.batch(
+            torch.randint(len(frames), (size,), generator=generator, device=frames.device)
         )
 
     def advance(self) -> None:
@@ -107,19 +129,19 @@ class Trainer:
         batch = self.sample(self.batch, self.step)
         losses, gradient = self.gradient_function(self.weights, batch, self.shapes, self.generator)
         self.shapes = losses.shapes
-        if self.team.size > 1:
+        if self.group.size > 1:
             gradient = gradient * (self.batch / self.preset.recipe.batch)
-            self.team.total(gradient)
-        rate = learning_rate(self.preset.recipe, self.step, self.time_gone)
+            self.group.sum_in_place(gradient)
+        rate = learning_rate(self.preset.recipe, self.step, self.time_fraction)
         self.optimiser.update(gradient, rate)
         self.step += 1
         self.cpu_seconds += time.process_time() - began
 
     @torch.no_grad()
     def measure(self) -> tuple[float, float]:
-        """Return (reprojection error, cycle error) on fixed frames without augmentation.
+        """Return reprojection error and cycle error on 1024 fixed frames of this process.
 
-        The frames are those of this process.
+        Both are relative, 0 being perfect; without augmentation and whitening.
         """
         self.generator.manual_seed(self.seed)
         shapes = self.plain_objective(self.net, self.probe, None, self.generator).shapes
@@ -127,14 +149,14 @@ class Trainer:
         return float(losses.reprojection), float(losses.cycle)
 
     def quality(self) -> float:
-        """Return the label-free quality, less being better: both errors of `measure` combined.
+        """Return the root of the squared sum of both errors of `measure`; less is better.
 
-        The errors are means over the team, so all processes of it ask together.
+        The errors are means over the group, so all its processes call this at the same step.
         """
-        return math.hypot(*self.team.mean(self.measure()))
+        return math.hypot(*self.group.mean(self.measure()))
 
     def state(self) -> dict[str, Tensor]:
-        """Return everything that `restore` needs, as named tensors."""
+        """Return all that `restore` needs, as named tensors."""
         tensors = {name: torch.tensor(getattr(self, name)) for name in _COUNTS}
         tensors |= {"weights": self.weights, "L": self.initial.L}
         if self.shapes is not None:
@@ -143,7 +165,11 @@ class Trainer:
         return tensors | {f"adam.{key}": value for key, value in moments.items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Take over a `state`; raise ValueError if it is not of this architecture."""
+        """Set the trainer to a saved state.
+
+        Raises:
+            ValueError: the state is of another architecture, other data or another start.
+        """
         saved = tensors.get("weights")
         if saved is None or saved.shape != self.weights.shape or not _COUNTS <= tensors.keys():
             raise ValueError("the checkpoint is not of a training of this network; delete it")
@@ -171,29 +197,33 @@ _COUNTS = {"step", "seed", "cpu_seconds"}
 
 
 def second_moment(
-    frames: FrameStore, normaliser: Normaliser, team: ProcessGroup = ALONE
+    frames: FrameStore, normaliser: Normaliser, group: ProcessGroup = ALONE
 ) -> NDArray[np.float64]:
-    """Return E[W W^T] (p, p), each entry over the frames in which both points are visible.
+    """Return E[W W^T] (p, p) of normalised keypoints W, over the frames of all processes.
 
-    The frames are those of all processes.
+    Each entry is the mean over the frames in which both points are visible, 0 if there are none.
     """
-    total = seen = torch.zeros(())
-    for points, mask in frames.blocks():
-        # One product for all frames: one a frame took seven times as long.
+    total = count = torch.zeros(())
+    for points, mask in frames.batches():
+        # One product for all frames is seven times as fast as one for each.
         W = normaliser.encode(points, mask).W.mT.reshape(-1, points.shape[1]).double()
-        there = mask[..., 0].double()
-        total, seen = total + W.T @ W, seen + there.T @ there
-    team.total(total, seen)
-    moment = (total / seen.clamp(min=1)).cpu().numpy()
+        visible = mask[..., 0].double()
+        total, count = total + W.T @ W, count + visible.T @ visible
+    group.sum_in_place(total, count)
+    moment = (total / count.clamp(min=1)).cpu().numpy()
     return np.asarray(moment, np.float64)
 
 
-def learning_rate(recipe: Recipe, step: float, time_gone: float = 0.0) -> float:
-    """Return the learning rate of a step by the recipe's schedule.
+def learning_rate(recipe: Recipe, step: float, time_fraction: float = 0.0) -> float:
+    """Return the learning rate of a step.
 
-    It is at least as far as the share of the time that is gone, so that it ends with the time.
+    Args:
+        recipe: gives the schedule.
+        step: steps taken.
+        time_fraction: elapsed fraction of the time limit; the schedule is at least that far, so
+            that it ends with the time.
     """
-    step = max(step, min(time_gone, 1.0) * recipe.steps)
+    step = max(step, min(time_fraction, 1.0) * recipe.steps)
     if recipe.schedule == "exponential":
         return recipe.learning_rate * float(0.95 ** (step / 10000))
     return recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * step / recipe.steps))

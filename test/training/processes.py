@@ -26,11 +26,11 @@ PRESET = Preset(
 )
 
 
-def first_step(points: torch.Tensor, team: ProcessGroup) -> dict[str, torch.Tensor]:
+def first_step(points: torch.Tensor, group: ProcessGroup) -> dict[str, torch.Tensor]:
     """Return the gradient of one step, what it was asked on, and the whitening."""
     pool = FrameStore.of(points.numpy(), np.ones(points.shape[:2], bool))
-    pool = dataclasses.replace(pool, usable=team.shard(pool.usable))
-    trainer = Trainer(pool, PRESET, 0, team=team)
+    pool = dataclasses.replace(pool, usable=group.shard(pool.usable))
+    trainer = Trainer(pool, PRESET, 0, group=group)
     batch = trainer.sample(trainer.batch, 0).points
     trainer.advance()
     gradient = trainer.weights.grad
@@ -43,31 +43,31 @@ def main(folder: Path) -> None:
     torch.set_num_threads(1)
     points = np.load(folder / "points.npy")
     data = points, np.ones(points.shape[:2], bool), PRESET
-    team = join()
-    found = first_step(torch.from_numpy(points), team)
+    group = join()
+    found = first_step(torch.from_numpy(points), group)
     reports: list[object] = []
     trainer = train(
-        *data, Setup(limits=Limits(), group=team), Callbacks(on_progress=reports.append)
+        *data, Setup(limits=Limits(), group=group), Callbacks(on_progress=reports.append)
     )
-    errors = team.mean(trainer.measure())
+    errors = group.mean(trainer.measure())
     found |= {"weights": trainer.weights, "errors": torch.tensor(errors)}
-    found |= {"reports": torch.tensor(len(reports)), "frames": torch.tensor(trainer.frames_in_all)}
+    found |= {"reports": torch.tensor(len(reports)), "frames": torch.tensor(trainer.total_frames)}
 
     asked = 0
 
     def stop() -> bool:
         nonlocal asked
         asked += 1
-        return rank() == team.size - 1 and asked > 6
+        return rank() == group.size - 1 and asked > 6
 
     file = folder / "checkpoint"
-    stopped = train(*data, Setup(group=team), Callbacks(should_stop=stop), Checkpointing(file))
+    stopped = train(*data, Setup(group=group), Callbacks(should_stop=stop), Checkpointing(file))
     found["stopped"] = torch.tensor(stopped.step)
     first: list[int] = []
     note = Callbacks(on_step=lambda trainer: first.append(trainer.step))
-    train(*data, Setup(group=team), note, Checkpointing(file))
+    train(*data, Setup(group=group), note, Checkpointing(file))
     found |= {"resumed": torch.tensor(first[0]), "resumed_to": torch.tensor(first[-1])}
-    team.leave()
+    group.close()
     names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
     found["threads"] = torch.tensor(sum("gloo" in name for name in names))
     save_file(found, folder / f"{rank()}.safetensors")

@@ -33,7 +33,7 @@ def run(figure: Any, **how: Any) -> Trainer:
 @pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[float]], dict[int, np.ndarray]]:
     """Look every 4 steps and find what the test says; return the weights at each step."""
-    monkeypatch.setattr(best, "interval", lambda recipe: 4)
+    monkeypatch.setattr(best, "steps_between", lambda recipe: 4)
 
     def tell(qualities: list[float]) -> dict[int, np.ndarray]:
         weights: dict[int, np.ndarray] = {}
@@ -52,7 +52,7 @@ def test_the_best_state_is_kept(figure: Any, told: Any) -> None:
     weights = told([5, 4, 3, 9, 6, 5, 4])
     trainer = run(figure, limits=Limits())
     np.testing.assert_array_equal(trainer.weights, weights[12])
-    assert (trainer.step, trainer.kept, trainer.ended) == (40, 12, "all steps were taken")
+    assert (trainer.step, trainer.kept_step, trainer.end_reason) == (40, 12, "all steps were taken")
     assert finish(trainer, "figure", figure.layout, "test").provenance["kept_step"] == 12
 
 
@@ -64,7 +64,7 @@ def test_the_last_state_is_kept(
 ) -> None:
     told(qualities)
     trainer, last = run(figure, limits=limits), run(figure)
-    assert trainer.kept is None
+    assert trainer.kept_step is None
     np.testing.assert_array_equal(trainer.weights, last.weights)
     assert "kept_step" not in finish(trainer, "figure", figure.layout, "test").provenance
 
@@ -72,9 +72,9 @@ def test_the_last_state_is_kept(
 def test_it_ends_when_it_no_longer_improves(figure: Any, told: Any) -> None:
     told([5, 4, 3.99, 3.98, 3.97, 2, 1])
     trainer = run(figure, limits=Limits(patience=0.15))
-    assert (trainer.step, trainer.ended) == (16, "its quality no longer improved")
+    assert (trainer.step, trainer.end_reason) == (16, "its quality no longer improved")
     assert run(figure, limits=Limits(patience=0.5)).step == 40
-    assert run(figure, limits=Limits(patience=0.15, keep_best=False)).kept is None
+    assert run(figure, limits=Limits(patience=0.15, keep_best=False)).kept_step is None
 
 
 def test_what_is_cancelled_keeps_the_best_and_goes_on_from_the_last(
@@ -85,11 +85,11 @@ def test_what_is_cancelled_keeps_the_best_and_goes_on_from_the_last(
     calls = iter(range(10**6))
     how = {"limits": Limits(), "file": tmp_path / "checkpoint"}
     cancelled = run(figure, **how, should_stop=lambda: next(calls) >= 18)
-    assert (cancelled.step, cancelled.kept, cancelled.ended) == (18, 8, "")
+    assert (cancelled.step, cancelled.kept_step, cancelled.end_reason) == (18, 8, "")
     np.testing.assert_array_equal(cancelled.weights, weights[8])
     steps: list[int] = []
     went_on = run(figure, **how, on_step=lambda trainer: steps.append(trainer.step))
-    assert steps == list(range(18, 41)) and went_on.kept == whole.kept == 8
+    assert steps == list(range(18, 41)) and went_on.kept_step == whole.kept_step == 8
     np.testing.assert_array_equal(went_on.weights, whole.weights)
 
 
@@ -102,14 +102,14 @@ def test_the_patience_goes_on_too(figure: Any, told: Any, tmp_path: Path) -> Non
 
 
 def test_looking_does_not_change_the_training(figure: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(best, "interval", lambda recipe: 3)
+    monkeypatch.setattr(best, "steps_between", lambda recipe: 3)
     last = run(figure, limits=Limits(keep_best=False, patience=1.0))
     np.testing.assert_array_equal(last.weights, run(figure).weights)
 
 
 @pytest.mark.parametrize("recipe", [preset.recipe for preset in PRESETS.values()])
 def test_looks_are_few(recipe: Recipe) -> None:
-    assert recipe.steps / best.interval(recipe) <= 50
+    assert recipe.steps / best.steps_between(recipe) <= 50
     short = dataclasses.replace(recipe, steps=100)
-    assert best.interval(short) > 100
-    assert best.interval(dataclasses.replace(short, batch=65536)) == 2
+    assert best.steps_between(short) > 100
+    assert best.steps_between(dataclasses.replace(short, batch=65536)) == 2

@@ -77,8 +77,9 @@ def test_two_processes_agree_with_one(figure: Any, found: list[dict[str, torch.T
     first, second = found
     torch.testing.assert_close(first["weights"], second["weights"], rtol=0, atol=0)
     np.testing.assert_allclose(first["errors"], alone.measure(), rtol=TOLERANCE)
-    counts = (first["frames"], first["reports"], second["reports"])
-    assert tuple(map(int, counts)) == (len(visible), 1, 0)
+    assert int(first["frames"]) == len(visible)
+    # At least the last report: a slow machine has one every five seconds besides.
+    assert int(first["reports"]) >= 1 and int(second["reports"]) == 0
 
 
 def test_all_stop_when_one_wants_to_and_all_go_on(found: list[dict[str, torch.Tensor]]) -> None:
@@ -99,17 +100,17 @@ def test_shares_add_up() -> None:
         def __init__(self, rank: int, size: int) -> None:
             self.rank, self.size = rank, size
 
-    teams = [Part(i, 3) for i in range(3)]
+    groups = [Part(i, 3) for i in range(3)]
     for batch in (3, 64, 65):
-        assert sum(team.share(batch) for team in teams) == batch
+        assert sum(group.share(batch) for group in groups) == batch
     frames = torch.arange(10)
-    assert sorted(torch.cat([team.shard(frames) for team in teams]).tolist()) == list(range(10))
+    assert sorted(torch.cat([group.shard(frames) for group in groups]).tolist()) == list(range(10))
     with pytest.raises(ValueError, match="3 processes are more than"):
         train(
             np.eye(4, 2, dtype=np.float32)[None],
             np.ones((1, 4), bool),
             PRESET,
-            Setup(group=teams[0]),
+            Setup(group=groups[0]),
         )
 
 

@@ -53,7 +53,7 @@ def test_blocks_are_all_usable_frames_once(
     pool: FrameStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pools, "slices", partial(slices, size=10))
-    parts = list(pool.blocks())
+    parts = list(pool.batches())
     assert [len(part.points) for part in parts] == [10, 10, 5]
     whole = pool.batch(slice(None))
     assert torch.equal(torch.cat([part.points for part in parts]), whole.points)

@@ -156,11 +156,11 @@ def test_a_stopped_screening_keeps_the_best_so_far_and_goes_on(
 ) -> None:
     preset, file = small(**SCREENED, seed=7), tmp_path / "checkpoint"
     stopped = run(figure, preset, file=file, should_stop=stop_after(stops))
-    assert stopped.step == (stops if stops < 4 else 4) and not stopped.ended
+    assert stopped.step == (stops if stops < 4 else 4) and not stopped.end_reason
     assert stopped.seed in range(21, 21 + max(stops // 4, 1))
     went_on = run(figure, preset, file=file)
     assert_same(went_on, run(figure, preset))
-    assert went_on.ended
+    assert went_on.end_reason
 
 
 def test_a_crash_in_the_screening_loses_one_interval(figure: Any, tmp_path: Path) -> None:
@@ -321,7 +321,7 @@ def second_a_step(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 def test_the_learning_rate_ends_with_the_time(figure: Any, second_a_step: list[float]) -> None:
     reports: list[Progress] = []
     trainer = run(figure, small(steps=1000), limits=Limits(minutes=0.5), on_progress=reports.append)
-    assert (trainer.step, trainer.ended) == (30, "its time was up")
+    assert (trainer.step, trainer.end_reason) == (30, "its time was up")
     cosine = Recipe(steps=30, learning_rate=SMALL.recipe.learning_rate)
     assert second_a_step == pytest.approx([learning_rate(cosine, step) for step in range(30)])
     assert reports[1].seconds_left == 20 and reports[-1].seconds_left == 0
@@ -329,7 +329,7 @@ def test_the_learning_rate_ends_with_the_time(figure: Any, second_a_step: list[f
 
 def test_steps_may_end_before_the_time(figure: Any, second_a_step: list[float]) -> None:
     trainer = run(figure, limits=Limits(minutes=0.5))
-    assert (trainer.step, trainer.ended) == (12, "all steps were taken")
+    assert (trainer.step, trainer.end_reason) == (12, "all steps were taken")
     assert second_a_step == pytest.approx([learning_rate(SMALL.recipe, i) for i in range(12)])
 
 

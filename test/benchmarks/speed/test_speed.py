@@ -163,7 +163,7 @@ def test_shares_are_of_the_sum() -> None:
 @pytest.mark.usefixtures("few")
 def test_training_speed_compares_with_plain_torch(tmp_path: Path) -> None:
     found = rows(training_speed, tmp_path)
-    assert len(found) == 2 * 2 * len(PRESETS)
+    assert len(found) == 2 * 2 * len(training_speed.CASES)
     for plain, ours in zip(found[::2], found[1::2], strict=True):
         assert (plain["by"], ours["by"]) == (training_speed.PLAIN, training_speed.OURS)
         ratio = float(ours["samples/s"]) / float(plain["samples/s"])
