@@ -72,7 +72,7 @@ else
 	rm -rf build/sanitize
 	CC=$(SANITIZE_CC) CFLAGS="$(SANITIZERS)" LDFLAGS="$(SANITIZERS)" DEEP_NRSFM_REQUIRE_KERNEL=1 $(PYTHON) setup.py -q build \
 	    --build-base build/sanitize --build-lib build/sanitize/lib
-	LD_PRELOAD="$(LIBASAN) $(LIBSTDCXX)" ASAN_OPTIONS=detect_leaks=0:quarantine_size_mb=16 UBSAN_OPTIONS=print_stacktrace=1 PYTHONMALLOC=malloc \
+	LD_PRELOAD="$(LIBASAN) $(LIBSTDCXX)" ASAN_OPTIONS=detect_leaks=0:quarantine_size_mb=16:allocator_may_return_null=1 UBSAN_OPTIONS=print_stacktrace=1 PYTHONMALLOC=malloc \
 	    DEEP_NRSFM_REQUIRE_KERNEL=1 FUZZ=$(SANITIZE_FUZZ) $(PYTHON) -m pytest -q --capture sys -p no:cacheprovider \
 	    -o pythonpath="build/sanitize/lib ." --timeout 0 $(SANITIZE_TESTS)
 endif

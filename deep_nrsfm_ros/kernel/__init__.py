@@ -38,7 +38,7 @@ def supports(network: Network) -> bool:
     return (
         AVAILABLE
         and architecture.is_default_variant
-        and len(architecture.widths) <= _kernel.MOST_LAYERS
+        and len(architecture.widths) <= _kernel.MAX_LAYERS
         and max(architecture.widths) <= _kernel.MAX_WIDTH
         and network.p <= _kernel.MAX_KEYPOINTS
     )

@@ -2,7 +2,7 @@ from typing import Any
 
 FLOATS: int  # columns of a panel
 DOUBLES: int  # to a multiple of which rows of doubles are filled up
-MOST_LAYERS: int  # of a network
+MAX_LAYERS: int  # of a network
 MAX_KEYPOINTS: int  # of a network
 MAX_WIDTH: int  # of a dictionary of a network, in atoms
 

@@ -5,7 +5,7 @@
 #include <stddef.h>
 
 /* Limits of a network: products of these numbers that are computed as `int` cannot overflow. */
-#define MOST_LAYERS 64
+#define MAX_LAYERS 64
 #define MAX_KEYPOINTS 4096
 #define MAX_WIDTH 65536 /* atoms of a dictionary */
 

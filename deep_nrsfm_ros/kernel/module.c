@@ -161,7 +161,7 @@ static PyObject *choose(PyObject *Py_UNUSED(module), PyObject *bytes) {
 static int module_exec(PyObject *module) {
     choose_vectors(64);
     return PyModule_AddIntMacro(module, FLOATS) || PyModule_AddIntMacro(module, DOUBLES) ||
-                   PyModule_AddIntMacro(module, MOST_LAYERS) || PyModule_AddIntMacro(module, MAX_KEYPOINTS) ||
+                   PyModule_AddIntMacro(module, MAX_LAYERS) || PyModule_AddIntMacro(module, MAX_KEYPOINTS) ||
                    PyModule_AddIntMacro(module, MAX_WIDTH)
                ? -1
                : 0;

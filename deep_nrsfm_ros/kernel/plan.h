@@ -33,8 +33,8 @@ typedef struct {
     int p, stride, layers, rotations, refill_rounds, reference[2], min_visible, bones;
     int mirrored, whitened, scale_by_rms, corrected;                     /* flags */
     const int *widths, *partners, *bone_ends;                            /* (layers), (p), (bones, 2) */
-    Matrix L, L_inverse, encoder[MOST_LAYERS], decoder[MOST_LAYERS], code_head;
-    const float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head;
+    Matrix L, L_inverse, encoder[MAX_LAYERS], decoder[MAX_LAYERS], code_head;
+    const float *b[MAX_LAYERS], *b_[MAX_LAYERS], *camera_head;
     const float *error_std, *covariance;                                 /* (p), (p, 3, 3, p) in DOUBLES */
     const double *completion, *image_rotations, *object_frame;           /* (p, p), (rotations, 2, 2), (3, 3) */
     const double *calibration, *bone_lengths;                            /* (5), (bones, 2) length and deviation */

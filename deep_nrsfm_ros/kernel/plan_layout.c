@@ -21,7 +21,7 @@ const char *check_header(const int *h, ptrdiff_t length) {
     if (length < HEADER_LENGTH) return "the header is too short";
     int p = h[0], layers = h[1], bones = h[11];
     if (!in_range(p, 1, MAX_KEYPOINTS)) return "the number of keypoints is out of range";
-    if (!in_range(layers, 1, MOST_LAYERS)) return "the number of dictionaries is out of range";
+    if (!in_range(layers, 1, MAX_LAYERS)) return "the number of dictionaries is out of range";
     if (!in_range(h[2], 1, MAX_ROTATIONS)) return "the number of rotations is out of range";
     for (int i = 3; i < 7; i++)
         if (!in_range(h[i], 0, 1)) return "a flag is neither 0 nor 1";

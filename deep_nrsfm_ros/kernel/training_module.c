@@ -49,7 +49,7 @@ static WorkerPool *worker_pool_start(const int *header, const float *L, const fl
 
 /* Return whether n ints are the header of a pool. */
 static int header_valid(const int *header, Py_ssize_t n) {
-    if (n < 6 || header[1] < 1 || header[1] > MOST_LAYERS || n != 5 + header[1]) return 0;
+    if (n < 6 || header[1] < 1 || header[1] > MAX_LAYERS || n != 5 + header[1]) return 0;
     if (header[0] < 1 || header[0] > MAX_KEYPOINTS || header[3] < 1 || header[3] > MAX_BLOCK) return 0;
     if (header[4] < 1 || header[4] > MAX_THREADS) return 0;
     for (int i = 5; i < n; i++)

@@ -18,7 +18,7 @@
 
 /* Sizes of a network; all workers share them. */
 typedef struct {
-    int p, wide, layers, whitened, widths[MOST_LAYERS], filled[MOST_LAYERS];
+    int p, wide, layers, whitened, widths[MAX_LAYERS], filled[MAX_LAYERS];
     int block;           /* frames that are computed at a time, so that their codes stay in the cache */
     size_t weights;      /* learned numbers: the length of the weight vector */
     size_t activations;  /* floats that the forward pass keeps of each frame */
@@ -27,7 +27,7 @@ typedef struct {
 /* What the forward pass keeps of n frames, and the backward pass reads. */
 typedef struct {
     float *x;                                     /* (2 n, wide), whitened */
-    float *Psi[MOST_LAYERS], *psi[MOST_LAYERS];   /* (6 n, filled_i), (n, filled_i) */
+    float *Psi[MAX_LAYERS], *psi[MAX_LAYERS];   /* (6 n, filled_i), (n, filled_i) */
     float *camera_rows;                           /* (n, 2, 3): M^T before it is made orthonormal */
 } Activations;
 
@@ -39,11 +39,11 @@ typedef struct {
 */
 typedef struct {
     const NetworkSizes *sizes;
-    Matrix L, L_inverse, first, encoder[MOST_LAYERS], decoder[MOST_LAYERS], code_head, code_back;
-    float *b[MOST_LAYERS], *b_[MOST_LAYERS], *camera_head;
+    Matrix L, L_inverse, first, encoder[MAX_LAYERS], decoder[MAX_LAYERS], code_head, code_back;
+    float *b[MAX_LAYERS], *b_[MAX_LAYERS], *camera_head;
     float *gradient; /* all gradients by the weights, padded, one after the other */
     size_t gradient_floats;
-    float *D_bar[MOST_LAYERS], *b_bar[MOST_LAYERS], *b__bar[MOST_LAYERS], *code_bar, *camera_bar;
+    float *D_bar[MAX_LAYERS], *b_bar[MAX_LAYERS], *b__bar[MAX_LAYERS], *code_bar, *camera_bar;
     float *S, *S_bar, *camera_bars, *spare[2]; /* scratch of one block of frames */
 } Worker;
 

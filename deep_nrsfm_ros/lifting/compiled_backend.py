@@ -1,6 +1,6 @@
 """The lifter's computation as one call of the compiled kernel, for networks that it supports.
 
-`numpy_backend` computes the same for all networks, some ten times slower; one test compares the two.
+`numpy_backend` computes the same for all networks, some ten times slower; a test compares the two.
 """
 
 from __future__ import annotations

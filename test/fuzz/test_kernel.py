@@ -248,7 +248,7 @@ def called(name: str, arguments: Arguments) -> Any:
 
 
 def test_every_entry_point_is_called() -> None:
-    assert names() <= set(ENTRY_POINTS)
+    assert names() == set(ENTRY_POINTS)
 
 
 def test_valid_arguments_are_accepted() -> None:
@@ -274,13 +274,16 @@ def test_a_call_is_computed_or_refused(fuzz: Fuzz) -> None:
         except REFUSALS as refusal:
             assert str(refusal)
             return f"{name}: {type(refusal).__name__}"
+        except MemoryError:  # of networks that are possible, but huge
+            return f"{name}: MemoryError"
         if name == "plan":  # what is accepted can be lifted with
             p = int(np.frombuffer(arguments[0], np.int32)[0])
             called("lift", lift(spoiler, Sizes(p, []), result))
         if name == "worker_pool":
             p, _, _, _, _, *widths = np.frombuffer(arguments[0], np.int32).tolist()
-            called("network_forward", network_forward(spoiler, Sizes(p, widths), result))
-            called("network_backward", network_backward(spoiler, Sizes(p, widths), result))
+            if max(widths) <= 1000:  # wider ones are possible, and take the memory that they need
+                called("network_forward", network_forward(spoiler, Sizes(p, widths), result))
+                called("network_backward", network_backward(spoiler, Sizes(p, widths), result))
         return f"{name}: computed"
 
     fuzz("direct calls of the kernel", one)

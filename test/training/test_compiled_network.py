@@ -221,7 +221,7 @@ def test_what_the_kernel_does_not_support_is_torchs() -> None:
 def test_wide_and_deep_networks_are_torchs() -> None:
     assert supports(network((512, 256), 31, 1.0, 0))
     assert not supports(network((1024,), 31, 1.0, 0))
-    most = _kernel.MOST_LAYERS
+    most = _kernel.MAX_LAYERS
     assert supports(network((2,) * most, 5, 1.0, 0))
     assert not supports(network((2,) * (most + 1), 5, 1.0, 0))
 
