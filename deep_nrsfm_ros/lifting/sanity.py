@@ -1,0 +1,300 @@
+"""Findings about values that look wrong: keypoints, stamps and lifted shapes that nobody meant.
+
+`lift`, `train` and the node share `check`. A finding names the number that looks wrong and the
+remedy. It is no error: the values are used as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.lifter import Lifted
+
+Floats = NDArray[np.floating[Any]]
+Size = tuple[int, int]
+"""Width and height of an image in pixels."""
+
+POOR_RESIDUAL = 0.3
+"""Median reprojection error of objects from which on the fit is poor."""
+LOW_CONFIDENCE = 0.3
+"""Median confidence of objects below which the answer is doubtful."""
+
+_MAX_OBJECTS = 5000  # objects of a sample; more cost time and change no finding
+_NORMALISED = 2.0  # largest normalised coordinate; a detector puts some points beyond the border
+_SIGNED = 0.05  # fraction of points with a negative coordinate, above which the range is -1 to 1
+_MIN_FOCAL = 10.0  # pixels; a smaller focal length belongs to normalised coordinates
+_MIN_REPEATS = 3  # points on one spot that may be a sentinel
+_OUTSIDE = 0.05  # fraction of points far outside the image that is too many
+_MARGIN = 0.5  # of the image's size: points further outside are far outside
+_SCALED_TWICE = 20.0  # sizes of the image from its corner to the points
+_MAX_PLACE = 1000.0  # metres from the camera
+_FAR = 0.01  # fraction of objects at an impossible place that is too many
+_SECOND = 1_000_000_000  # ns
+_SHORTEST, _LONGEST = 100_000, 3600 * _SECOND  # ns between frames: 10 kHz to one an hour
+_UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": _SECOND}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that looks wrong in the input or in the answer.
+
+    Attributes:
+        code: short name of the kind, e.g. "normalised"; the same for all findings of a kind.
+        message: one sentence with the number that looks wrong, and the remedy.
+    """
+
+    code: str
+    message: str
+
+    def __str__(self) -> str:
+        """Return the message."""
+        return self.message
+
+
+def check(
+    points: Floats,
+    confidence: Floats,
+    intrinsics: Intrinsics | None = None,
+    image_size: Size | None = None,
+    stamps: NDArray[np.int64] | None = None,
+    lifted: Lifted | None = None,
+) -> list[Finding]:
+    """Return what looks wrong in keypoints, their stamps and the shapes lifted from them.
+
+    Args:
+        points: (n, q, 2) keypoints, which should be pixels.
+        confidence: (n, q) of the keypoints; 0 where missing.
+        intrinsics: of the camera, in pixels; None: not used.
+        image_size: width and height of the image in pixels; None: unknown.
+        stamps: (f,) in ns, one for each frame, in the order of the frames; None: unknown.
+        lifted: the objects, lifted; None: not lifted.
+    """
+    step = max(1, -(-len(points) // _MAX_OBJECTS))
+    findings: list[Finding] = []
+    visible = confidence[::step] > 0
+    objects = points[::step]
+    if visible.any():
+        if sentinel := find_sentinel(objects, visible):
+            spot, times = sentinel
+            visible = visible & ~(objects == spot).all(-1)
+            findings.append(_sentinel(spot, times, int(confidence[::step].astype(bool).sum())))
+        findings += _coordinates(objects, visible, intrinsics, image_size)
+    if stamps is not None:
+        findings += _stamps(np.asarray(stamps, np.int64))
+    if lifted is not None:
+        if intrinsics:
+            findings += _places(lifted)
+        findings += quality(lifted.residual, lifted.object_confidence)
+    return findings
+
+
+def looks_normalised(points: Floats, visible: NDArray[np.bool_]) -> bool:
+    """Return whether keypoints are fractions of the image's size and not pixels.
+
+    No object in an image is 2 pixels large, so small coordinates are no pixels.
+
+    Args:
+        points: (n, q, 2).
+        visible: (n, q).
+    """
+    values = np.where(visible[..., None], np.abs(points), 0)
+    largest = float(values.max(initial=0))
+    return 0 < largest <= _NORMALISED and not is_signed(points, visible)
+
+
+def is_signed(points: Floats, visible: NDArray[np.bool_]) -> bool:
+    """Return whether many visible keypoints (n, q, 2) have a negative coordinate."""
+    negative = (points < 0).any(-1) & visible
+    return bool(negative.sum() > _SIGNED * visible.sum())
+
+
+def find_sentinel(points: Floats, visible: NDArray[np.bool_]) -> tuple[Floats, int] | None:
+    """Return the spot (2,) that stands for a missing keypoint, and how often it is there.
+
+    A spot such as (-1, -1) or (9999, 9999) is one when several visible keypoints lie on it: both
+    coordinates are negative or 0, or they are equal.
+
+    Args:
+        points: (n, q, 2).
+        visible: (n, q).
+
+    Returns:
+        None if there is no such spot.
+    """
+    x, y = points[..., 0], points[..., 1]
+    suspect = visible & (((x <= 0) & (y <= 0)) | (x == y))
+    if suspect.sum() < _MIN_REPEATS:
+        return None
+    spots, counts = np.unique(points[suspect], axis=0, return_counts=True)
+    most = int(counts.argmax())
+    return (spots[most], int(counts[most])) if counts[most] >= _MIN_REPEATS else None
+
+
+def quality(residual: Floats, confidence: Floats) -> list[Finding]:
+    """Return whether the lifted objects fit their keypoints poorly or have low confidence.
+
+    Args:
+        residual: (n,) reprojection errors; NaN where not lifted.
+        confidence: (n,) of the objects.
+    """
+    is_lifted = ~np.isnan(residual)
+    if not is_lifted.any():
+        return []
+    error = float(np.median(residual[is_lifted]))
+    certainty = float(np.median(confidence[is_lifted]))
+    if error >= POOR_RESIDUAL:
+        return [
+            Finding(
+                "poor-fit",
+                f"poor fit: median residual {error:.2f}, below 0.1 is usual: check the keypoint "
+                "layout, the model, and that y points down",
+            )
+        ]
+    if certainty < LOW_CONFIDENCE:
+        return [
+            Finding(
+                "low-confidence",
+                f"low confidence: median {certainty:.2f}; many keypoints are missing or guessed, "
+                "or the model is of another object",
+            )
+        ]
+    return []
+
+
+def _sentinel(spot: Floats, times: int, total: int) -> Finding:
+    """Return the finding of a sentinel."""
+    x, y = (float(value) for value in spot)
+    return Finding(
+        "sentinel",
+        f"{times} of {total} visible keypoints lie at exactly ({x:g}, {y:g}), which detectors "
+        "write for a missing keypoint: give them confidence 0, NaN or (0, 0)",
+    )
+
+
+def _coordinates(
+    points: Floats,
+    visible: NDArray[np.bool_],
+    intrinsics: Intrinsics | None,
+    image_size: Size | None,
+) -> Iterator[Finding]:
+    """Yield what is wrong with the unit of the keypoints."""
+    if not visible.any():
+        return
+    shown = points[visible]
+    low, high = float(shown.min()), float(shown.max())
+    if max(-low, high) <= _NORMALISED:
+        if intrinsics and min(intrinsics.focal) < _MIN_FOCAL:
+            return
+        camera = f", and the focal length is {intrinsics.focal[0]:.0f} pixels" if intrinsics else ""
+        if is_signed(points, visible):
+            yield Finding(
+                "normalised",
+                f"keypoints lie between {low:.2f} and {high:.2f}{camera}: these are no pixels; "
+                "convert them to pixels with x right and y down",
+            )
+        else:
+            yield Finding(
+                "normalised",
+                f"keypoints lie between {low:.2f} and {high:.2f}{camera}: they are normalised, not "
+                "pixels; give the size of the image (image_width and image_height)",
+            )
+        return
+    if image_size is None and intrinsics is None:
+        return
+    principal = intrinsics.principal if intrinsics else (0.0, 0.0)
+    width, height = image_size or (2 * principal[0], 2 * principal[1])
+    if min(width, height) <= 1:
+        return
+    size = np.array((width, height))
+    relative = shown / size
+    source = f"{width:.0f} x {height:.0f}" + ("" if image_size else " (twice the principal point)")
+    beyond = np.abs(np.median(relative, 0)).max()
+    far = ((relative < -_MARGIN) | (relative > 1 + _MARGIN)).any(-1).mean()
+    worst = shown[np.abs(relative - 0.5).max(-1).argmax()]
+    if beyond > _SCALED_TWICE:
+        yield Finding(
+            "pixels-called-normalised",
+            f"the middle keypoint lies {beyond:.0f} image sizes away from an image of {source}: "
+            "they are pixels that are taken as normalised; say units: pixels in the field mapping",
+        )
+    elif far > _OUTSIDE:
+        yield Finding(
+            "outside",
+            f"{far:.0%} of the keypoints lie far outside the image of {source}, one at "
+            f"({worst[0]:.0f}, {worst[1]:.0f}): give the size and the camera of the image in which "
+            "they were detected",
+        )
+
+
+def _stamps(stamps: NDArray[np.int64]) -> Iterator[Finding]:
+    """Yield what is wrong with the stamps (f,) in ns."""
+    if len(stamps) < 2:
+        return
+    spacing = np.diff(stamps)
+    span = int(stamps.max()) - int(stamps.min())
+    if span == 0:
+        yield Finding(
+            "stamps",
+            f"all {len(stamps)} frames have the stamp {int(stamps[0])}: there is no time; let the "
+            "detector fill header.stamp, or leave the stamps out and give the rate",
+        )
+        return
+    middle = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 0.0
+    mean = span / (len(stamps) - 1)
+    if mean < _SHORTEST:
+        units = [unit for unit, factor in _UNITS.items() if _plausible(mean * factor)]
+        guess = f"; they look like {units[0]}" if units else ""
+        yield Finding(
+            "stamps",
+            f"frames are {mean:.3g} ns apart{guess}: stamps are in nanoseconds; convert them",
+        )
+        return
+    if middle > _LONGEST:
+        yield Finding(
+            "stamps",
+            f"frames are {middle / _SECOND:.0f} s apart: stamps are in nanoseconds; convert them",
+        )
+        return
+    if backwards := int((spacing <= 0).sum()):
+        first = int((spacing <= 0).argmax())
+        yield Finding(
+            "stamps",
+            f"{backwards} of {len(spacing)} stamps are not above the one before, the first after "
+            f"frame {first} ({int(stamps[first])} to {int(stamps[first + 1])} ns): sort the "
+            "frames by time, or let one clock stamp them",
+        )
+
+
+def _plausible(spacing: float) -> bool:
+    """Return whether frames may be so many ns apart: 1 kHz to one in 10 s."""
+    return 0.001 * _SECOND <= spacing <= 10 * _SECOND
+
+
+def _places(lifted: Lifted) -> Iterator[Finding]:
+    """Yield objects behind the camera or kilometres away."""
+    is_lifted = ~np.isnan(lifted.residual)
+    places = lifted.shapes[is_lifted].mean(1)
+    if not len(places):
+        return
+    distance = np.linalg.norm(places, axis=1)
+    farthest = places[distance.argmax()]
+    if (behind := int((places[:, 2] < 0).sum())) > _FAR * len(places):
+        yield Finding(
+            "place",
+            f"{behind} of {len(places)} objects are behind the camera: check the intrinsics and "
+            "the unit of the keypoints",
+        )
+    elif (far := int((distance > _MAX_PLACE).sum())) > _FAR * len(places):
+        x, y, z = (float(value) for value in farthest)
+        yield Finding(
+            "place",
+            f"{far} of {len(places)} objects are more than {_MAX_PLACE:g} m away, one at "
+            f"({x:.0f}, {y:.0f}, {z:.0f}): check the intrinsics, the unit of the keypoints and "
+            "reference_length",
+        )

@@ -1,0 +1,124 @@
+"""Values that look wrong are found, and sound ones are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.sanity import check, looks_normalised
+
+CAMERA = Intrinsics((1000.0, 1000.0), (640.0, 360.0))
+SIZE = (1280, 720)
+N, Q = 60, 17
+
+
+def people() -> np.ndarray:
+    """Return pixels (60, 17, 2) of people in an image of 1280 x 720."""
+    rng = np.random.default_rng(0)
+    return rng.uniform((500, 150), (720, 600), (N, Q, 2))
+
+
+def lifted(place: tuple[float, float, float] = (0, 0, 4), residual: float = 0.05) -> Lifted:
+    shapes = np.full((N, Q, 3), place, np.float32)
+    return Lifted(
+        *(shapes, np.tile(np.eye(3, dtype=np.float32), (N, 1, 1)), np.ones(N, np.float32)),
+        *(np.ones((N, 2), np.float32), np.full(N, residual, np.float32)),
+        np.full((N, Q), 0.8, np.float32),
+    )
+
+
+ALL = np.ones((N, Q))
+STAMPS = np.arange(N) * 33_333_333
+
+
+def codes(points: np.ndarray, **options: object) -> list[str]:
+    return [finding.code for finding in check(points, ALL, **options)]  # type: ignore[arg-type]
+
+
+def test_sound_values_are_found_nothing_of() -> None:
+    points = people()
+    for camera in (None, CAMERA):
+        for size in (None, SIZE):
+            assert not check(points, ALL, camera, size, STAMPS, lifted())
+    assert not check(points[:0], ALL[:0], CAMERA, SIZE, STAMPS[:0], lifted()._replace())
+    assert not codes(points - 500)  # a person at the left border, half outside
+
+
+@pytest.mark.parametrize("camera", [None, CAMERA])
+def test_normalised_points(camera: Intrinsics | None) -> None:
+    points = people() / SIZE
+    (finding,) = check(points, ALL, camera)
+    assert finding.code == "normalised" and "image_width" in finding.message
+    assert looks_normalised(points, ALL > 0) and not looks_normalised(people(), ALL > 0)
+    (finding,) = check(2 * points - 1, ALL, camera)
+    assert finding.code == "normalised" and "convert them to pixels" in finding.message
+    assert not looks_normalised(2 * points - 1, ALL > 0)
+    points[0, :2] = -0.1  # a few points beyond the border
+    assert looks_normalised(points, ALL > 0)
+
+
+def test_a_camera_of_normalised_coordinates() -> None:
+    assert not check(people() / SIZE, ALL, Intrinsics((0.8, 1.4), (0.5, 0.5)))
+
+
+def test_pixels_called_normalised() -> None:
+    assert codes(people() * SIZE, image_size=SIZE) == ["pixels-called-normalised"]
+
+
+@pytest.mark.parametrize("options", [{"image_size": (320, 240)}, {"intrinsics": CAMERA}])
+def test_points_far_outside_the_image(options: dict[str, object]) -> None:
+    points = people() * (1 if "image_size" in options else 4)
+    assert codes(points, **options) == ["outside"]
+
+
+@pytest.mark.parametrize("spot", [(-1, -1), (-999, -999), (-1, 0), (9999, 9999)])
+def test_sentinels(spot: tuple[int, int]) -> None:
+    points = people()
+    points[::3, 5:8] = spot
+    (finding,) = check(points, ALL, image_size=SIZE)
+    assert finding.code == "sentinel" and f"60 of 1020 visible keypoints lie at exactly ({spot[0]}"
+    normalised = people() / SIZE
+    normalised[::3, 5:8] = spot
+    assert codes(normalised) == ["sentinel", "normalised"]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "expected"),
+    [
+        (STAMPS // 1_000_000, "milliseconds"),
+        (STAMPS // 1_000, "microseconds"),
+        (STAMPS // 1_000_000_000, "seconds"),
+        (np.zeros(N, np.int64), "all 60 frames have the stamp 0"),
+        (STAMPS[::-1], "59 of 59 stamps"),
+        (np.concatenate([STAMPS[30:], STAMPS[:30]]), "1 of 59 stamps"),
+        (STAMPS * 1_000_000, "33333 s apart"),
+    ],
+)
+def test_stamps(stamps: np.ndarray, expected: str) -> None:
+    (finding,) = check(people(), ALL, stamps=stamps)
+    assert finding.code == "stamps" and expected in finding.message
+
+
+def test_slow_and_fast_streams_are_sound() -> None:
+    for rate in (1 / 60, 1, 10, 240, 1000):
+        stamps = 1_700_000_000_000_000_000 + (np.arange(N) * (1e9 / rate)).astype(np.int64)
+        assert not check(people(), ALL, stamps=stamps), rate
+
+
+def test_impossible_places() -> None:
+    (finding,) = check(people(), ALL, CAMERA, SIZE, STAMPS, lifted((-1885, -1060, 2948)))
+    assert finding.code == "place" and "(-1885, -1060, 2948)" in finding.message
+    (finding,) = check(people(), ALL, CAMERA, SIZE, STAMPS, lifted((0, 0, -4)))
+    assert "behind the camera" in finding.message
+    assert not check(people(), ALL, lifted=lifted((0, 0, -4)))  # no place without a camera
+
+
+def test_poor_fit_and_low_confidence() -> None:
+    assert codes(people(), lifted=lifted(residual=0.79)) == ["poor-fit"]
+    low = lifted()
+    low.confidence[:] = 0.2
+    assert codes(people(), lifted=low) == ["low-confidence"]
+    nothing = lifted(residual=np.nan)
+    assert not codes(people(), lifted=nothing)
