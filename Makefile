@@ -1,6 +1,6 @@
 # make demo        from a fresh clone to the picture
 # make demo-live   from videos to 3D, with MediaPipe Pose as the detector
-# make test        environment, lint, types and all tests
+# make test        environment, lint, types and all tests; TEST_PROCESSES=2: two files at a time
 # make lint        lint and types only
 # make reference   docs/reference/ from the code
 # make sanitize    the kernel's tests with a kernel that checks every access (ASan, UBSan)
@@ -36,6 +36,9 @@ SANITIZE_TESTS := test/kernel test/fuzz/test_kernel.py test/lifting/test_compile
     test/messages/test_serialised.py $(wildcard test/training/test_compiled_*.py)
 SANITIZE_FUZZ ?= 1000
 
+# Test files that run at the same time, each on a DDS domain of its own.
+TEST_PROCESSES ?= 1
+
 PYTHON := .venv/bin/python
 READY := .venv/.ready
 # Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
@@ -53,7 +56,7 @@ demo-live: $(EXAMPLES_READY)
 # make test DEEP_NRSFM_REQUIRE_KERNEL=0
 test: export DEEP_NRSFM_REQUIRE_KERNEL = 1
 test: lint
-	$(PYTHON) -m pytest
+	$(PYTHON) -m pytest $(if $(filter-out 1,$(TEST_PROCESSES)),-n $(TEST_PROCESSES) --dist loadfile)
 
 lint: $(READY)
 	$(PYTHON) -m ruff check .

@@ -106,6 +106,7 @@ setup(
         ],
         "test": [
             "pytest",  # runs the tests; colcon test needs its name here to run any
+            "pytest-xdist",  # several test files at a time: make test TEST_PROCESSES=2
             "pytest-timeout",  # a process that never answers fails its test instead of hanging all
             "hypothesis",  # properties over generated input
             "ruff",  # lint and format
