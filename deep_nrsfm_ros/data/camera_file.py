@@ -8,6 +8,7 @@ from typing import Any
 
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.messages.camera_info import read_camera_info
+from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 
 # Names of the matrices in files of camera_calibration (ost.yaml) and camera_info_manager.
@@ -40,6 +41,14 @@ def read_camera_file(path: Path, *, rectified: bool = False) -> Intrinsics:
         )
     except ValueError as error:
         raise CameraFileError(f"camera file {path}: {error}") from error
+
+
+def read_image_size(path: Path) -> Size | None:
+    """Return width and height in pixels of the image of a camera file; None if it lacks them."""
+    fields = read_fields(path, "k: [600, 0, 320, ...]")
+    size = tuple(fields.get(f"image_{side}", fields.get(side)) for side in ("width", "height"))
+    known = all(isinstance(side, int) and side > 0 for side in size)
+    return (size[0], size[1]) if known else None
 
 
 def _message(content: dict[Any, Any]) -> SimpleNamespace:

@@ -103,9 +103,22 @@ def looks_normalised(points: Floats, visible: NDArray[np.bool_]) -> bool:
         points: (n, q, 2).
         visible: (n, q).
     """
-    values = np.where(visible[..., None], np.abs(points), 0)
-    largest = float(values.max(initial=0))
+    largest = float(np.abs(points).max(where=visible[..., None], initial=0))
     return 0 < largest <= _NORMALISED and not is_signed(points, visible)
+
+
+def to_pixels(points: Floats, confidence: Floats, image_size: Size | None) -> Floats:
+    """Return keypoints in pixels: normalised ones times the image's size, others as they are.
+
+    Args:
+        points: (n, q, 2); 0 where missing.
+        confidence: (n, q); 0 where missing.
+        image_size: width and height in pixels; None: unknown, the points are returned.
+    """
+    if image_size is None or not looks_normalised(points, confidence > 0):
+        return points
+    pixels: Floats = points * np.array(image_size, points.dtype)
+    return pixels
 
 
 def is_signed(points: Floats, visible: NDArray[np.bool_]) -> bool:

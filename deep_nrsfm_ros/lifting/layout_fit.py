@@ -1,0 +1,143 @@
+"""Keypoint layouts ranked by how well a model explains keypoints in their order.
+
+Layouts of the same number of keypoints cannot be told apart by a count: human17 and coco17 both
+have 17. In the wrong order the keypoints are no projection of a shape of the model, so the
+reprojection error of a few objects shows the right one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
+from deep_nrsfm_ros.model_files.model_file import Model
+
+MAX_OBJECTS = 200
+"""Objects of a sample: they take 2 to 10 ms a layout."""
+
+_CLEARLY = 0.6  # a residual below this fraction of another is clearly better
+_MIN_MAPPED = 10  # keypoints of the model, or half of them; fewer fit any shape in any order
+_QUICK = LiftingOptions(correction="none", test_time_rotations=1, refill=0)
+
+
+class LayoutFit(NamedTuple):
+    """How well a model explains keypoints in the order of a layout.
+
+    Attributes:
+        layout: the layout.
+        residual: median reprojection error; 0 = perfect, below 0.1 typical, above 0.3 poor.
+    """
+
+    layout: KeypointLayout
+    residual: float
+
+
+def fit_layouts(
+    points: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    model: Model,
+    layouts: Iterable[KeypointLayout] = (),
+) -> list[LayoutFit]:
+    """Return the layouts of q keypoints that the model can lift, the best fit first.
+
+    Args:
+        points: (n, q, 2) in pixels; at most `MAX_OBJECTS` of them, evenly spaced, are lifted.
+        confidence: (n, q); 0 where missing.
+        model: lifts them.
+        layouts: tried besides the presets and the model's own.
+
+    Returns:
+        Layouts that map to 10 or half of the model's keypoints, and with which an object can
+        be lifted. Layouts that fit equally well are in the order of `layouts`,
+        the model's own, the presets.
+    """
+    chosen = _sample(confidence)
+    points, confidence = points[chosen], confidence[chosen]
+    lifter = Lifter(model, _QUICK)
+    fits = []
+    for layout in _candidates(confidence.shape[1], model, layouts):
+        mapped = KeypointMap(layout, model.layout)(points, confidence)
+        residual = lift_all(lifter.lift, *mapped).residual
+        if not np.isnan(residual).all():
+            fits.append(LayoutFit(layout, float(np.nanmedian(residual))))
+    return sorted(fits, key=lambda fit: fit.residual)
+
+
+def choose_layout(fits: list[LayoutFit], preferred: KeypointLayout) -> LayoutFit | None:
+    """Return the fit of the preferred layout, or of the best one if it is clearly better.
+
+    Args:
+        fits: as `fit_layouts` returns them.
+        preferred: taken if it is among the fits and none is clearly better.
+
+    Returns:
+        None if there is no fit.
+    """
+    if not fits:
+        return None
+    best = fits[0]
+    present = next((fit for fit in fits if fit.layout.keypoints == preferred.keypoints), None)
+    return best if present is None or _is_clearly_better(best, present.residual) else present
+
+
+def better_layout(
+    fits: list[LayoutFit], present: KeypointLayout, residual: float
+) -> Finding | None:
+    """Return the finding that another layout fits clearly better than the present one.
+
+    Args:
+        fits: as `fit_layouts` returns them.
+        present: layout with which the objects were lifted.
+        residual: their median residual.
+    """
+    if not fits:
+        return None
+    best = fits[0]
+    if best.layout.keypoints == present.keypoints or not _is_clearly_better(best, residual):
+        return None
+    return Finding(
+        "layout",
+        f"poor fit as {present.name}: is it {best.layout.name}? It fits {best.residual:.2f} "
+        f"instead of {residual:.2f}; set the keypoint layout to {best.layout.name}",
+    )
+
+
+def _is_clearly_better(fit: LayoutFit, residual: float) -> bool:
+    """Return whether a fit is sound and clearly better than another residual."""
+    return fit.residual < POOR_RESIDUAL and fit.residual < _CLEARLY * residual
+
+
+def _candidates(
+    q: int, model: Model, layouts: Iterable[KeypointLayout]
+) -> Iterable[KeypointLayout]:
+    """Yield the different layouts of q keypoints that map to enough of the model's."""
+    seen: set[tuple[str, ...]] = set()
+    for layout in (*layouts, model.layout, *LAYOUTS.values()):
+        if len(layout) != q or layout.keypoints in seen:
+            continue
+        seen.add(layout.keypoints)
+        try:
+            mapping = KeypointMap(layout, model.layout)
+        except ValueError:  # it shares too few keypoints with the model
+            continue
+        ones = np.ones((1, q), np.float32)
+        _, mapped = mapping(np.ones((1, q, 2), np.float32), ones)
+        if (mapped > 0).sum() >= min(_MIN_MAPPED, len(model.layout) / 2):
+            yield layout
+
+
+def _sample(confidence: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the indices of at most `MAX_OBJECTS` objects, evenly spaced, with many keypoints."""
+    visible = (confidence > 0).sum(1)
+    full = np.flatnonzero(visible >= np.median(visible)) if len(visible) else np.arange(0)
+    if len(full) <= MAX_OBJECTS:
+        return full
+    return full[np.linspace(0, len(full) - 1, MAX_OBJECTS).astype(int)]

@@ -1,0 +1,53 @@
+"""The layout that fits is found among those of the same number of keypoints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17, LAYOUTS
+from deep_nrsfm_ros.lifting.layout_fit import better_layout, choose_layout, fit_layouts
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
+from test.fixtures.walking import in_layout
+
+
+@pytest.fixture(scope="module")
+def human() -> Model:
+    return load_model("human")
+
+
+@pytest.mark.parametrize("name", ["human17", "coco17"])
+def test_the_layout_of_seventeen_keypoints(human: Model, name: str) -> None:
+    points, confidence = in_layout(LAYOUTS[name], 40)
+    fits = fit_layouts(points, confidence, human)
+    assert {"human17", "coco17"} <= {fit.layout.name for fit in fits}
+    assert fits[0].layout.name == name and fits[0].residual < 0.2
+    for preferred in (HUMAN17, COCO17):
+        chosen = choose_layout(fits, preferred)
+        assert chosen and chosen.layout.name == name
+    assert better_layout(fits, LAYOUTS[name], fits[0].residual) is None
+    other = next(fit for fit in fits if fit.layout.name in {"human17", "coco17"} - {name})
+    finding = better_layout(fits, other.layout, other.residual)
+    assert finding and f"is it {name}? It fits {fits[0].residual:.2f}" in finding.message
+
+
+def test_keypoints_of_which_no_layout_is_known(human: Model) -> None:
+    points = np.random.default_rng(0).uniform(0, 500, (20, 17, 2)).astype(np.float32)
+    ones = np.ones((20, 17), np.float32)
+    fits = fit_layouts(points, ones, human)
+    chosen = choose_layout(fits, HUMAN17)
+    assert chosen and chosen.layout.name == "human17"
+    assert better_layout(fits, HUMAN17, chosen.residual) is None
+    assert not fit_layouts(points[:, :7], ones[:, :7], human)
+    assert choose_layout([], HUMAN17) is None
+    assert better_layout([], HUMAN17, 0.8) is None
+    assert not fit_layouts(points, 0 * ones, human)
+
+
+def test_a_layout_of_the_caller(human: Model) -> None:
+    points, confidence = in_layout(COCO17, 20)
+    turned = KeypointLayout("turned", COCO17.keypoints[::-1])
+    fits = fit_layouts(*KeypointMap(COCO17, turned)(points, confidence), human, [turned])
+    assert fits[0].layout is turned
