@@ -1,4 +1,4 @@
-"""The serialised messages of a bag, also of a damaged one.
+"""The serialised messages of a bag of ROS 2 or ROS 1, also of a damaged one.
 
 A recording that was cut off (power failure, full disk, killed recorder) has no index, no metadata
 or an incomplete page at its end. Its readable part is read, and a warning says what is lost.
@@ -9,17 +9,26 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import IO, Any, NamedTuple, Protocol
 
 import yaml
+from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.typesys.store import Typestore
 
-SUFFIXES = (".db3", ".mcap")
+from deep_nrsfm_ros.data.definitions import DefinitionError, ros1_types
+
+SUFFIXES = (".db3", ".mcap", ".bag")
+"""Suffixes of the files of bags: SQLite and MCAP of ROS 2, and .bag of ROS 1."""
+
+_METADATA = "metadata.yaml"
+_ROS1_MAGIC = b"#ROSBAG V"
+_NO_METADATA = "it has no metadata.yaml, as after a recorder that was killed"
 
 
 class BagError(ValueError):
@@ -34,12 +43,14 @@ class Topic(NamedTuple):
         type: e.g. "sensor_msgs/msg/PointCloud2".
         total: number of messages; of a damaged bag, as far as it is known.
         definition: definition of the type in .msg or .idl format; "" if the bag has none.
+        type_hash: hash of the recorded definition (RIHS01); "" if unknown.
     """
 
     name: str
     type: str
     total: int
     definition: str = ""
+    type_hash: str = ""
 
     @property
     def input_type(self) -> str:
@@ -80,15 +91,17 @@ class BagFile:
         self.path, self._storages, self._problem = path, storages, problem
         counts: Counter[tuple[str, str]] = Counter()
         definitions: dict[str, str] = {}
+        hashes: dict[str, str] = {}
         for storage in storages:
             for topic in storage.topics():
                 if not isinstance(topic.name, str) or not isinstance(topic.type, str):
                     continue  # a damaged table may have lost either
                 counts[topic.name, topic.type] += topic.total
                 definitions[topic.type] = definitions.get(topic.type) or topic.definition
+                hashes[topic.type] = hashes.get(topic.type) or topic.type_hash
         recorded = _recorded_counts(path)
         self.topics = [
-            Topic(name, kind, max(count, recorded.get(name, 0)), definitions[kind])
+            Topic(name, kind, max(count, recorded.get(name, 0)), definitions[kind], hashes[kind])
             for (name, kind), count in counts.items()
         ]
         self._read: Counter[str] = Counter()  # messages read so far, by topic
@@ -112,13 +125,24 @@ class BagFile:
             except Exception as error:  # a damaged file fails in many ways; keep what was read
                 self._problem = self._problem or str(error)
 
+    def sample(self, topic: Topic) -> Iterator[bytes]:
+        """Yield messages of a topic that do not count as read; end where a file is damaged."""
+        for storage in self._storages:
+            with suppress(Exception):
+                yield from (record.raw for record in storage.records(topic.name))
+
+    def has_messages(self, topic: Topic) -> bool:
+        """Return whether there is a message of a topic; a damaged bag may not have counted them."""
+        return bool(topic.total) or next(self.sample(topic), None) is not None
+
     def warning(self, topic: Topic) -> str:
         """Return a sentence on the lost messages of a topic after reading it; "" if none is."""
         if not self._problem:
             return ""
         read, lost = self._read[topic.name], topic.total - self._read[topic.name]
         loss = f"{lost} of {topic.total} messages are lost" if lost > 0 else "its end may be lost"
-        return f"bag {self.path} is damaged ({self._problem}); read {read} messages, {loss}"
+        state = "is incomplete" if self._problem == _NO_METADATA else "is damaged"
+        return f"bag {self.path} {state} ({self._problem}); read {read} messages, {loss}"
 
     def close(self) -> None:
         """Close the files."""
@@ -130,29 +154,83 @@ def open_bag(path: Path) -> BagFile:
     """Open a bag, sound or damaged.
 
     Args:
-        path: bag folder, or a single .db3 or .mcap file.
+        path: bag folder, or a single .db3, .mcap or .bag file. A folder without metadata.yaml is
+            read file by file, as the parts of a ROS 1 recording are.
 
     Raises:
         BagError: the bag is missing, is no bag, or nothing of it can be read.
     """
     if not path.exists():
         raise BagError(f"bag {path} does not exist")
+    folder = path.is_dir()
+    if not folder and is_ros1(path):
+        try:
+            return BagFile(path, [_Ros1(path)], "")
+        except Exception as error:  # rosbags raises exceptions of many types
+            raise BagError(_ros1_problem(path, error)) from None
     try:
         return BagFile(path, [_Sound(path)], "")
     except Exception as error:  # a damaged bag makes rosbags raise exceptions of many types
-        problem = str(error)
-    files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES) if path.is_dir() else [path]
+        problem = _NO_METADATA if folder and not (path / _METADATA).exists() else str(error)
+        not_allowed = isinstance(error, PermissionError)
+    files = sorted(f for f in path.iterdir() if f.suffix in SUFFIXES) if folder else [path]
+    files = [file for file in files if not file.name.startswith("._")]  # macOS's companions
     storages: list[_Storage] = []
     for file in files:
-        for kind in (_Sound, _CutSqlite if file.suffix == ".db3" else _CutMcap):
-            with suppress(Exception):
+        for kind in _readers_of(file):
+            try:
                 storages.append(kind(file))
+                if kind is not _Sound and kind is not _Ros1 and problem == _NO_METADATA:
+                    problem = f"{file.name} was cut off"
                 break
+            except Exception as error:  # try the next reader, and the next file
+                if problem == _NO_METADATA:
+                    problem = f"{file.name}: {error}"
+    if (
+        files
+        and all(isinstance(storage, _Ros1) for storage in storages)
+        and (problem == _NO_METADATA)
+    ):
+        problem = ""  # a recording of ROS 1 has none
     bag = BagFile(path, storages, problem)
     if not bag.topics:
         bag.close()
-        raise BagError(f"bag {path} cannot be read: {problem}; is it a rosbag2 recording?")
+        raise BagError(f"bag {path} cannot be read: {problem}{_advice(path, not_allowed)}")
     return bag
+
+
+def _readers_of(file: Path) -> tuple[Callable[[Path], _Storage], ...]:
+    """Return the readers to try on a file, the one for a sound file first."""
+    if is_ros1(file):
+        return (_Ros1,)
+    return (_Sound, _CutSqlite if file.suffix == ".db3" else _CutMcap)
+
+
+def is_ros1(file: Path) -> bool:
+    """Return whether a file begins as a bag of ROS 1, whatever its suffix."""
+    with suppress(OSError), file.open("rb") as content:
+        return content.read(len(_ROS1_MAGIC)) == _ROS1_MAGIC
+    return False
+
+
+def _ros1_problem(path: Path, error: Exception) -> str:
+    """Return why a bag of ROS 1 cannot be read, and the remedy."""
+    text = f"bag {path} of ROS 1 cannot be read: {error}"
+    if isinstance(error, OSError):
+        return text
+    return f"{text}; if its recording was cut off, `rosbag reindex` of ROS 1 restores its index"
+
+
+def _advice(path: Path, not_allowed: bool) -> str:
+    """Return a remedy for a bag of which nothing can be read; "" where there is none."""
+    if not_allowed:
+        return ""
+    if path.is_file():
+        if not path.stat().st_size:
+            return "; the file is empty"
+        if path.suffix == ".bag":
+            return "; it does not begin as a bag of ROS 1 does"
+    return "; is it a recording of rosbag2?"
 
 
 def lifter_topics(bag: BagFile) -> list[tuple[Topic, Topic]]:
@@ -180,7 +258,10 @@ def _recorded_counts(path: Path) -> dict[str, int]:
 
 def _topic(connection: Any, total: int) -> Topic:
     """Return a connection of rosbags as a topic with `total` messages."""
-    return Topic(connection.topic, connection.msgtype, total, connection.msgdef.data)
+    text, type_hash = connection.msgdef.data, connection.digest or ""
+    if not type_hash.startswith("RIHS01_"):
+        type_hash = ""
+    return Topic(connection.topic, connection.msgtype, total, text, type_hash)
 
 
 class _Sound:
@@ -201,6 +282,41 @@ class _Sound:
         connections = [c for c in self._reader.connections if c.topic == name]
         for _, time, raw in self._reader.messages(connections) if connections else ():
             yield Record(time, raw)
+
+
+class _Ros1:
+    """A bag file of ROS 1; its messages are converted to those of ROS 2."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the bag; raise what rosbags raises."""
+        self._reader = Ros1Reader(path)
+        self._reader.open()
+        self.close = self._reader.close
+        self._stores: dict[tuple[str, str], Typestore] = {}
+        for connection in self._reader.connections:
+            with suppress(DefinitionError):  # the messages of a type that nobody defines
+                key = connection.msgtype, connection.msgdef.data
+                self._stores[key] = self._stores.get(key) or ros1_types(*key)
+
+    def topics(self) -> list[Topic]:
+        """Return the topics, with definitions of ROS 2."""
+        topics = []
+        for connection in self._reader.connections:
+            kind, text = connection.msgtype, connection.msgdef.data
+            if store := self._stores.get((kind, text)):
+                text = store.generate_msgdef(kind, ros_version=2)[0]
+            topics.append(Topic(connection.topic, kind, connection.msgcount, text))
+        return topics
+
+    def records(self, name: str) -> Iterator[Record]:
+        """Yield the records of a topic; a message that cannot be converted remains as it is."""
+        connections = [c for c in self._reader.connections if c.topic == name]
+        for connection, time, raw in self._reader.messages(connections) if connections else ():
+            kind, converted = connection.msgtype, raw
+            if store := self._stores.get((kind, connection.msgdef.data)):
+                with suppress(Exception):  # damaged bytes fail in many ways
+                    converted = bytes(store.ros1_to_cdr(raw, kind))
+            yield Record(time, converted)
 
 
 class _CutMcap:

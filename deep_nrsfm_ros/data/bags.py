@@ -86,7 +86,8 @@ def read_bags(
         raise BagError("no bag to read; name at least one")
     for path in paths:
         with closing(open_bag(Path(path))) as bag:
-            for topic, input_type, decode in keypoint_topics(bag, options.topic, options.mapping):
+            topics = keypoint_topics(bag, options.topic, options.mapping, len(source))
+            for topic, input_type, decode in topics:
                 before, reader = messages, MessageReader(input_type, decode)
                 for raw in bag.messages(topic):
                     messages += 1

@@ -24,8 +24,8 @@ from deep_nrsfm_ros.lifting.observation import Observation, to_observation
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 
 KINDS = (
-    "a bag (folder, .db3 or .mcap), an .npz with `points`, COCO keypoints (.json), a folder of "
-    "OpenPose .json files, or OpenPose frames as .jsonl (.jsonl.gz)"
+    "a bag (folder, .db3, .mcap, or .bag of ROS 1), an .npz with `points`, COCO keypoints (.json), "
+    "a folder of OpenPose .json files, or OpenPose frames as .jsonl (.jsonl.gz)"
 )
 
 _MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
@@ -119,7 +119,8 @@ def read_bag(
     """
     observations, stamps, reason, camera, count = [], [], "", "", 0
     with closing(open_bag(path)) as bag:
-        for topic, input_type, decode in keypoint_topics(bag, options.topic, options.mapping):
+        topics = keypoint_topics(bag, options.topic, options.mapping, keypoints)
+        for topic, input_type, decode in topics:
             reader = MessageReader(input_type, decode)
             for record in bag.records(topic):
                 count += 1
