@@ -156,7 +156,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     frames = len(recording.detections.stamps)
     print(f"{args.output}: {lifted} of {total} objects in {frames} frames lifted")
     if lifted < total:
-        warn(f"{total - lifted} objects have too few visible keypoints, or all on one line")
+        warn(f"{total - lifted} objects have too few detected keypoints, or all on one line")
 
 
 if __name__ == "__main__":

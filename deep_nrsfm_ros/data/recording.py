@@ -57,7 +57,7 @@ def lift_recording(
     Args:
         detections: 2D keypoints in pixels.
         source: their layout.
-        lifter: model and options.
+        lifter: model and options; its layout need not be `source`.
         on_progress: called with the number of objects done and their total number.
         intrinsics: of the camera, so that shapes are at their position in front of it; None =
             each shape is centred at the origin.
@@ -67,7 +67,9 @@ def lift_recording(
     """
     target = lifter.model.layout
     points, confidence = KeypointMap(source, target)(detections.points, detections.confidence)
-    lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter
+    if lifter.layout != source:
+        lifter = Lifter(lifter.model, lifter.options, layout=source)
+    lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter.lift
     return Recording(source, target, detections, lift_all(lift, points, confidence, on_progress))
 
 

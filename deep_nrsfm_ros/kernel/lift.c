@@ -130,7 +130,21 @@ static void set_confidence(Plan *k, const Object *o, double radius, float *confi
     }
 }
 
-/* Write a fitted object as row i of the outputs; return 1 if it is not lifted: too few keypoints are visible, or
+/* Return the number of visible keypoints, without those that follow from visible ones: `detected_count` of
+   layouts/keypoint_map.py. */
+static int detected_count(const Plan *k, const Object *o) {
+    int n = (int)o->visible_count;
+    for (int i = 0; i < k->derivations;) {
+        const int keypoint = k->derivation_pairs[2 * i];
+        int follows = o->visible[keypoint] > 0;
+        for (; i < k->derivations && k->derivation_pairs[2 * i] == keypoint; i++)
+            follows &= o->visible[k->derivation_pairs[2 * i + 1]] > 0;
+        n -= follows;
+    }
+    return n;
+}
+
+/* Write a fitted object as row i of the outputs; return 1 if it is not lifted: too few keypoints are detected, or
    all lie on one line. */
 static int write_lifted(Plan *k, Object *o, ptrdiff_t i, float *const outputs[6]) {
     int p = k->p, stride = k->stride;
@@ -158,7 +172,7 @@ static int write_lifted(Plan *k, Object *o, ptrdiff_t i, float *const outputs[6]
     outputs[2][i] = (float)scale;
     for (int c = 0; c < 2; c++) outputs[3][2 * i + c] = (float)(m.mean[c] - scale * m.mean[2 + c]);
     outputs[4][i] = (float)o->residual;
-    return on_one_line(m) || o->visible_count < k->min_visible;
+    return on_one_line(m) || detected_count(k, o) < k->min_visible;
 }
 
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,

@@ -30,9 +30,10 @@ typedef struct {
 } Object;
 
 typedef struct {
-    int p, stride, layers, rotations, refill_rounds, reference[2], min_visible, bones;
+    int p, stride, layers, rotations, refill_rounds, reference[2], min_visible, bones, derivations;
     int mirrored, whitened, scale_by_rms, corrected;                     /* flags */
     const int *widths, *partners, *bone_ends;                            /* (layers), (p), (bones, 2) */
+    const int *derivation_pairs; /* (derivations, 2): a keypoint, and one that it follows from */
     Matrix L, L_inverse, encoder[MAX_LAYERS], decoder[MAX_LAYERS], code_head;
     const float *b[MAX_LAYERS], *b_[MAX_LAYERS], *camera_head;
     const float *error_std, *covariance;                                 /* (p), (p, 3, 3, p) in DOUBLES */
@@ -58,6 +59,7 @@ typedef struct {
 /* Limits of a plan, as those of a network in algebra.h. */
 #define MAX_ROTATIONS 1024
 #define MAX_BONES 65536
+#define MAX_DERIVATIONS 65536
 #define MAX_REFILL 1000 /* rounds; so that no plan makes a lift endless */
 
 /* Check the numbers of a plan's header (length): counts, flags, widths and indices of keypoints. Returns what is
@@ -94,7 +96,7 @@ void correct(Plan *k, Object *o, double noise);
 
    points (n, p, 2), confidence (n, p). Outputs, as in `lifting.Lifted`: shapes (n, p, 3), rotations (n, 3, 3),
    scale (n), translation (n, 2), residual (n), confidence (n, p); not_lifted (n) is 1 where too few keypoints
-   are visible or all lie on one line. An object's result does not depend on the others. */
+   are detected or all lie on one line. An object's result does not depend on the others. */
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
           float *const outputs[6], char *not_lifted);
 

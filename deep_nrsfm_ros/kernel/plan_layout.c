@@ -6,7 +6,7 @@
 /* Rows of a product, at most: the codes of more do not stay in the cache. */
 #define MAX_ROWS 144
 
-#define HEADER_LENGTH 12
+#define HEADER_LENGTH 13
 
 static int in_range(int value, int first, int last) { return first <= value && value <= last; }
 
@@ -19,7 +19,7 @@ static int all_keypoints(const int *indices, ptrdiff_t n, int p) {
 
 const char *check_header(const int *h, ptrdiff_t length) {
     if (length < HEADER_LENGTH) return "the header is too short";
-    int p = h[0], layers = h[1], bones = h[11];
+    int p = h[0], layers = h[1], bones = h[11], derivations = h[12];
     if (!in_range(p, 1, MAX_KEYPOINTS)) return "the number of keypoints is out of range";
     if (!in_range(layers, 1, MAX_LAYERS)) return "the number of dictionaries is out of range";
     if (!in_range(h[2], 1, MAX_ROTATIONS)) return "the number of rotations is out of range";
@@ -29,13 +29,15 @@ const char *check_header(const int *h, ptrdiff_t length) {
     if (!(h[8] == -1 && h[9] == -1) && !all_keypoints(h + 8, 2, p)) return "the reference is no pair of keypoints";
     if (h[10] < 0) return "min_visible is negative";
     if (!in_range(bones, 0, MAX_BONES)) return "the number of bones is out of range";
-    /* All four are bounded: the sum cannot overflow. */
-    if (length != HEADER_LENGTH + (ptrdiff_t)layers + p + 2 * bones) return "the header has another length";
+    if (!in_range(derivations, 0, MAX_DERIVATIONS)) return "the number of derivations is out of range";
+    /* All five are bounded: the sum cannot overflow. */
+    if (length != HEADER_LENGTH + (ptrdiff_t)layers + p + 2 * bones + 2 * derivations) return "the header has another length";
     h += HEADER_LENGTH;
     for (int i = 0; i < layers; i++, h++)
         if (!in_range(*h, 1, MAX_WIDTH)) return "the width of a dictionary is out of range";
     if (!all_keypoints(h, p, p)) return "a partner is no keypoint";
     if (!all_keypoints(h + p, 2 * (ptrdiff_t)bones, p)) return "the end of a bone is no keypoint";
+    if (!all_keypoints(h + p + 2 * bones, 2 * (ptrdiff_t)derivations, p)) return "a derivation is of no keypoints";
     return NULL;
 }
 
@@ -69,11 +71,12 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     Items f_items = {n_floats, 0}, d_items = {n_doubles, 0};
     k->p = *h++, k->layers = *h++, k->rotations = *h++, k->mirrored = *h++, k->whitened = *h++;
     k->scale_by_rms = *h++, k->corrected = *h++, k->refill_rounds = *h++, k->reference[0] = *h++;
-    k->reference[1] = *h++, k->min_visible = *h++, k->bones = *h++;
+    k->reference[1] = *h++, k->min_visible = *h++, k->bones = *h++, k->derivations = *h++;
     int p = k->p, stride = k->stride = FLOATS_OF(p), last;
     k->widths = h, h += k->layers;
     k->partners = h, h += p;
-    k->bone_ends = h;
+    k->bone_ends = h, h += 2 * k->bones;
+    k->derivation_pairs = h;
     f = matrix(&k->L, p, p, f, &f_items);
     f = matrix(&k->L_inverse, p, p, f, &f_items);
     for (int i = 0; i < k->layers; i++) {

@@ -10,6 +10,20 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 _MIN_SHARED = 4  # a shape is unique from four points on
 
 
+def detected_count(visible: NDArray[np.bool_], derivations: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return the number (n,) of visible keypoints, without those that follow from others.
+
+    Args:
+        visible: (n, p).
+        derivations: (m, 2) as in `KeypointMap`.
+    """
+    count: NDArray[np.int64] = visible.sum(1)
+    for t in np.unique(derivations[:, 0]):
+        parts = derivations[derivations[:, 0] == t, 1]
+        count -= visible[:, t] & visible[:, parts].all(1)
+    return count
+
+
 class KeypointMap:
     """Maps keypoints of a source layout to a target layout by name.
 
@@ -17,6 +31,9 @@ class KeypointMap:
         source: layout of the input.
         target: layout of the output.
         identical: True if both have the same keypoints in the same order.
+        derivations: pairs (m, 2) of a keypoint of the target and a keypoint that it follows from,
+            in the order of the first. A visible keypoint adds no information where all that it
+            follows from are visible. A keypoint that this map derives follows from itself.
     """
 
     def __init__(self, source: KeypointLayout, target: KeypointLayout) -> None:
@@ -47,6 +64,27 @@ class KeypointMap:
                 f"layouts {source.name!r} and {target.name!r} share {shared} keypoints; "
                 f"at least {_MIN_SHARED} are needed"
             )
+        self.derivations = self._find_derivations()
+
+    def _find_derivations(self) -> NDArray[np.int32]:
+        """Return the attribute `derivations`."""
+        target, mapped = self.target, {t for t, _ in self._derived}
+        pairs: list[tuple[int, int]] = []
+        for t, name in enumerate(target.keypoints):
+            parts = target.derived.get(name, ())
+            if t in mapped:
+                pairs.append((t, t))
+            elif all(part in target.keypoints for part in parts):
+                pairs += [(t, target.index(part)) for part in parts]
+        return np.array(pairs, np.int32).reshape(-1, 2)
+
+    def detected_count(self, visible: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the number (n,) of visible keypoints, without those that follow from others.
+
+        Args:
+            visible: (n, p) in the target layout.
+        """
+        return detected_count(visible, self.derivations)
 
     def __call__(
         self, points: NDArray[np.float32], confidence: NDArray[np.float32]

@@ -44,8 +44,9 @@ class CompiledBackend:
         header += [constants.covariance is not None]
         header += [constants.refill, *(constants.reference or (-1, -1)), constants.min_visible]
         bones = constants.bones or Bones(np.zeros((2, 0), np.int32), np.zeros(0), np.zeros(0))
-        header += [len(bones.lengths), *options.widths, *(constants.partners or range(p))]
-        header += [*bones.ends.T.flat]
+        header += [len(bones.lengths), len(constants.derivations), *options.widths]
+        header += [*(constants.partners or range(p)), *bones.ends.T.flat]
+        header += [*constants.derivations.flat]
         floats = [_panels(net.L), _panels(net.L_inverse)]
         for i, (D, b, b_) in enumerate(zip(net.D, net.b, net.b_, strict=True)):
             # The kernel stores shapes with the keypoints last, (3, p).

@@ -65,7 +65,8 @@ class LiftingOptions:
     )
     min_visible: int = option(
         4,
-        "fewest visible keypoints with which an object is lifted; 4 typical",
+        "fewest detected keypoints with which an object is lifted; a keypoint that follows from "
+        "others does not count, as a neck between two visible shoulders; 4 typical",
         low=3,
         high=1000,
     )
@@ -82,7 +83,7 @@ class LiftingOptions:
 class Lifted(NamedTuple):
     """n lifted objects with p keypoints each.
 
-    An object that cannot be lifted has confidence 0 and is NaN otherwise: it has too few visible
+    An object that cannot be lifted has confidence 0 and is NaN otherwise: it has too few detected
     keypoints, or they lie on one line, which does not determine a camera.
 
     Attributes:
@@ -147,7 +148,7 @@ class Lifter:
             layout = find_layout("layout", layout)
         self.layout = layout or model.layout
         self._to_model = KeypointMap(self.layout, model.layout)
-        self.constants = _constants(model, self.options)
+        self.constants = _constants(model, self.options, self._to_model)
         backend = CompiledBackend if supports(model.network) else NumpyBackend
         self.backend = backend(self.constants)
 
@@ -169,8 +170,18 @@ class Lifter:
         seen = from_arrays(points, confidence, self.layout)
         return lift_all(self.lift, *self._to_model(seen.points, seen.confidence))
 
+    def detected_count(self, confidence: Float32) -> NDArray[np.int64]:
+        """Return the number (n,) of keypoints that count for the option `min_visible`.
+
+        Args:
+            confidence: (n, p) as in `lift`.
+        """
+        return self._to_model.detected_count(confidence > 0)
+
     def lift(self, points: Float32, confidence: Float32, *, perspective: bool = False) -> Lifted:
         """Lift an observation in the model's layout, without the checks of a call.
+
+        Keypoints that a map from this lifter's layout derives do not count for `min_visible`.
 
         Args:
             points: (n, p, 2) float32, finite.
@@ -192,7 +203,7 @@ class Lifter:
         return mark_not_lifted(lifted, not_lifted) if not_lifted.any() else lifted
 
 
-def _constants(model: Model, options: LiftingOptions) -> LifterConstants:
+def _constants(model: Model, options: LiftingOptions, to_model: KeypointMap) -> LifterConstants:
     """Return model and options in the form that a backend computes with."""
     p = len(model.layout)
     angles = 2 * np.pi * np.arange(options.test_time_rotations) / options.test_time_rotations
@@ -218,6 +229,7 @@ def _constants(model: Model, options: LiftingOptions) -> LifterConstants:
         reference_length=options.reference_length or model.layout.reference_length or 1.0,
         reference=pair and (model.layout.index(pair[0]), model.layout.index(pair[1])),
         min_visible=options.min_visible,
+        derivations=to_model.derivations,
     )
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.layouts.keypoint_map import detected_count
 from deep_nrsfm_ros.lifting.confidence import keypoint_confidence
 from deep_nrsfm_ros.lifting.correction import ErrorModel, correct
 from deep_nrsfm_ros.nrsfm.bones import Bones
@@ -55,7 +56,8 @@ class LifterConstants(NamedTuple):
         refill: rounds of filling missing keypoints with those of the lifted shape.
         reference_length: length of the reference pair in the output.
         reference: indices of the reference pair; None: the RMS radius is the reference.
-        min_visible: objects with fewer visible keypoints are not lifted.
+        min_visible: objects with fewer detected keypoints are not lifted.
+        derivations: (m, 2) keypoints that do not count as detected, as in `KeypointMap`.
     """
 
     network: Network
@@ -71,6 +73,7 @@ class LifterConstants(NamedTuple):
     reference_length: float
     reference: tuple[int, int] | None
     min_visible: int
+    derivations: NDArray[np.int32]
 
 
 class NumpyBackend:
@@ -113,7 +116,9 @@ class NumpyBackend:
         S *= self.constants.reference_length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
         not_lifted = on_one_line(points, visible)
-        not_lifted |= visible.sum(1) < self.constants.min_visible
+        not_lifted |= (
+            detected_count(visible, self.constants.derivations) < self.constants.min_visible
+        )
         return (S, R, scale, translation, residual, probability), not_lifted
 
     def keypoint_confidence(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:

@@ -128,7 +128,7 @@ class Pipeline:
         self.source = detector or model.layout
         self.edges = model.layout.edge_indices()
         self._map = KeypointMap(self.source, model.layout)
-        self._lifter = Lifter(model, lifting)
+        self._lifter = Lifter(model, lifting, layout=self.source)
         self._min_confidence = inputs.min_confidence
         self._size = inputs.image_size
         self._min_visible, self._max_objects = lifting.min_visible, inputs.max_objects
@@ -199,14 +199,15 @@ class Pipeline:
             smoother = self._smoothers[topic] = Smoother(self._smoothing)
         lifted, identities = smoother(lifted, identities, time)
         if identities and np.isnan(lifted.residual).all():
-            visible = (confidence > 0).sum(1).max()
-            if visible >= self._min_visible:
+            detected = self._lifter.detected_count(confidence).max()
+            if detected >= self._min_visible:
                 raise MessageError(
                     "message has its visible keypoints on one line or on one spot"
                     + ", or outside the view of the camera's lens" * bool(intrinsics)
                 )
             raise MessageError(
-                f"message has at most {visible} visible keypoints of the "
-                f"model's {len(self.model.layout)} in an object; min_visible is {self._min_visible}"
+                f"message has at most {detected} detected keypoints of the model's "
+                f"{len(self.model.layout)} in an object, without those that follow from others; "
+                f"min_visible is {self._min_visible}"
             )
         return lifted, identities

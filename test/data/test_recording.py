@@ -29,7 +29,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation, to_observation
-from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_quaternion
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -64,6 +64,14 @@ def test_lifts_everyone_who_is_seen_well_enough(recording: Recording) -> None:
     )
     assert recording.lifted.shapes.shape == (4, 17, 3) and points.shape == (4, 17, 2)
     assert (recording.lifted.confidence[:3] > 0).any()
+
+
+def test_head_and_shoulders_alone_are_nobody() -> None:
+    everyone = people()
+    shown = np.isin(BODY25.keypoints, ("nose", "neck", "left_shoulder", "right_shoulder"))
+    everyone.confidence[1:3] *= shown
+    lifter = Lifter(load_model("human"))
+    assert lift_recording(everyone, BODY25, lifter).is_lifted.tolist() == [1, 0, 0, 0]
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

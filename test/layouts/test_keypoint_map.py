@@ -58,6 +58,34 @@ def test_a_derived_point_needs_its_parts_in_the_source() -> None:
     assert seen == set(source.keypoints)
 
 
+@pytest.mark.parametrize(
+    ("source", "shown", "count"),
+    [
+        ("coco17", "nose left_shoulder right_shoulder", 3),
+        ("coco17", "left_eye right_eye left_ear left_hip right_hip left_knee", 3),
+        ("body25", "nose neck left_shoulder right_shoulder", 3),
+        ("body25", "nose neck left_shoulder left_wrist", 4),
+        ("human17", "nose neck mid_hip right_knee", 4),
+    ],
+)
+def test_a_keypoint_that_follows_from_visible_ones_does_not_count(
+    source: str, shown: str, count: int
+) -> None:
+    keypoint_map = KeypointMap(LAYOUTS[source], LAYOUTS["human17"])
+    confidence = np.array([[name in shown.split() for name in LAYOUTS[source].keypoints]])
+    points = np.ones((1, len(LAYOUTS[source]), 2), np.float32)
+    _, mapped = keypoint_map(points, confidence.astype(np.float32))
+    assert keypoint_map.detected_count(mapped > 0).tolist() == [count]
+
+
+def test_a_keypoint_derived_from_what_the_target_lacks_does_not_count() -> None:
+    target = KeypointLayout("t", (*"abcd", "head"), derived={"head": ("ear", "eye")})
+    source = KeypointLayout("s", (*"abcd", "ear", "eye"))
+    points, confidence = np.ones((1, 6, 2), np.float32), np.ones((1, 6), np.float32)
+    keypoint_map = KeypointMap(source, target)
+    assert keypoint_map.detected_count(keypoint_map(points, confidence)[1] > 0).tolist() == [4]
+
+
 @every_preset
 def test_points_of_the_same_layout_pass_unchanged(layout: KeypointLayout) -> None:
     points, confidence = detections(layout)

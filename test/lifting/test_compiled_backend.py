@@ -87,7 +87,7 @@ each_vectors = [HealthCheck.function_scoped_fixture]
         min_visible=st.integers(3, 5),
         reference_length=st.sampled_from([0.0, 2.0]),
     ),
-    missing=st.sampled_from([0.0, 0.3, 1.0]),
+    missing=st.sampled_from([0.0, 0.3, 0.7, 1.0]),
     perspective=st.booleans(),
 )
 def test_lifts_as_numpy_does(
