@@ -14,15 +14,18 @@ from pathlib import Path
 from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
+from deep_nrsfm_ros.reporting.page import Training, write_report
+from deep_nrsfm_ros.reporting.shapes import handedness_warning
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.distributed import rank
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments
-from deep_nrsfm_ros.training.run import run
+from deep_nrsfm_ros.training.run import TrainingResult, run
 
 
 def parser() -> argparse.ArgumentParser:
@@ -141,6 +144,37 @@ def stop_with_parent(stopped: Callable[[], bool]) -> Callable[[], bool]:
     return lambda: stopped() or orphaned.is_set()
 
 
+def report_end(result: TrainingResult, reporter: Reporter) -> None:
+    """Write the page of a training, and report how the training ended."""
+    values: dict[str, object] = dict(result.model.quality)
+    if warning := handedness_warning(result.model, result.prepared.dataset):
+        reporter.warn(warning)
+        values["warning"] = warning
+    page = write_page(result, reporter)
+    message = result.message + (f"; report {page}" if page else "")
+    reporter.end(result.state, message, model=str(result.path), report=page, **values)
+
+
+def write_page(result: TrainingResult, reporter: Reporter) -> str:
+    """Write the HTML report next to the model; return its path, "" if that was not possible.
+
+    A page that cannot be written costs no model. A finished training is shown beside the other
+    models, which takes a second for each; a cancelled one does not take the time.
+    """
+    prepared = result.prepared
+    training = Training(
+        *(result.model, result.path, prepared.dataset, prepared.curated, prepared.sufficiency),
+        progress=reporter.curves,
+        warnings=reporter.warnings,
+    )
+    folders = model_folders(result.path.parent) if result.state == "finished" else []
+    try:
+        return str(write_report(training, folders))
+    except (ValueError, OSError) as error:
+        reporter.say(f"no report was written: {error}")
+        return ""
+
+
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command; exit code 2 says that the input was at fault."""
@@ -150,7 +184,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         should_stop = stop_with_parent(should_stop)
     reporter = (SilentReporter if rank() else Reporter)(arguments.json_progress, should_stop)
     try:
-        run(parse(arguments, reporter.say), reporter, should_stop)
+        if result := run(parse(arguments, reporter.say), reporter, should_stop):
+            report_end(result, reporter)
     except CancelledError:
         reporter.end("cancelled", "cancelled before anything was learned; nothing was written")
     except (ValueError, OSError) as error:

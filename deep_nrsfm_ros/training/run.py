@@ -1,4 +1,4 @@
-"""One training from its configuration to the model file and its report."""
+"""One training from its configuration to the model file."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from safetensors import SafetensorError
 
-from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
-from deep_nrsfm_ros.reporting.page import Training, write_report
-from deep_nrsfm_ros.reporting.shapes import handedness_warning
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
@@ -30,13 +27,36 @@ if TYPE_CHECKING:
     from deep_nrsfm_ros.training.trainer import Trainer
 
 
-def run(config: TrainingConfig, reporter: Reporter, should_stop: Callable[[], bool]) -> None:
-    """Read the data, train, and save the model with its report.
+class TrainingResult(NamedTuple):
+    """A training that has ended and whose model is saved.
+
+    Attributes:
+        model: the model that was learned.
+        path: its file.
+        prepared: the data it was learned from.
+        state: "finished" or "cancelled".
+        message: one line for people about the end.
+    """
+
+    model: Model
+    path: Path
+    prepared: Prepared
+    state: str
+    message: str
+
+
+def run(
+    config: TrainingConfig, reporter: Reporter, should_stop: Callable[[], bool]
+) -> TrainingResult | None:
+    """Read the data, train, and save the model.
 
     Args:
         config: what to train on, how, and where the model goes.
-        reporter: takes progress, warnings and the end.
+        reporter: takes progress and warnings.
         should_stop: called often; True ends the training, which saves the best model so far.
+
+    Returns:
+        The result; None in all but the first of several processes.
 
     Raises:
         ValueError: for a configuration, data or a folder that a training cannot work with.
@@ -46,7 +66,7 @@ def run(config: TrainingConfig, reporter: Reporter, should_stop: Callable[[], bo
     prepared = prepare(config.curation, read_data(config, reporter), reporter)
     try:
         with _record(config) as checkpoint:
-            _train_and_save(config, prepared, checkpoint, reporter, should_stop)
+            return _train_and_save(config, prepared, checkpoint, reporter, should_stop)
     except SafetensorError as error:  # neither OSError nor ValueError, though the disk is full
         raise ValueError(unwritable(config.output.folder, error)) from error
 
@@ -64,13 +84,13 @@ def _train_and_save(
     checkpoint: Path,
     reporter: Reporter,
     should_stop: Callable[[], bool],
-) -> None:
-    """Train on the prepared data; the first process saves the model and reports the end."""
+) -> TrainingResult | None:
+    """Train on the prepared data; the first process saves the model and returns the result."""
     start = load_model(Path(config.start)) if config.start else None
     _describe(prepared, reporter, starts_anew=start is None)
     trainer = _train(config, prepared, checkpoint, reporter, should_stop)
     if trainer.group.rank:
-        return
+        return None
     if not trainer.step:
         checkpoint.unlink(missing_ok=True)
         raise CancelledError
@@ -84,7 +104,7 @@ def _train_and_save(
         model = inherit(model, start)
     path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"
     save_model(path, model)
-    _report_end(model, path, prepared, reporter, _ending(trainer, path, model, checkpoint))
+    return TrainingResult(model, path, prepared, *_ending(trainer, path, model, checkpoint))
 
 
 def _describe(prepared: Prepared, reporter: Reporter, *, starts_anew: bool) -> None:
@@ -144,37 +164,3 @@ def _ending(trainer: Trainer, path: Path, model: Model, checkpoint: Path) -> tup
     if trainer.step < steps:
         message += f"; after {trainer.step} of {steps} steps {trainer.end_reason}"
     return "finished", message
-
-
-def _report_end(
-    model: Model, path: Path, prepared: Prepared, reporter: Reporter, ending: tuple[str, str]
-) -> None:
-    """Write the page of the training, and report its end."""
-    state, message = ending
-    values: dict[str, object] = dict(model.quality)
-    if warning := handedness_warning(model, prepared.dataset):
-        reporter.warn(warning)
-        values["warning"] = warning
-    page = _write_page(model, path, prepared, reporter, compare=state == "finished")
-    message += f"; report {page}" if page else ""
-    reporter.end(state, message, model=str(path), report=page, **values)
-
-
-def _write_page(
-    model: Model, path: Path, prepared: Prepared, reporter: Reporter, *, compare: bool
-) -> str:
-    """Write the HTML report next to the model; return its path, "" if that was not possible.
-
-    A page that cannot be written costs no model. `compare`: show other models beside this one,
-    which takes a second for each; a cancelled training does not take the time.
-    """
-    training = Training(
-        *(model, path, prepared.dataset, prepared.curated, prepared.sufficiency),
-        progress=reporter.curves,
-        warnings=reporter.warnings,
-    )
-    try:
-        return str(write_report(training, model_folders(path.parent) if compare else []))
-    except (ValueError, OSError) as error:
-        reporter.say(f"no report was written: {error}")
-        return ""
