@@ -46,9 +46,10 @@ def read_camera_file(path: Path, *, rectified: bool = False) -> Intrinsics:
 def read_image_size(path: Path) -> Size | None:
     """Return width and height in pixels of the image of a camera file; None if it lacks them."""
     fields = read_fields(path, "k: [600, 0, 320, ...]")
-    size = tuple(fields.get(f"image_{side}", fields.get(side)) for side in ("width", "height"))
-    known = all(isinstance(side, int) and side > 0 for side in size)
-    return (size[0], size[1]) if known else None
+    width, height = (fields.get(f"image_{side}", fields.get(side)) for side in ("width", "height"))
+    if not isinstance(width, int) or not isinstance(height, int):
+        return None
+    return (width, height) if width > 0 and height > 0 else None
 
 
 def _message(content: dict[Any, Any]) -> SimpleNamespace:

@@ -140,4 +140,5 @@ def _sample(confidence: NDArray[np.float32]) -> NDArray[np.int64]:
     full = np.flatnonzero(visible >= np.median(visible)) if len(visible) else np.arange(0)
     if len(full) <= MAX_OBJECTS:
         return full
-    return full[np.linspace(0, len(full) - 1, MAX_OBJECTS).astype(int)]
+    chosen: NDArray[np.int64] = full[np.linspace(0, len(full) - 1, MAX_OBJECTS).astype(int)]
+    return chosen

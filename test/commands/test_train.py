@@ -19,7 +19,6 @@ import torch
 
 import deep_nrsfm_ros
 from deep_nrsfm_ros.commands import train
-from deep_nrsfm_ros.commands import train as train_command
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout_file import read_layout
@@ -27,6 +26,7 @@ from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.training import run
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -521,9 +521,7 @@ def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
 ) -> None:
     words = (*arguments, "--steps", "3")
     for told in ("", "no depth in mine"):
-        monkeypatch.setattr(
-            train_command, "handedness_warning", lambda model, dataset, told=told: told
-        )
+        monkeypatch.setattr(train, "handedness_warning", lambda model, dataset, told=told: told)
         assert in_process(*words, "--json-progress") == 0
         *_, end = map(json.loads, capsys.readouterr().out.splitlines())
         assert (end["state"], end.get("warning", "")) == ("finished", told)
