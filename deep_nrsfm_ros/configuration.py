@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 Config = TypeVar("Config")
 
@@ -37,10 +37,13 @@ class Option:
 
         Args:
             name: name of the option, for the error message.
-            value: a value, or a tuple or list of them.
+            value: a value, or a tuple or list of them; None, where that is the default, is
+                allowed.
         """
         values = value if isinstance(value, (tuple, list)) else (value,)
         for item in values:
+            if item is None:
+                continue
             if self.choices and item not in self.choices:
                 raise ValueError(f"{name} is {item!r}; choose one of {', '.join(self.choices)}")
             below = self.low is not None and not item >= self.low
@@ -99,6 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type, without: Sequence[
     for field, kind, opt in options(cls):
         if field.name in without:
             continue
+        kind = _without_none(kind)
         settings: dict[str, Any] = {"default": argparse.SUPPRESS}
         if kind is bool:
             settings["action"] = argparse.BooleanOptionalAction
@@ -109,10 +113,15 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type, without: Sequence[
             settings["type"] = kind
         if opt.choices:
             settings["choices"] = opt.choices
-        default: Any = field.default
+        default: Any = "none" if field.default is None else field.default
         shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
         settings["help"] = f"{opt.description} (default: {shown})".replace("%", "%%")
         group.add_argument("--" + field.name.replace("_", "-"), **settings)
+
+
+def _without_none(kind: Any) -> Any:
+    """Return `float` for `float | None`, and any other type as it is."""
+    return next((part for part in get_args(kind) if part is not type(None)), kind)
 
 
 def override(base: Config, arguments: argparse.Namespace) -> Config:

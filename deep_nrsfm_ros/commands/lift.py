@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -42,23 +43,17 @@ def arguments() -> argparse.ArgumentParser:
 
 def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of reading keypoints and of lifting."""
-    parser.add_argument("--topic", default="", help="keypoints in a bag (default: the only ones)")
     parser.add_argument(
         "--mapping",
         default="",
         help="field mapping (.yaml) for messages in a bag of a type not known here",
     )
     parser.add_argument(
-        "--rate",
-        type=_positive,
-        default=30.0,
-        help="frames a second of input without stamps (default: %(default)s)",
-    )
-    parser.add_argument(
         "--objects",
         default="all",
         choices=("all", "largest"),
-        help="lift all objects of a frame, or the largest in the image (default: %(default)s)",
+        help="lift all objects of a frame, or the largest in the image of those with at least half "
+        "of the best score (default: %(default)s)",
     )
     parser.add_argument(
         "--intrinsics",
@@ -72,37 +67,52 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the keypoints are those of the rectified image, to which CameraInfo's P belongs",
     )
+    add_arguments(parser, ReadOptions)
     add_arguments(parser, InputOptions, without=("input_type", "topics"))
     add_arguments(parser, LiftingOptions)
 
 
-def read_model(args: argparse.Namespace) -> tuple[Model, KeypointLayout]:
-    """Return the model and the layout of the keypoints; raise ValueError if one is missing."""
+def read_model(args: argparse.Namespace) -> tuple[Model, KeypointLayout | None]:
+    """Return the model, and the layout that the user names for the keypoints; None = no layout.
+
+    Raises:
+        ValueError: the model or the layout is missing.
+    """
     inputs = override(InputOptions(), args)
     model = load_model(inputs.model, Path(inputs.models_dir).expanduser())
     if inputs.keypoint_layout == MODEL_ORDER:
-        return model, model.layout
+        return model, None
     return model, find_layout("--keypoint-layout", inputs.keypoint_layout)
 
 
-def read_objects(args: argparse.Namespace, source: KeypointLayout) -> Detections:
-    """Return the objects in the input; raise ValueError if it cannot be read."""
+def read_objects(
+    args: argparse.Namespace, model: Model, layout: KeypointLayout | None
+) -> tuple[Detections, KeypointLayout]:
+    """Return the objects in the input, and the layout of their keypoints.
+
+    Args:
+        args: the command line.
+        model: its layout is that of an input that does not name its keypoints.
+        layout: as the user names it; None = that of the input or of the model.
+
+    Raises:
+        ValueError: the input cannot be read, or has other keypoints than the layout.
+    """
     inputs = override(InputOptions(), args)
+    options = dataclasses.replace(
+        override(ReadOptions(), args),
+        min_confidence=inputs.min_confidence,
+        mapping=read_mapping(Path(args.mapping).expanduser()) if args.mapping else None,
+        image_size=inputs.image_size,
+        layout=layout,
+        fallback=model.layout,
+    )
     with progress("reading") as on_progress:
-        detections = read_keypoints(
-            args.input,
-            len(source),
-            ReadOptions(
-                topic=args.topic,
-                rate=args.rate,
-                min_confidence=inputs.min_confidence,
-                mapping=read_mapping(Path(args.mapping).expanduser()) if args.mapping else None,
-                image_size=inputs.image_size,
-            ),
-            on_progress=on_progress,
-            warn=warn,
-        )
-    return detections.largest() if args.objects == "largest" else detections
+        detections = read_keypoints(args.input, options, on_progress)
+    for warning in detections.warnings:
+        warn(warning)
+    chosen = detections.largest() if args.objects == "largest" else detections
+    return chosen, detections.layout or model.layout
 
 
 def lift_objects(
@@ -133,21 +143,15 @@ def warn(message: str) -> None:
     tqdm.write(f"warning: {message}", file=sys.stderr)
 
 
-def _positive(text: str) -> float:
-    """Return a number above 0; raise ValueError for another."""
-    if not 0 < (value := float(text)) < 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not above 0")
-    return value
-
-
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Write the lifted objects; exit code 2 says that the input was at fault."""
     args = arguments().parse_args(argv)
     try:
         check_output(args.output)
-        model, source = read_model(args)
-        recording = lift_objects(args, model, source, read_objects(args, source))
+        model, layout = read_model(args)
+        detections, source = read_objects(args, model, layout)
+        recording = lift_objects(args, model, source, detections)
         write_recording(args.output, recording, model.name)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)

@@ -81,7 +81,7 @@ def arguments() -> argparse.ArgumentParser:
 
 
 def read_recording(
-    args: argparse.Namespace, model: Model, source: KeypointLayout
+    args: argparse.Namespace, model: Model, layout: KeypointLayout | None
 ) -> tuple[Recording, str]:
     """Return the recording, and the origin of its shapes as text.
 
@@ -91,16 +91,18 @@ def read_recording(
     if not args.input.exists():
         raise ValueError(f"{args.input} does not exist")
     if args.lift_again or not is_bag(args.input) or not has_lifted_messages(args.input):
-        recording = lift_objects(args, model, source, read_objects(args, source))
+        detections, source = read_objects(args, model, layout)
+        recording = lift_objects(args, model, source, detections)
         return recording, f"lifted with model {model.name}"
     with progress("reading lifted points") as on_progress:
         lifted = read_lifted_messages(args.input, on_progress, warn)
     try:
-        detections: Detections | None = read_objects(args, source)
+        recorded: Detections | None
+        recorded, source = read_objects(args, model, layout)
     except BagError as error:
         warn(f"showing the lifted points without keypoints: {error}")
-        detections = None
-    recording = join_lifted_messages(lifted, detections, source, model.layout)
+        recorded, source = None, layout or model.layout
+    recording = join_lifted_messages(lifted, recorded, source, model.layout)
     return recording, f"as recorded; drawn as model {model.name}"
 
 
@@ -179,15 +181,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         if not args.html and not args.serve:
             raise ValueError("no output chosen: give --html FILE, --serve, or both")
-        model, source = read_model(args)
+        model, layout = read_model(args)
         if args.input is None:
             if args.html:
                 raise ValueError(
                     "--html needs a BAG: record one, or show the running lifter with --serve"
                 )
-            watch(args, model, source)
+            watch(args, model, layout or model.layout)
             return
-        recording, origin = read_recording(args, model, source)
+        recording, origin = read_recording(args, model, layout)
         if args.html:
             page = recording_page(recording, args.input.name, [origin], args.max_frames)
             args.html.write_text(page, encoding="utf-8")

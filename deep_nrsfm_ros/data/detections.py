@@ -5,12 +5,28 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.openpose import largest
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
+
+_GHOST = 0.5  # of the best score in a frame: an object below it is not chosen for its size
+
+
+class Frames(NamedTuple):
+    """How the input calls its f frames.
+
+    Attributes:
+        numbers: (f,) int64, numbers of the frames in the input; their index if it gives none.
+        names: (f,) str, names of files or images; "" where the input gives none.
+    """
+
+    numbers: NDArray[np.int64]
+    names: NDArray[np.str_]
 
 
 @dataclass(frozen=True)
@@ -21,9 +37,14 @@ class Detections:
         points: (m, q, 2) float32 in pixels, x right and y down; 0 where missing.
         confidence: (m, q) float32 in [0, 1]; 0 where missing.
         frame: (m,) int64, ascending; index into `stamps` of the frame with the object.
-        identities: (m,) str, identity of the object; its index in the frame if the source has none.
+        identities: (m,) str, identity of the object; "" for an object without one; its index in
+            the frame if the source gives none at all.
         stamps: (f,) int64 in ns, of all frames, also of those without an object.
         frame_id: name of the camera; "" if unknown.
+        frames: numbers and names of the frames; None = numbered from 0, without names.
+        scores: (m,) float32, score of the object in the detector's own scale; None = all 1.
+        layout: layout in which the keypoints are given; None = nothing says it.
+        warnings: sentences about what was left out of the source or looks wrong.
     """
 
     points: NDArray[np.float32]
@@ -32,11 +53,25 @@ class Detections:
     identities: NDArray[np.str_]
     stamps: NDArray[np.int64]
     frame_id: str = ""
+    frames: Frames = None  # type: ignore[assignment]  # never None after __post_init__
+    scores: NDArray[np.float32] = None  # type: ignore[assignment]
+    layout: KeypointLayout | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise ValueError if the arrays do not match each other or frames are not ascending."""
         m, q = self.confidence.shape
-        for name, shape in {"points": (m, q, 2), "frame": (m,), "identities": (m,)}.items():
+        if self.frames is None:
+            f = len(self.stamps)
+            object.__setattr__(self, "frames", Frames(np.arange(f), np.full(f, "")))
+        if self.scores is None:
+            object.__setattr__(self, "scores", np.ones(m, np.float32))
+        for name, shape in {
+            "points": (m, q, 2),
+            "frame": (m,),
+            "identities": (m,),
+            "scores": (m,),
+        }.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} are {getattr(self, name).shape}; {shape} is needed")
         if m and not (0 <= self.frame.min() and self.frame.max() < len(self.stamps)):
@@ -56,16 +91,22 @@ class Detections:
             confidence=self.confidence[objects],
             frame=self.frame[objects],
             identities=self.identities[objects],
+            scores=self.scores[objects],
         )
 
     def largest(self) -> Detections:
-        """Return the object with the largest bounding box of each frame that has one."""
+        """Return the object with the largest bounding box of each frame that has one.
+
+        An object with less than half of the best score in its frame is not chosen, however large
+        it is.
+        """
         first, count = np.unique(self.frame, return_index=True, return_counts=True)[1:]
         indices = []
         for start, number in zip(first.tolist(), count.tolist(), strict=True):
-            rows = slice(start, start + number)
+            scores = self.scores[start : start + number]
+            rows = start + np.flatnonzero(~(scores < _GHOST * scores.max()))
             index = largest(Observation(self.points[rows], self.confidence[rows]))
-            indices.append(start + (index or 0))
+            indices.append(int(rows[index or 0]))
         return self[np.array(indices, np.int64)]
 
 
@@ -83,8 +124,7 @@ def gather(
         stamps: (f,) in ns.
         keypoints: number q of keypoints, for the case that there is no object.
         frame_id: name of the camera.
-        identities: of all objects in order; None = those of the observations, and the index in
-            the frame for objects without one.
+        identities: of all objects in order; None = those of the observations.
     """
     frames = list(observations)
     counts = [len(observation.confidence) for observation in frames]
@@ -102,14 +142,14 @@ def gather(
 
 
 def _identities(observations: Sequence[Observation]) -> list[str]:
-    """Return the identity of each object, or its index in its frame if it has none."""
-    return [
-        str(i) if identity is None else identity
-        for observation in observations
-        for i, identity in enumerate(
-            observation.identities or (None,) * len(observation.confidence)
-        )
-    ]
+    """Return the identity of each object, "" for none; its index if no object has any."""
+    if any(identity is not None for each in observations for identity in each.identities):
+        return [
+            identity or ""
+            for each in observations
+            for identity in each.identities or (None,) * len(each.confidence)
+        ]
+    return [str(i) for each in observations for i in range(len(each.confidence))]
 
 
 def stamps_at(rate: float, frames: int) -> NDArray[np.int64]:

@@ -1,90 +1,259 @@
-"""Keypoint files of several kinds to detections: bags, npz, COCO JSON, OpenPose JSON."""
+"""Keypoint files of several kinds to detections: the table of formats, and what all share."""
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
-import json
-import re
+import io
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.bag_files import SUFFIXES, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
-from deep_nrsfm_ros.data.bags import Progress
-from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
-from deep_nrsfm_ros.data.openpose import read_people
+from deep_nrsfm_ros.data.bags import Progress, keypoint_count
+from deep_nrsfm_ros.data.detections import Detections, gather
+from deep_nrsfm_ros.data.formats.arrays import read_npy, read_npz
+from deep_nrsfm_ros.data.formats.builder import DetectionsBuilder, KeypointFileError
+from deep_nrsfm_ros.data.formats.frame_numbers import natural
+from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
+from deep_nrsfm_ros.data.formats.json_items import Readable
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
-from deep_nrsfm_ros.lifting.observation import Observation, to_observation
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 
-KINDS = (
-    "a bag (folder, .db3, .mcap, or .bag of ROS 1), an .npz with `points`, COCO keypoints (.json), "
-    "a folder of OpenPose .json files, or OpenPose frames as .jsonl (.jsonl.gz)"
-)
+__all__ = ["KINDS", "KeypointFileError", "is_bag", "read_bag", "read_keypoints", "stamp_of"]
 
-_MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
+_MANY = 3
+_SHARE = 0.02
+"""As many objects, and this share of them, with a keypoint at one negative place are a mark."""
 
 
-class KeypointFileError(ValueError):
-    """A file of keypoints cannot be read; the message names the file and the remedy."""
+class Format(NamedTuple):
+    """A format of keypoint files.
+
+    Attributes:
+        description: for the help of programs.
+        suffixes: ends of the names of its files.
+        read: returns the detections in such a file.
+        has_categories: its objects may be of several categories.
+    """
+
+    description: str
+    suffixes: tuple[str, ...]
+    read: Callable[[Path, ReadOptions, Progress], Detections]
+    has_categories: bool = False
 
 
 def read_keypoints(
     path: Path,
-    keypoints: int,
     options: ReadOptions = DEFAULT_READ_OPTIONS,
     on_progress: Progress = lambda done, total: None,
-    warn: Callable[[str], None] = lambda message: None,
 ) -> Detections:
     """Return the detections in a file or folder of any of `KINDS`.
 
+    Their `layout` is the layout that the options name; else the one that the input names; else
+    the fallback of the options. Their `warnings` say what was left out and what looks wrong.
+
     Args:
         path: the file or folder; its name and content say of which kind it is.
-        keypoints: number q of keypoints of the detector's layout, e.g. 17.
-        options: topic and mapping for bags, rate for files without stamps, least confidence.
+        options: layout, topic and mapping for bags, rate for files without stamps, ...
         on_progress: called while reading.
-        warn: called with a sentence about each damaged part.
 
     Raises:
-        KeypointFileError: the file is missing, of no known kind, or damaged.
+        KeypointFileError: the file is missing, of no known kind, damaged, or nothing is left of
+            it; or an option cannot apply to it.
         BagError: a bag cannot be read.
     """
-    name = path.name.lower()
     if not path.exists():
         raise KeypointFileError(f"{path} does not exist")
-    if is_bag(path):
-        return read_bag(path, keypoints, options, on_progress, warn)
     try:
-        if path.is_dir():
-            files = sorted(path.glob("*.json"), key=_natural)
-            if not files:
-                raise KeypointFileError(f"it holds neither a bag nor .json files; expected {KINDS}")
-            texts = ((file.name, file.read_bytes()) for file in files)
-            return _openpose(texts, len(files), keypoints, options, on_progress)
-        if name.endswith(".npz"):
-            return _npz(path, keypoints, options)
-        if name.endswith((".jsonl", ".jsonl.gz")):
-            data = path.read_bytes()
-            lines = (gzip.decompress(data) if name.endswith(".gz") else data).splitlines()
-            numbered = ((f"line {i}", line) for i, line in enumerate(lines, 1) if line.strip())
-            return _openpose(numbered, len(lines), keypoints, options, on_progress)
-        if name.endswith(".json"):
-            content = json.loads(path.read_bytes())
-            if isinstance(content, dict) and "people" in content:
-                frame = [(path.name, path.read_bytes())]
-                return _openpose(frame, 1, keypoints, options, on_progress)
-            return _coco(content, keypoints, options)
+        if is_bag(path):
+            _refuse(options, ("category", "min_score", "rate"), "a bag")
+            return _finish(read_bag(path, options, on_progress), options)
+        _refuse(options, ("topic", "mapping"), "a file that is no bag")
+        form = _format_of(path)
+        if not form.has_categories:
+            _refuse(options, ("category",), "a file that is not COCO")
+        return _finish(form.read(path, options, on_progress), options)
     except (ValueError, TypeError, ArithmeticError, EOFError, OSError, zlib.error) as error:
+        if is_bag(path):
+            raise
         raise KeypointFileError(f"{path}: {error}") from None
     except (MemoryError, RecursionError) as error:
         raise KeypointFileError(f"{path} asks for more than there is: {error!r}") from None
-    raise KeypointFileError(f"{path} is of no known kind; expected {KINDS}")
+
+
+def _format_of(path: Path) -> Format:
+    """Return the format of a file or folder by its name."""
+    if path.is_dir():
+        return _FOLDER
+    name = path.name.lower()
+    for form in FORMATS:
+        if name.endswith(form.suffixes):
+            return form
+    raise KeypointFileError(f"it is of no known kind; expected {KINDS}")
+
+
+def _refuse(options: ReadOptions, names: tuple[str, ...], kind: str) -> None:
+    """Raise KeypointFileError for an option that has no effect on an input of this kind."""
+    for name in names:
+        if getattr(options, name) != getattr(DEFAULT_READ_OPTIONS, name):
+            flag = "--" + name.replace("_", "-")
+            raise KeypointFileError(f"{flag} has no effect on {kind}: leave it out")
+
+
+def _finish(detections: Detections, options: ReadOptions) -> Detections:
+    """Return detections without marks of missing keypoints, with warnings of likely ones."""
+    points, confidence = detections.points, detections.confidence
+    if options.missing_value is not None:
+        marked = (points == np.float32(options.missing_value)).any(-1) & (confidence > 0)
+        points, confidence = points.copy(), confidence.copy()
+        points[marked], confidence[marked] = 0, 0
+        detections = dataclasses.replace(detections, points=points, confidence=confidence)
+    if warning := _likely_mark(detections):
+        return dataclasses.replace(detections, warnings=(*detections.warnings, warning))
+    return detections
+
+
+def _likely_mark(detections: Detections) -> str:
+    """Return a warning if many objects have a keypoint at the same negative place; "" if not."""
+    points = detections.points
+    negative = np.argwhere((points < 0).all(-1) & (detections.confidence > 0))
+    if not len(negative):
+        return ""
+    places = points[negative[:, 0], negative[:, 1]]
+    unique, which = np.unique(places, axis=0, return_inverse=True)
+    which = which.ravel()
+    counts = Counter(zip(which.tolist(), negative[:, 0].tolist(), strict=True))
+    objects = np.bincount([place for place, _ in counts])
+    most = int(objects.argmax())
+    if objects[most] < max(_MANY, _SHARE * len(points)):
+        return ""
+    x, y = unique[most].tolist()
+    option = f"--missing-value {x:g}" if x == y else "--missing-value with one of them"
+    return (
+        f"{objects[most]} of {len(points)} objects have keypoints at ({x:g}, {y:g}), which is "
+        f"likely a mark of missing ones: {option} leaves them out"
+    )
+
+
+def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
+    """Return the objects in a JSON file of any detector."""
+    builder = DetectionsBuilder(options)
+    with path.open("rb") as file:
+        problem = _read_document(
+            JsonReader(builder), _Counted(file, path, on_progress), DefaultFrame(path.name)
+        )
+    if problem and not builder.frames:
+        reasons = builder.reasons()
+        raise KeypointFileError("; ".join([problem, *reasons]))
+    if problem:
+        builder.warnings.append(f"it is read up to a damaged place only: {problem}")
+    return builder.detections("it has no frame")
+
+
+def _read_document(reader: JsonReader, file: Readable, frame: DefaultFrame) -> str:
+    """Read a document; return what is wrong with it, "" if nothing is."""
+    try:
+        return reader.read(file, frame)
+    except RecursionError:
+        return "it is nested too deep for JSON of a detector"
+    except ValueError as error:
+        return str(error)
+
+
+class _Counted:
+    """A file that reports how much of it is read."""
+
+    def __init__(self, file: IO[bytes], path: Path, on_progress: Progress) -> None:
+        self._file, self._size, self._on_progress = file, path.stat().st_size, on_progress
+
+    def read(self, size: int = -1, /) -> bytes:
+        """Return at most `size` bytes."""
+        data = self._file.read(size)
+        self._on_progress(min(self._file.tell(), self._size), self._size)
+        return data
+
+
+def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
+    """Return the objects in a file that has in each line a document, which is a frame."""
+    builder = DetectionsBuilder(options)
+    size = path.stat().st_size
+    is_compressed = path.name.lower().endswith(".gz")
+
+    def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
+        lines = (line for line in file if line.strip())
+        for number, line in enumerate(lines):
+            yield DefaultFrame(f"line {number + 1}", number), line
+            on_progress(min(file.tell(), size), size)
+
+    with gzip.open(path) if is_compressed else path.open("rb") as file:
+        try:
+            _read_frames(builder, documents())
+        except (EOFError, OSError, zlib.error) as error:
+            if not builder.frames:
+                raise
+            builder.warnings.append(f"it is read up to a damaged place only: {error}")
+    return builder.detections("it is empty")
+
+
+def _folder(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
+    """Return the objects in a folder with a document, which is a frame, in each file."""
+    builder = DetectionsBuilder(options)
+    files = []
+    for file in sorted(path.iterdir(), key=natural):
+        if file.name.startswith("."):  # ._frame.json: what macOS writes beside each file
+            builder.leave_out("are hidden files", file.name)
+        elif file.suffix.lower() == ".json" and file.is_file():
+            files.append(file)
+        elif file.suffix.lower() not in _IMAGES:
+            builder.leave_out("are no .json files", file.name)
+    if not files:
+        raise KeypointFileError(f"it holds neither a bag nor .json files; expected {KINDS}")
+
+    def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
+        for done, file in enumerate(files, 1):
+            yield DefaultFrame(file.name), file.read_bytes()
+            on_progress(done, len(files))
+
+    _read_frames(builder, documents())
+    return builder.detections("no file in it has keypoints")
+
+
+def _read_frames(
+    builder: DetectionsBuilder, documents: Iterator[tuple[DefaultFrame, bytes]]
+) -> None:
+    """Read documents, each a frame; what is none is left out and counted."""
+    reader = JsonReader(builder)
+    for frame, text in documents:
+        if problem := _read_document(reader, io.BytesIO(text), frame):
+            builder.leave_out("cannot be read", f"{frame.name}: {problem}")
+
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+"""Images beside the files of their keypoints are no keypoints, and usual."""
+_FOLDER = Format("a folder of .json files, one a frame", (), _folder, has_categories=True)
+FORMATS = (
+    Format("an .npz with `points`", (".npz",), lambda path, options, _: read_npz(path, options)),
+    Format("an .npy", (".npy",), lambda path, options, _: read_npy(path, options)),
+    Format(
+        "JSON of COCO, OpenPose, MMPose, AlphaPose, MediaPipe or PoseNet (.json)",
+        (".json",),
+        _json,
+        has_categories=True,
+    ),
+    Format("such JSON of a frame a line (.jsonl, .jsonl.gz)", (".jsonl", ".jsonl.gz"), _lines),
+)
+"""The formats of single files."""
+KINDS = "; ".join(
+    ["a bag (folder, .db3, .mcap, or .bag of ROS 1)", *(form.description for form in (*FORMATS, _FOLDER))]
+)
+"""What `read_keypoints` reads, for the help of programs."""
 
 
 def is_bag(path: Path) -> bool:
@@ -96,10 +265,8 @@ def is_bag(path: Path) -> bool:
 
 def read_bag(
     path: Path,
-    keypoints: int,
     options: ReadOptions = DEFAULT_READ_OPTIONS,
     on_progress: Progress = lambda done, total: None,
-    warn: Callable[[str], None] = lambda message: None,
 ) -> Detections:
     """Return the detections on a topic of a bag, in order of time.
 
@@ -108,16 +275,17 @@ def read_bag(
 
     Args:
         path: bag folder, or a single .db3 or .mcap file.
-        keypoints: number q of keypoints of the detector's layout.
-        options: topic, mapping, image size and least confidence.
+        options: layout, topic, mapping, image size and least confidence.
         on_progress: called after every 256 messages.
-        warn: called with a sentence about each damaged part and about unreadable messages.
 
     Raises:
         BagError: the bag cannot be read, or has no such topic.
         KeypointFileError: no message is readable.
     """
     observations, stamps, reason, camera, count = [], [], "", "", 0
+    warnings: list[str] = []
+    layout = options.layout or options.fallback
+    keypoints = len(layout) if layout else keypoint_count([path], options)
     with closing(open_bag(path)) as bag:
         topics = keypoint_topics(bag, options.topic, options.mapping, keypoints)
         for topic, input_type, decode in topics:
@@ -136,159 +304,20 @@ def read_bag(
                 if count % 256 == 0:
                     on_progress(count, max(count, topic.total))
             if warning := bag.warning(topic):
-                warn(warning)
+                warnings.append(warning)
     if not observations:
         raise KeypointFileError(f"no readable message in {path} ({count} found); {reason}")
     if len(observations) < count:
-        warn(f"{count - len(observations)} of {count} messages could not be read: {reason}")
+        warnings.append(
+            f"{count - len(observations)} of {count} messages could not be read: {reason}"
+        )
     order = np.argsort(stamps, kind="stable")
     ordered = [observations[i] for i in order], [stamps[i] for i in order]
-    return gather(*ordered, keypoints, camera)
+    detections = gather(*ordered, keypoints, camera)
+    return dataclasses.replace(detections, layout=layout, warnings=tuple(warnings))
 
 
 def stamp_of(message: Any) -> int:
     """Return the stamp in the header of a message in ns; 0 if it has no header."""
     header = read_header(message)
     return header.stamp if header else 0
-
-
-def _openpose(
-    texts: Iterable[tuple[str, bytes]],
-    total: int,
-    keypoints: int,
-    options: ReadOptions,
-    on_progress: Progress,
-) -> Detections:
-    """Return the people in frames of OpenPose JSON, given as pairs (file or line, JSON)."""
-    observations: list[Observation] = []
-    for done, (name, text) in enumerate(texts, 1):
-        try:
-            observations.append(read_people(text, keypoints, options.min_confidence))
-        except ValueError as error:
-            raise KeypointFileError(f"{name}: {error}; is it the right keypoint layout?") from None
-        on_progress(done, total)
-    if not observations:
-        raise KeypointFileError("it is empty")
-    return gather(observations, stamps_at(options.rate, len(observations)), keypoints)
-
-
-def _coco(content: Any, keypoints: int, options: ReadOptions) -> Detections:
-    """Return the people in COCO keypoint annotations, or in a list of COCO results."""
-    rows = content.get("annotations") if isinstance(content, dict) else content
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise KeypointFileError(
-            "neither COCO keypoints (`annotations`, or a list of results) nor OpenPose (`people`)"
-        )
-    rows = [row for row in rows if "keypoints" in row]
-    if not rows:
-        raise KeypointFileError("no annotation or result has `keypoints`")
-    for row in rows:
-        if "image_id" not in row:
-            raise KeypointFileError("an annotation or result has no `image_id`")
-        if np.shape(row["keypoints"]) != (3 * keypoints,):
-            raise KeypointFileError(
-                f"image {row['image_id']!r} has {np.size(row['keypoints']) / 3:g} keypoints; the "
-                f"keypoint layout has {keypoints}: name the layout in which they were written"
-            )
-    images = content.get("images") if isinstance(content, dict) else None
-    names = [image.get("id") for image in images or () if isinstance(image, dict)]
-    if not all(isinstance(name, (int, str)) for name in [*names, *(r["image_id"] for r in rows)]):
-        raise KeypointFileError("`id` of an image or `image_id` is neither a number nor a text")
-    names = list(dict.fromkeys([*names, *sorted((row["image_id"] for row in rows), key=_natural)]))
-    frames = {name: frame for frame, name in enumerate(names)}
-    by_frame: list[list[Mapping[str, Any]]] = [[] for _ in names]
-    for row in rows:
-        by_frame[frames[row["image_id"]]].append(row)
-    observations = [_people(people, keypoints, options.min_confidence) for people in by_frame]
-    identities = [str(p.get("track_id", i)) for people in by_frame for i, p in enumerate(people)]
-    stamps = stamps_at(options.rate, len(observations))
-    return gather(observations, stamps, keypoints, identities=identities)
-
-
-def _people(
-    rows: Sequence[Mapping[str, Any]], keypoints: int, min_confidence: float
-) -> Observation:
-    """Return the annotations of one image as an observation."""
-    values = np.reshape([row["keypoints"] for row in rows], (len(rows), keypoints, 3))
-    return to_observation(values.astype(np.float64), min_confidence)
-
-
-def _npz(path: Path, keypoints: int, options: ReadOptions) -> Detections:
-    """Return the objects in the arrays of an .npz: see README, "Files instead of topics"."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except Exception as error:  # a damaged file makes zipfile and NumPy raise many types
-        raise KeypointFileError(f"damaged or no .npz file: {error!r}") from error
-    if "points" not in arrays:
-        raise KeypointFileError(
-            f"no array `points` (objects, {keypoints}, 2); there are: {', '.join(arrays) or 'none'}"
-        )
-    points = _numbers(arrays, "points", np.float64)
-    if points.ndim != 3 or points.shape[1:] not in ((keypoints, 2), (keypoints, 3)):
-        raise KeypointFileError(
-            f"`points` is {points.shape}; (objects, {keypoints}, 2), or 3 with the confidence, is "
-            "needed: x, y in the order of the keypoint layout"
-        )
-    m = len(points)
-    if "confidence" in arrays:
-        confidence = _numbers(arrays, "confidence", np.float64, (m, keypoints))
-        points = np.concatenate([points[..., :2], confidence[..., None]], -1)
-    frame = _numbers(arrays, "frame", np.int64, (m,)) if "frame" in arrays else np.arange(m)
-    count = int(frame.max(initial=-1)) + 1
-    if m and int(frame.min()) < 0:
-        raise KeypointFileError(f"`frame` has {frame.min()}; frames are counted from 0")
-    if count > m + _MAX_EMPTY:
-        raise KeypointFileError(
-            f"`frame` goes to {count - 1} with {m} objects; at most {_MAX_EMPTY} frames may show "
-            "nobody"
-        )
-    if "stamps" in arrays:
-        count = max(count, len(arrays["stamps"]))
-        stamps = _numbers(arrays, "stamps", np.int64, (count,))
-    else:
-        stamps = stamps_at(options.rate, count)
-    identities = arrays.get("identities", _index_in_frame(frame)).astype(str)
-    if identities.shape != (m,):
-        raise KeypointFileError(f"`identities` is {identities.shape}; ({m},) is needed")
-    observation = to_observation(points, options.min_confidence)
-    order = np.argsort(frame, kind="stable")
-    return Detections(
-        observation.points[order],
-        observation.confidence[order],
-        frame[order],
-        identities[order],
-        stamps,
-    )
-
-
-def _numbers(
-    arrays: Mapping[str, NDArray[Any]],
-    name: str,
-    kind: type,
-    shape: tuple[int, ...] | None = None,
-) -> NDArray[Any]:
-    """Return an array of an .npz as `kind`; raise KeypointFileError unless it has that shape."""
-    array = arrays[name]
-    if array.dtype.kind not in "fiu" or shape is not None and array.shape != shape:
-        wanted = "of numbers" if shape is None else f"of numbers {shape}"
-        raise KeypointFileError(f"`{name}` is {array.dtype} {array.shape}; {wanted} is needed")
-    if kind is np.int64 and not (np.abs(array) < 2**63).all():
-        raise KeypointFileError(f"`{name}` has a number that is no whole one of 64 bits")
-    return array.astype(kind)
-
-
-def _index_in_frame(frame: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (m,) of each object among the objects of its frame."""
-    order = np.argsort(frame, kind="stable")
-    ordered = frame[order]
-    index = np.empty(len(frame), np.int64)
-    index[order] = np.arange(len(frame)) - np.searchsorted(ordered, ordered)
-    return index
-
-
-def _natural(name: Any) -> list[tuple[int, int, str]]:
-    """Return a key that sorts numbers in names by value: frame_2 before frame_10."""
-    text = name.name if isinstance(name, Path) else str(name)
-    parts = re.split(r"(\d+)", text)
-    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p]

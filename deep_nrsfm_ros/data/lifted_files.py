@@ -70,6 +70,8 @@ def _arrays(recording: Recording, model: str) -> dict[str, NDArray[Any]]:
         "frame": detections.frame,
         "identities": detections.identities,
         "stamps": detections.stamps,
+        "frame_numbers": detections.frames.numbers,
+        "frame_names": detections.frames.names,
         "names": np.array(target.keypoints),
         "edges": np.array(target.edge_indices(), np.int64).reshape(-1, 2),
         "model": np.array(model),
@@ -80,7 +82,10 @@ def _document(recording: Recording, model: str) -> dict[str, Any]:
     """Return the JSON document, frame by frame, without objects that were not lifted."""
     detections, target = recording.detections, recording.target
     frames: list[dict[str, Any]] = [
-        {"stamp": stamp, "objects": []} for stamp in detections.stamps.tolist()
+        {"stamp": stamp, "number": number, "name": name, "objects": []}
+        for stamp, number, name in zip(
+            detections.stamps.tolist(), *(each.tolist() for each in detections.frames), strict=True
+        )
     ]
     for i in np.flatnonzero(recording.is_lifted).tolist():
         fields = {name: _plain(values[i]) for name, values in recording.lifted._asdict().items()}

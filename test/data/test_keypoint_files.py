@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
 from pathlib import Path
@@ -14,11 +15,12 @@ from deep_nrsfm_ros.data.bags import Frame, write_bag
 from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
 from deep_nrsfm_ros.data.read_options import ReadOptions
-from deep_nrsfm_ros.layouts.presets import COCO17
+from deep_nrsfm_ros.layouts.presets import BODY25, COCO17
 from deep_nrsfm_ros.lifting.observation import to_observation
 from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY
 
 Q = len(COCO17)
+OPTIONS = ReadOptions(layout=COCO17)
 PERSON = json.dumps({"image_id": 5, "keypoints": [0] * 3 * Q})
 COUNTS = (1, 0, 2, 3, 1)  # objects in each frame
 
@@ -101,14 +103,19 @@ def write(kind: str, folder: Path, seen: Detections) -> Path:
 
 
 KINDS = ("openpose folder", "jsonl", "jsonl.gz", "coco", "npz", "mcap", "sqlite3", "mcap array")
+STAMPED = ("npz", "mcap", "sqlite3", "mcap array")
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_gives_the_same_people(kind: str, tmp_path: Path, seen: Detections) -> None:
-    found = read_keypoints(write(kind, tmp_path, seen), Q, ReadOptions(rate=10))
+    rate = None if kind in STAMPED else 10
+    found = read_keypoints(write(kind, tmp_path, seen), ReadOptions(rate=rate, layout=COCO17))
     if kind == "npz":  # the objects of a frame stay in their order, which was turned round
         found = found[np.lexsort((found.identities, found.frame))]
+    if kind == "openpose folder":  # the first file has number 8
+        found = dataclasses.replace(found, stamps=found.stamps - 800_000_000)
     assert_same(found, seen)
+    assert found.layout == COCO17 and not found.warnings
 
 
 def test_coco_results_without_images(tmp_path: Path, seen: Detections) -> None:
@@ -118,7 +125,7 @@ def test_coco_results_without_images(tmp_path: Path, seen: Detections) -> None:
         for i, f in reversed([*enumerate(seen.frame.tolist())])
     ]
     (tmp_path / "results.json").write_text(json.dumps(results))
-    found = read_keypoints(tmp_path / "results.json", Q)
+    found = read_keypoints(tmp_path / "results.json", OPTIONS)
     assert found.frame.tolist() == [0, 1, 1, 2, 2, 2, 3]  # the frame of nobody is not told of
     assert sorted(found.identities.tolist()) == sorted(map(str, range(7, 14)))
     np.testing.assert_array_equal(found.points[0], seen.points[0])
@@ -126,7 +133,7 @@ def test_coco_results_without_images(tmp_path: Path, seen: Detections) -> None:
 
 def test_plain_npz_is_a_frame_each(tmp_path: Path, seen: Detections) -> None:
     np.savez(tmp_path / "a.npz", points=seen.points)
-    found = read_keypoints(tmp_path / "a.npz", Q, ReadOptions(rate=50))
+    found = read_keypoints(tmp_path / "a.npz", ReadOptions(rate=50, layout=COCO17))
     assert found.frame.tolist() == list(range(7)) and set(found.identities) == {"0"}
     assert found.stamps.tolist() == [20_000_000 * i for i in range(7)]
     np.testing.assert_array_equal(found.confidence > 0, (seen.points != 0).any(-1))
@@ -142,17 +149,22 @@ def test_largest_is_one_a_frame(seen: Detections) -> None:
 
 def test_low_confidence_is_missing(tmp_path: Path, seen: Detections) -> None:
     for kind in ("coco", "npz"):
-        found = read_keypoints(write(kind, tmp_path, seen), Q, ReadOptions(min_confidence=0.6))
+        found = read_keypoints(
+            write(kind, tmp_path, seen), ReadOptions(min_confidence=0.6, layout=COCO17)
+        )
         assert (found.confidence > 0).sum() == (seen.confidence >= 0.6).sum()
 
 
 @pytest.mark.parametrize(
     ("arrays", "expected"),
     [
-        ({"poses": np.zeros(3)}, r"no array `points` \(objects, 17, 2\); there are: poses"),
-        ({"points": np.zeros((4, 18, 2))}, r"`points` is \(4, 18, 2\); \(objects, 17, 2\)"),
+        ({"poses": np.zeros(3)}, r"no array `points` \(objects, 17, 2\); there are: `poses`"),
+        (
+            {"points": np.zeros((4, 18, 2))},
+            r"\(4, 18, 2\): its objects have 18 .* has 17",
+        ),
         ({"points": np.array([["a"]])}, "`points` is <U1"),
-        ({"points": np.array([None])}, "a.npz: .*pickle"),
+        ({"points": np.array([None])}, "a.npz: array `points` holds Python objects.*astype"),
         ({"points": np.zeros((4, 17, 2)), "confidence": np.zeros(4)}, r"`confidence` is .*\(4,\)"),
         ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, -1])}, "counted from 0"),
         ({"points": np.zeros((2, 17, 2)), "frame": np.array([0, 2**60])}, "at most 1000000 frames"),
@@ -167,29 +179,35 @@ def test_low_confidence_is_missing(tmp_path: Path, seen: Detections) -> None:
 def test_wrong_arrays_are_named(tmp_path: Path, arrays: dict[str, Any], expected: str) -> None:
     np.savez(tmp_path / "a.npz", **arrays)
     with pytest.raises(KeypointFileError, match=expected):
-        read_keypoints(tmp_path / "a.npz", Q)
+        read_keypoints(tmp_path / "a.npz", OPTIONS)
 
 
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [
-        ("a.json", "{", "a.json: Expecting"),
+        ("a.json", "{", "a.json: the file ends early"),
         ("a.json", "{}", "neither COCO"),
         ("a.json", "[1]", "neither COCO"),
-        ("a.json", '[{"image_id": 1}]', "no annotation or result has `keypoints`"),
-        ("a.json", '[{"keypoints": []}]', "no `image_id`"),
-        ("a.json", '[{"image_id": 5, "keypoints": [1, 2, 3]}]', "image 5 has 1 keypoints.*has 17"),
-        ("a.json", '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}', "1 keypoints; expected 17"),
-        ("a.jsonl", '{"people": []}\n{"persons": []}', "a.jsonl: line 2: not a frame"),
-        ("a.json", f'{{"images": [{{}}], "annotations": [{PERSON}]}}', "`id` of an image"),
-        ("a.json", f"[{PERSON.replace('5', '[5]')}]", "`image_id` is neither"),
-        ("a.json", f"[{PERSON.replace('[0,', '[{},', 1)}]", "a.json: .*dict"),
-        pytest.param("a.json", "[" * 100_000, "asks for more .* Recursion", id="deep json"),
-        pytest.param("a.jsonl", "[" * 100_000, "line 1: not a frame", id="deep jsonl"),
+        ("a.json", '[{"image_id": 1}]', "have no keypoints, but image_id"),
+        ("a.json", '[{"image_id": 5, "keypoints": [1, 2, 3]}]', "have 1 keypoints.*has 17"),
+        (
+            "a.json",
+            '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}',
+            "have 1 keypoints; .* has 17",
+        ),
+        ("a.jsonl", '{"people": []}\n{"nobody": []}', "cannot be read .line 2: neither COCO"),
+        ("a.json", f"[{PERSON.replace('5', '[5]')}]", "`image_id` that is neither"),
+        (
+            "a.json",
+            f"[{PERSON.replace('[0,', '[{},', 1)}]",
+            "keypoints that are no numbers",
+        ),
+        pytest.param("a.json", "[" * 100_000, "nested too deep", id="deep json"),
+        pytest.param("a.jsonl", "[" * 100_000, "line 1: it is nested too deep", id="deep jsonl"),
         ("a.jsonl", "", "is empty"),
         ("a.jsonl.gz", "no gzip", "a.jsonl.gz: "),
         ("a.npz", "no zip", "a.npz: "),
-        ("a.txt", "", "a.txt is of no known kind; expected a bag"),
+        ("a.txt", "", "a.txt: it is of no known kind; expected a bag"),
         ("a.mcap", "no bag", "a.mcap cannot be read"),
         ("folder/a.txt", "", "folder: it holds neither a bag nor .json"),
     ],
@@ -199,14 +217,14 @@ def test_other_files_are_refused(tmp_path: Path, name: str, text: str, expected:
     path.parent.mkdir(exist_ok=True)
     path.write_text(text)
     with pytest.raises(ValueError, match=expected):
-        read_keypoints(path.parent if path.parent != tmp_path else path, Q)
+        read_keypoints(path.parent if path.parent != tmp_path else path, OPTIONS)
 
 
 def test_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(KeypointFileError, match="nowhere does not exist"):
-        read_keypoints(tmp_path / "nowhere", Q)
+        read_keypoints(tmp_path / "nowhere", OPTIONS)
 
 
 def test_bags_of_another_layout_say_so(tmp_path: Path, seen: Detections) -> None:
     with pytest.raises(ValueError, match=r"no readable message in .*bag \(5 found\).* has 25"):
-        read_keypoints(write("mcap", tmp_path, seen), 25)
+        read_keypoints(write("mcap", tmp_path, seen), ReadOptions(layout=BODY25))

@@ -24,6 +24,7 @@ from deep_nrsfm_ros.data.lifted_bags import (
     write_lifted_bag,
 )
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages, lift_recording
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
@@ -79,7 +80,9 @@ def test_bags_give_back_what_was_lifted(tmp_path: Path, recording: Recording, st
     bag = tmp_path / "bag"
     assert write_lifted_bag(bag, recording.detections, recording.lifted, storage) == 4 + 2 + 2
     assert has_lifted_messages(bag)
-    seen = read_keypoints(bag, 25)  # not the answers, though they are of a keypoint type
+    seen = read_keypoints(
+        bag, ReadOptions(layout=BODY25)
+    )  # not the answers, though they are of a keypoint type
     np.testing.assert_array_equal(seen.points, recording.detections.points)
     np.testing.assert_array_equal(seen.stamps, recording.detections.stamps)
     assert seen.frame_id == "cam"

@@ -17,6 +17,7 @@ from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.bags import frames, read_bags, write_bag
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
 from deep_nrsfm_ros.data.read_options import ReadOptions
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import LayoutFileError, read_layout
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
 from deep_nrsfm_ros.messages.mapping_file import MappingError, read_mapping
@@ -203,7 +204,7 @@ def test_a_keypoint_file_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: 
         file = tmp_path / f"spoilt.{kind}"
         file.write_bytes(content)
         try:
-            seen = read_keypoints(file, p)
+            seen = read_keypoints(file, ReadOptions(fallback=KeypointLayout.numbered(p)))
         except KeypointFileError as refusal:
             assert "spoilt" in str(refusal)
             return f"{kind} refused"

@@ -1,0 +1,1 @@
+"""Formats of keypoint files, one in each file, behind the table in `data.keypoint_files`."""

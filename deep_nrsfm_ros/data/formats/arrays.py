@@ -1,0 +1,219 @@
+"""Arrays of NumPy: .npz with named arrays, .npy with the keypoints alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.data.detections import Detections, Frames
+from deep_nrsfm_ros.data.formats.builder import (
+    KeypointFileError,
+    identities_of,
+    index_in_frame,
+    wrong_count,
+)
+from deep_nrsfm_ros.data.formats.frame_numbers import stamps_of
+from deep_nrsfm_ros.data.formats.names import contradiction, layout_of_names
+from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.observation import to_observation
+
+_MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
+_OPTIONAL = (
+    *("confidence", "frame", "stamps", "identities", "scores"),
+    *("names", "frame_numbers", "frame_names"),
+)
+_OF_OTHERS = {
+    "positions_2d": "VideoPose3D's data_2d_*.npz",
+    "boxes": "detections of Detectron, as VideoPose3D's infer_video.py writes them",
+}
+
+
+def read_npz(path: Path, options: ReadOptions) -> Detections:
+    """Return the objects in the arrays of an .npz: see README, "Files instead of topics".
+
+    Only the arrays that are needed are read; what else the file holds does not matter.
+    """
+    warnings: list[str] = []
+    arrays: dict[str, NDArray[Any]] = {}
+    with _open(path) as file:
+        if "points" not in file.files:
+            raise KeypointFileError(_of_others(file, options))
+        for name in ("points", *_OPTIONAL):
+            if name not in file.files:
+                continue
+            try:
+                arrays[name] = file[name]
+            except ValueError as error:
+                if "pickle" not in str(error).lower():
+                    raise
+                text = (
+                    f"array `{name}` holds Python objects, which could run code when they are "
+                    f"read; save it with a plain type: np.savez(..., {name}={name}.astype("
+                    f"{'str' if name in ('identities', 'names', 'frame_names') else 'float'}))"
+                )
+                if name == "points":
+                    raise KeypointFileError(text) from None
+                warnings.append(text)
+    return _detections(arrays, options, warnings)
+
+
+def read_npy(path: Path, options: ReadOptions) -> Detections:
+    """Return the objects in an array: (frames, q, 2 or 3) or (frames, objects, q, 2 or 3)."""
+    try:
+        points = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        reason = f"damaged or no .npy file: {error}"
+        if "pickle" in str(error).lower():
+            reason = "it holds Python objects, which could run code when they are read; save it "
+            reason += "with numbers: np.save(FILE, np.array(points, float))"
+        raise KeypointFileError(reason) from None
+    if points.ndim == 2 and points.shape[1] in (2, 3):
+        points = points[None]
+    arrays = {"points": points}
+    if points.ndim == 4:
+        f, n = points.shape[:2]
+        arrays = {
+            "points": points.reshape(f * n, *points.shape[2:]),
+            "frame": np.repeat(np.arange(f), n),
+            "stamps": stamps_of(None, f, options.rate or DEFAULT_RATE),
+        }
+    return _detections(arrays, options, [], rate_acts=True)
+
+
+def _open(path: Path) -> Any:
+    """Return an open .npz; raise KeypointFileError if it is none."""
+    try:
+        file = np.load(path, allow_pickle=False)
+        if not hasattr(file, "files"):
+            raise ValueError("it is one array; call it .npy")
+        return file
+    except Exception as error:  # a damaged file makes zipfile and NumPy raise many types
+        raise KeypointFileError(f"damaged or no .npz file: {error}") from error
+
+
+def _of_others(file: Any, options: ReadOptions) -> str:
+    """Return the error text for an .npz without `points`."""
+    layout = options.layout or options.fallback
+    q = len(layout) if layout else "q"
+    origin = next((text for name, text in _OF_OTHERS.items() if name in file.files), "")
+    found = ", ".join(f"`{name}`" for name in file.files) or "no array"
+    text = f"no array `points` (objects, {q}, 2); there are: {found}"
+    if not origin:
+        return text
+    return (
+        f"it is {origin} ({found}), in which keypoints are Python objects: they could run code "
+        "when they are read. Load it yourself with np.load(FILE, allow_pickle=True) if you trust "
+        f"it, and save np.savez(NEW, points=array (objects, {q}, 2), frame=array (objects,))"
+    )
+
+
+def _detections(
+    arrays: Mapping[str, NDArray[Any]],
+    options: ReadOptions,
+    warnings: list[str],
+    rate_acts: bool = False,
+) -> Detections:
+    """Return the objects in arrays as detections."""
+    points = _numbers(arrays, "points", np.float64)
+    layout: KeypointLayout | None
+    if "names" in arrays and arrays["names"].dtype.kind == "U" and arrays["names"].ndim == 1:
+        named = layout_of_names(arrays["names"].tolist())
+        reason = contradiction(options.layout, named) if options.layout else ""
+        if options.layout and reason:
+            raise KeypointFileError(
+                f"its `names` are not those of the keypoint layout {options.layout.name}: "
+                f"{reason}; leave out --keypoint-layout to use the names of the file"
+            )
+        layout = options.layout or named
+    else:
+        layout = options.layout or options.fallback
+    if points.ndim != 3 or points.shape[2] not in (2, 3):
+        q = len(layout) if layout else "q"
+        raise KeypointFileError(
+            f"`points` is {points.shape}; (objects, {q}, 2), or 3 with the confidence, is "
+            "needed: x, y in the order of the keypoint layout"
+        )
+    m, q = points.shape[:2]
+    if layout and q != len(layout):
+        raise KeypointFileError(f"`points` is {points.shape}: {wrong_count(q, layout)}")
+    if "confidence" in arrays:
+        confidence = _numbers(arrays, "confidence", np.float64, (m, q))
+        points = np.concatenate([points[..., :2], confidence[..., None]], -1)
+    frame = _numbers(arrays, "frame", np.int64, (m,)) if "frame" in arrays else np.arange(m)
+    count = int(frame.max(initial=-1)) + 1
+    if m and int(frame.min()) < 0:
+        raise KeypointFileError(f"`frame` has {frame.min()}; frames are counted from 0")
+    if count > m + _MAX_EMPTY:
+        raise KeypointFileError(
+            f"`frame` goes to {count - 1} with {m} objects; at most {_MAX_EMPTY} frames may show "
+            "nobody"
+        )
+    numbers = None
+    for name in ("stamps", "frame_numbers", "frame_names"):
+        if name in arrays and arrays[name].ndim == 1:
+            count = max(count, len(arrays[name]))
+    if "frame_numbers" in arrays:
+        numbers = _numbers(arrays, "frame_numbers", np.int64, (count,))
+    if "stamps" in arrays:
+        if options.rate and not rate_acts:
+            raise KeypointFileError("it has `stamps` of its own: leave out --rate")
+        stamps = _numbers(arrays, "stamps", np.int64, (count,))
+    else:
+        stamps = stamps_of(numbers, count, options.rate or DEFAULT_RATE)
+    names = arrays.get("frame_names", np.full(count, "")).astype(str)
+    if names.shape != (count,):
+        raise KeypointFileError(f"`frame_names` is {names.shape}; ({count},) is needed")
+    frames = Frames(np.arange(count) if numbers is None else numbers, names)
+    scores: NDArray[np.float32] = np.ones(m, np.float32)
+    if "scores" in arrays:
+        scores = _numbers(arrays, "scores", np.float32, (m,))
+    elif options.min_score:
+        raise KeypointFileError("it has no array `scores` (objects,): leave out --min-score")
+    if "identities" in arrays:
+        given = arrays["identities"]
+        if given.shape != (m,):
+            raise KeypointFileError(f"`identities` is {given.shape}; ({m},) is needed")
+        texts = [None if t in ("-1", "") else t for t in given.astype(str).tolist()]
+        identities, warning = identities_of(texts, frame)
+        warnings += [warning] if warning else []
+    else:
+        identities = index_in_frame(frame).astype(str)
+    observation = to_observation(points, options.min_confidence)
+    order = np.argsort(frame, kind="stable")
+    kept = order[scores[order] >= options.min_score] if options.min_score else order
+    if len(kept) < m:
+        warnings.append(
+            f"left out: {m - len(kept)} that have a score below --min-score {options.min_score:g}"
+        )
+    return Detections(
+        observation.points[kept],
+        observation.confidence[kept],
+        frame[kept],
+        identities[kept],
+        stamps,
+        frames=frames,
+        scores=scores[kept],
+        layout=layout,
+        warnings=tuple(warnings),
+    )
+
+
+def _numbers(
+    arrays: Mapping[str, NDArray[Any]],
+    name: str,
+    kind: type,
+    shape: tuple[int, ...] | None = None,
+) -> NDArray[Any]:
+    """Return an array of an .npz as `kind`; raise KeypointFileError unless it has that shape."""
+    array = arrays[name]
+    if array.dtype.kind not in "fiu" or shape is not None and array.shape != shape:
+        wanted = "of numbers" if shape is None else f"of numbers {shape}"
+        raise KeypointFileError(f"`{name}` is {array.dtype} {array.shape}; {wanted} is needed")
+    if kind is np.int64 and not (np.abs(array) < 2**63).all():
+        raise KeypointFileError(f"`{name}` has a number that is no whole one of 64 bits")
+    return array.astype(kind)

@@ -1,0 +1,477 @@
+"""Gathers the objects of a file, one by one, into detections."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.data.detections import Detections, Frames
+from deep_nrsfm_ros.data.formats.frame_numbers import MOST, natural, numbers_in, stamps_of
+from deep_nrsfm_ros.data.formats.names import contradiction, layout_of_names
+from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
+from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.lifting.observation import to_observation
+
+NO_KEYPOINTS = "have no keypoints"
+_ROWS = 8192  # of a chunk: large enough that a freed one returns to the system
+_NAMED = 3  # places that a warning names
+
+
+class KeypointFileError(ValueError):
+    """A file of keypoints cannot be read; the message names the file and the remedy."""
+
+
+class _Group:
+    """The objects of one category with one number of keypoints, in chunks."""
+
+    def __init__(self, keypoints: int) -> None:
+        self.keypoints = keypoints
+        self.chunks: list[NDArray[np.float32]] = []
+        self.frame = array("q")
+        self.scores = array("f")
+        self.identities: list[str | None] = []
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        """Add x, y and confidence (q, 3) of an object."""
+        row = len(self.frame) % _ROWS
+        if row == 0:
+            self.chunks.append(np.empty((_ROWS, self.keypoints, 3), np.float32))
+        self.chunks[-1][row] = values
+
+    def arrays(self, min_confidence: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return points (m, q, 2) and confidence (m, q) as of an observation; empties the chunks.
+
+        A chunk is freed as soon as it is copied, so that memory holds all objects but once.
+        """
+        m = len(self.frame)
+        points = np.empty((m, self.keypoints, 2), np.float32)
+        confidence = np.empty((m, self.keypoints), np.float32)
+        self.chunks.reverse()
+        for start in range(0, m, _ROWS):
+            rows = slice(start, min(start + _ROWS, m))
+            observation = to_observation(self.chunks.pop()[: rows.stop - start], min_confidence)
+            points[rows], confidence[rows] = observation.points, observation.confidence
+        return points, confidence
+
+
+class DetectionsBuilder:
+    """Gathers frames and objects in any order; `detections` returns them frame by frame.
+
+    Attributes:
+        options: of reading.
+        warnings: sentences about what was left out or looks wrong.
+    """
+
+    def __init__(self, options: ReadOptions) -> None:
+        """Start without frames."""
+        self.options = options
+        self.warnings: list[str] = []
+        self._groups: dict[tuple[Any, int], _Group] = {}
+        self._frames: dict[Any, int] = {}
+        self._keys: list[Any] = []
+        self._frame_names: list[str] = []
+        self._numbers: list[int | None] = []
+        self._stamps: list[int | None] = []
+        self._order: list[int | None] = []
+        self._listed = 0
+        self._left_out: dict[str, list[str]] = {}
+        self._left_out_counts: Counter[str] = Counter()
+        self._names: dict[Any, Sequence[str]] = {}
+        self._preset: KeypointLayout | None = None
+        self._categories: dict[Any, str] = {}
+        self._has_scores = False
+
+    def frame(
+        self,
+        key: Any,
+        name: str = "",
+        number: int | None = None,
+        stamp: int | None = None,
+        listed: bool = False,
+    ) -> int:
+        """Return the index of a frame, which is added if it is new.
+
+        Args:
+            key: what the input calls the frame: a number, a name.
+            name: of its file or image; "" = the key, where that is a text.
+            number: of the frame; None = the number in its name, where names have numbers.
+            stamp: time in ns; None = by number and rate.
+            listed: the input lists its frames in this order.
+        """
+        index = self._frames.setdefault(key, len(self._frames))
+        if index == len(self._keys):
+            self._keys.append(key)
+            self._frame_names.append(key if isinstance(key, str) else "")
+            for values in (self._numbers, self._stamps, self._order):
+                values.append(None)
+        if name:
+            self._frame_names[index] = name
+        if number is not None:
+            self._numbers[index] = number
+        if stamp is not None:
+            self._stamps[index] = stamp
+        if listed:
+            self._order[index] = self._listed
+            self._listed += 1
+        return index
+
+    def frame_name(self, index: int) -> str:
+        """Return how the input calls a frame, for a warning."""
+        return self._frame_names[index] or f"frame {self._keys[index]}"
+
+    @property
+    def frames(self) -> int:
+        """Number of frames so far."""
+        return len(self._keys)
+
+    def name_keypoints(self, names: Sequence[Any], category: Any = None) -> None:
+        """Set the names of the keypoints that the input gives, of all or of one category."""
+        if len(names) <= MAX_KEYPOINTS and all(isinstance(n, str) and n.strip() for n in names):
+            self._names[category] = tuple(names)
+        elif names:
+            self.warnings.append(
+                f"its names of keypoints are not used: {len(names)}, not all of them texts"
+            )
+
+    def use_preset(self, layout: KeypointLayout) -> None:
+        """Set the layout that the input names, for an input without names of keypoints."""
+        self._preset = layout
+
+    def name_category(self, category: Any, name: str) -> None:
+        """Set the name of a category."""
+        self._categories[category] = name
+
+    def leave_out(self, reason: str, place: str) -> None:
+        """Count an entry of the input that is left out."""
+        self._left_out_counts[reason] += 1
+        places = self._left_out.setdefault(reason, [])
+        if len(places) < _NAMED:
+            places.append(place)
+
+    def add(
+        self,
+        frame: int,
+        values: NDArray[np.float64],
+        identity: str | None = None,
+        score: float | None = None,
+        category: Any = None,
+    ) -> None:
+        """Add an object.
+
+        Args:
+            frame: index from `frame`.
+            values: (q, 3) x, y and confidence; NaN where missing.
+            identity: None = the input gives none.
+            score: of the object; None = the input gives none.
+            category: its number in the input.
+        """
+        if score is not None:
+            self._has_scores = True
+            if score < self.options.min_score:
+                reason = f"have a score below --min-score {self.options.min_score:g}"
+                self._left_out_counts[reason] += 1
+                return
+        q = len(values)
+        group = self._groups.get((category, q))
+        if group is None:
+            group = self._groups[category, q] = _Group(q)
+        group.add(values)
+        group.frame.append(frame)
+        group.scores.append(1.0 if score is None else score)
+        group.identities.append(identity)
+
+    def detections(self, expected: str) -> Detections:
+        """Return all objects that were added.
+
+        Args:
+            expected: what the file should hold, for the case that it holds nothing.
+
+        Raises:
+            KeypointFileError: nothing is left, or the keypoints are not those of the layout.
+        """
+        options = self.options
+        if options.min_score and not self._has_scores:
+            raise KeypointFileError("it gives no object a score: leave out --min-score")
+        if not self._frames and not self._groups:
+            raise KeypointFileError("; ".join([expected, *self.reasons()]))
+        category = self._category()
+        layout = self._layout(category)
+        group = self._group(layout)
+        if not group.frame and (set(self._left_out_counts) - {NO_KEYPOINTS}):
+            raise KeypointFileError("; ".join(["no object is left", *self.reasons()]))
+        frame = np.array(group.frame, np.int64)
+        points, confidence = group.arrays(options.min_confidence)
+        identities, warning = identities_of(group.identities, frame)
+        self.warnings += [warning] if warning else []
+        scores = np.array(group.scores, np.float32)
+        order, frames, stamps = self._in_order()
+        position = np.empty(len(order), np.int64)
+        position[order] = np.arange(len(order))
+        frame = position[frame]
+        if (np.diff(frame) < 0).any():
+            rows = np.argsort(frame, kind="stable")
+            frame, scores, identities = frame[rows], scores[rows], identities[rows]
+            points, confidence = points[rows], confidence[rows]
+        return Detections(
+            points,
+            confidence,
+            frame,
+            identities,
+            stamps,
+            frames=frames,
+            scores=scores,
+            layout=layout,
+            warnings=(*self.warnings, *self.reasons()),
+        )
+
+    def reasons(self) -> list[str]:
+        """Return a sentence for each reason for which entries were left out."""
+        sentences = []
+        for reason, count in self._left_out_counts.items():
+            places = self._left_out.get(reason, [])
+            more = ", ..." if count > len(places) else ""
+            named = f" ({', '.join(places)}{more})" if places else ""
+            sentences.append(f"left out: {count} that {reason}{named}")
+        return sentences
+
+    def _category(self) -> Any:
+        """Return the category to read; raise KeypointFileError if the choice is not clear."""
+        wanted = self.options.category
+        present = list(dict.fromkeys(category for category, _ in self._groups))
+        # A category without keypoints of its own is one more name of nothing: a car, a ball.
+        known = dict.fromkeys([*self._names, *present])
+        named = {c: self._categories.get(c, "") for c in known if c is not None}
+        text = ", ".join(f"{n} ({c})" if n else str(c) for c, n in named.items()) or "none"
+        if wanted:
+            chosen = [c for c, n in named.items() if wanted in (n, str(c))]
+            if not chosen:
+                raise KeypointFileError(
+                    f"it has no category {wanted!r} with keypoints; there are: {text}"
+                )
+            for c, q in list(self._groups):
+                if c not in (chosen[0], None):
+                    del self._groups[c, q]
+            return chosen[0]
+        names = {self._names.get(c) for c in present}
+        if len(present) > 1 and (len(names) > 1 or len({q for _, q in self._groups}) > 1):
+            raise KeypointFileError(
+                f"it has objects of several categories: {text}; choose one with --category"
+            )
+        return present[0] if present else next(iter(self._names), None)
+
+    def _layout(self, category: Any) -> KeypointLayout | None:
+        """Return the layout of the keypoints; None if nothing says it."""
+        options = self.options
+        names = self._names.get(category, self._names.get(None))
+        if names is None:
+            layout = self._preset
+        else:
+            try:
+                layout = layout_of_names(names)
+            except ValueError as error:
+                self.warnings.append(f"its names of keypoints are not used: {error}")
+                layout = self._preset
+        if options.layout is None:
+            return layout or options.fallback
+        if layout and (reason := contradiction(options.layout, layout)):
+            shown = ", ".join(layout.keypoints[:6]) + (", ..." if len(layout) > 6 else "")
+            raise KeypointFileError(
+                f"it names its keypoints ({shown}), not as the keypoint layout "
+                f"{options.layout.name}: {reason}; leave out --keypoint-layout to use the names of "
+                "the file"
+            )
+        return options.layout
+
+    def _group(self, layout: KeypointLayout | None) -> _Group:
+        """Return the objects with the number of keypoints of the layout; count the others."""
+        counts: Counter[int] = Counter()
+        for (_, q), group in self._groups.items():
+            counts[q] += len(group.frame)
+        most = max(counts, key=lambda q: counts[q]) if counts else 0
+        q = len(layout) if layout else most
+        if counts and q not in counts:
+            raise KeypointFileError(wrong_count(most, layout))
+        for other, count in counts.items():
+            if other != q:
+                self._left_out_counts[f"have {other} keypoints, not {q}"] += count
+        groups = [group for (_, count), group in self._groups.items() if count == q]
+        merged = groups[0] if groups else _Group(q)
+        for group in groups[1:]:
+            merged = _merge(merged, group)
+        return merged
+
+    def _in_order(self) -> tuple[NDArray[np.int64], Frames, NDArray[np.int64]]:
+        """Return the order of the frames in time, what they are called, and their stamps."""
+        f, names, stamps = len(self._keys), self._frame_names, self._stamps
+        numbers = self._frame_numbers()
+        if numbers is not None:
+            order = np.argsort(numbers, kind="stable")
+        elif f and None not in stamps:
+            order = np.argsort(np.array(stamps, np.int64), kind="stable")
+        else:
+            order = np.array(sorted(range(f), key=self._place_in_order), np.int64)
+        numbers = None if numbers is None else numbers[order]
+        rate = self.options.rate or DEFAULT_RATE
+        times = stamps_of(numbers, f, rate)
+        if numbers is not None and f and numbers.max() >= MOST:
+            self.warnings.append(
+                f"numbers of frames such as {numbers.max()} are no count at a rate: frames follow "
+                f"each other at {rate:g} a second"
+            )
+        if f and None not in stamps:
+            times = np.array(stamps, np.int64)[order]
+        called = Frames(
+            np.arange(f) if numbers is None else numbers,
+            np.array([names[i] for i in order.tolist()], str),
+        )
+        return order, called, times
+
+    def _place_in_order(self, index: int) -> tuple[int, list[tuple[int, int, str]]]:
+        """Return the sorting key of a frame without a number: listed frames come first."""
+        place = self._order[index]
+        return (self._listed, natural(self._keys[index])) if place is None else (place, [])
+
+    def _frame_numbers(self) -> NDArray[np.int64] | None:
+        """Return the number (f,) of each frame; None if the input does not say it."""
+        keys = self._keys
+        if keys and None not in self._numbers:
+            numbers = np.array(self._numbers, np.int64)
+            return numbers if len(np.unique(numbers)) == len(numbers) else None
+        if all(self._frame_names) and (found := numbers_in(self._frame_names)) is not None:
+            return found
+        if all(isinstance(key, int) and abs(key) < 2**62 for key in keys):
+            return np.array(keys, np.int64)
+        return None
+
+
+def wrong_count(q: int, layout: KeypointLayout | None) -> str:
+    """Return the error text for objects none of which has the keypoints of the layout."""
+    name, size = (layout.name, len(layout)) if layout else ("", 0)
+    fitting = [preset for preset in LAYOUTS if len(LAYOUTS[preset]) == q]
+    others = f" ({', '.join(fitting)} has {q})" if len(fitting) == 1 else ""
+    others = f" ({', '.join(fitting)} have {q})" if len(fitting) > 1 else others
+    return (
+        f"its objects have {q} keypoints; the keypoint layout {name} has {size}: name the layout "
+        f"in which they were written with --keypoint-layout{others}"
+    )
+
+
+def _merge(a: _Group, b: _Group) -> _Group:
+    """Return the objects of two categories that are read as one."""
+    merged = _Group(a.keypoints)
+    for group in (a, b):
+        for row in range(len(group.frame)):
+            merged.add(group.chunks[row // _ROWS][row % _ROWS].astype(np.float64))
+            merged.frame.append(group.frame[row])
+    merged.scores = a.scores + b.scores
+    merged.identities = a.identities + b.identities
+    return merged
+
+
+def identities_of(
+    given: Sequence[str | None], frame: NDArray[np.int64]
+) -> tuple[NDArray[np.str_], str]:
+    """Return the identities (m,) of objects, and a warning, "" for none.
+
+    Args:
+        given: m identities of the input; None for an object without one.
+        frame: (m,) the frame of each.
+
+    Returns:
+        The identities of the input, "" for an object without one and for the second of the same
+        identity in a frame; the index in the frame if the input has none at all.
+    """
+    if not any(identity is not None for identity in given):
+        return index_in_frame(frame).astype(str), ""
+    identities = np.array([identity or "" for identity in given], str)
+    codes = np.unique(identities, return_inverse=True)[1]
+    pairs = frame * (int(codes.max()) + 1) + codes
+    first = np.unique(pairs, return_index=True)[1]
+    repeated = np.ones(len(pairs), bool)
+    repeated[first] = False
+    repeated &= identities != ""
+    if not repeated.any():
+        return identities, ""
+    example = identities[repeated][0]
+    identities[repeated] = ""
+    return identities, (
+        f"{repeated.sum()} objects have the identity of another one in their frame, such as "
+        f"{example}; they are read without identity"
+    )
+
+
+def index_in_frame(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index (m,) of each object among the objects of its frame."""
+    order = np.argsort(frame, kind="stable")
+    ordered = frame[order]
+    index = np.empty(len(frame), np.int64)
+    index[order] = np.arange(len(frame)) - np.searchsorted(ordered, ordered)
+    return index
+
+
+def as_identity(value: Any) -> str | None:
+    """Return the identity that a field of a detector gives; None for none (-1, [-1], "", null)."""
+    if isinstance(value, list):
+        value = value[0] if len(value) == 1 else None
+    if isinstance(value, bool) or value is None:
+        return None
+    if isinstance(value, (int, float)):
+        if not abs(value) < 2**62 or value == -1:
+            return None
+        return str(int(value)) if value == int(value) else str(value)
+    return value if isinstance(value, str) and value not in ("", "-1") else None
+
+
+def as_score(value: Any) -> float | None:
+    """Return the score that a field of a detector gives; None for none."""
+    while isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
+        return None
+    return float(value)
+
+
+def as_values(keypoints: Any, scores: Any = None, expected: int | None = None) -> NDArray[Any]:
+    """Return x, y and confidence (q, 3) of an object in any of the forms that detectors write.
+
+    Args:
+        keypoints: [x, y, s, ...], [[x, y, s], ...], or with `scores` or without any confidence
+            [x, y, ...] or [[x, y], ...].
+        scores: q confidences beside them; None = there are none.
+        expected: number of keypoints of the layout, to tell x, y, ... from x, y, s, ...
+
+    Raises:
+        ValueError: they have none of these forms; the text says what is wrong.
+    """
+    try:
+        values = np.asarray(keypoints, np.float64)
+        beside = None if scores is None else np.asarray(scores, np.float64).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("have keypoints that are no numbers, or not as many each") from None
+    if values.ndim == 3 and len(values) == 1:
+        values = values[0]
+    if not values.size or values.ndim == 0:
+        raise ValueError(NO_KEYPOINTS)
+    if values.ndim == 1:
+        pairs = values.size % 3 != 0 or values.size == 2 * (expected or 0)
+        if beside is not None and values.size != 3 * beside.size:
+            pairs = True
+        width = 2 if pairs else 3
+        if values.size % width:
+            raise ValueError(f"have {values.size} numbers, which are no pairs or triples")
+        values = values.reshape(-1, width)
+    if values.ndim != 2 or values.shape[1] not in (2, 3):
+        raise ValueError(f"have keypoints of shape {values.shape}, not (q, 2) or (q, 3)")
+    if beside is not None:
+        if beside.size != len(values):
+            raise ValueError(f"have {len(values)} keypoints and {beside.size} confidences")
+        return np.column_stack([values[:, :2], beside])
+    if values.shape[1] == 2:
+        return np.column_stack([values, np.ones(len(values))])
+    return values

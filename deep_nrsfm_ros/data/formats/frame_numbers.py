@@ -1,0 +1,54 @@
+"""Numbers of frames in the names of files and images."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.data.detections import stamps_at
+
+_MOST_DIGITS = 18  # of a number of 64 bits
+MOST = 1_000_000_000
+"""A number from here on is a time or an identifier, not that of a frame: a year at 30 Hz."""
+
+
+def natural(name: Any) -> list[tuple[int, int, str]]:
+    """Return a key that sorts numbers in names by value: frame_2 before frame_10."""
+    text = name.name if isinstance(name, Path) else str(name)
+    parts = re.split(r"(\d+)", text)
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p]
+
+
+def numbers_in(names: Sequence[str]) -> NDArray[np.int64] | None:
+    """Return the number (f,) of each frame in its name; None if the names do not say it.
+
+    That is the only number that differs between names; all else in the names must be the
+    same: 25 of `clip_000000000025_keypoints.json`, 7 of `7.jpg`.
+    """
+    first = re.split(r"(\d+)", names[0]) if names else []
+    numbers = np.empty((len(names), len(first) // 2), np.int64)
+    for row, name in enumerate(names):
+        parts = re.split(r"(\d+)", name)
+        if len(parts) != len(first) or parts[::2] != first[::2]:
+            return None
+        if any(len(part) > _MOST_DIGITS for part in parts[1::2]):
+            return None
+        numbers[row] = [int(part) for part in parts[1::2]]
+    if len(names) == 1 and numbers.size:
+        return numbers[:, -1]
+    differing = np.flatnonzero((numbers != numbers[:1]).any(0))
+    if len(differing) != 1 or len(np.unique(numbers[:, differing[0]])) != len(names):
+        return None
+    return numbers[:, differing[0]]
+
+
+def stamps_of(numbers: NDArray[np.int64] | None, frames: int, rate: float) -> NDArray[np.int64]:
+    """Return the stamps (f,) in ns of frames: number / rate, or index / rate without numbers."""
+    if numbers is None or not len(numbers) or numbers.max() >= MOST or numbers.min() < 0:
+        return stamps_at(rate, frames)
+    return np.round(numbers * (1e9 / rate)).astype(np.int64)

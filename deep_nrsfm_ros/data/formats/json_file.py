@@ -1,0 +1,273 @@
+"""JSON of detectors: COCO, OpenPose, MMPose, AlphaPose, MediaPipe and PoseNet.
+
+They differ in what holds the frames, and in the names of the same few fields of an object. One
+reader takes them all, so that a mixture (COCO results with nested keypoints, identities of
+AlphaPose) is read as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from deep_nrsfm_ros.data.formats.builder import (
+    NO_KEYPOINTS,
+    DetectionsBuilder,
+    as_identity,
+    as_score,
+    as_values,
+)
+from deep_nrsfm_ros.data.formats.json_items import Readable, json_items
+from deep_nrsfm_ros.data.formats.names import layout_of_dataset
+
+EXPECTED = (
+    "neither COCO (`annotations`, or a list of results), OpenPose (`people`), MMPose "
+    "(`instance_info`), AlphaPose nor MediaPipe (`landmarks`)"
+)
+_KEYPOINTS = (
+    *("keypoints", "pose_keypoints_2d", "pose_keypoints", "joints", "landmarks", "landmark"),
+    *("pose_landmarks", "poseLandmarks"),
+)
+_OBJECTS = ("people", "bodies", "instances", "predictions", "poses", "objects", "persons")
+_LANDMARKS = ("landmarks", "landmark", "pose_landmarks", "poseLandmarks")
+_FRAME = ("image_id", "frame_id", "frame", "frame_number", "frame_index", "image", "file_name")
+_SCORES = ("keypoint_scores", "keypoints_scores", "keypoint_score", "scores", "confidence")
+_IDENTITY = ("person_id", "track_id", "idx", "instance_id")
+_SCORE = ("score", "bbox_score")
+_CONFIDENCE = ("visibility", "score", "confidence", "presence", "likelihood")
+
+
+class DefaultFrame(NamedTuple):
+    """The frame of objects that name none: that of their file or line.
+
+    Attributes:
+        name: of the file or line.
+        number: of the frame; None = the number in its name, where the names have one.
+    """
+
+    name: str
+    number: int | None = None
+
+
+class JsonReader:
+    """Reads documents into a builder, each a whole recording or one frame."""
+
+    def __init__(self, builder: DetectionsBuilder) -> None:
+        """Add frames and objects to a builder."""
+        self._builder = builder
+        layout = builder.options.layout or builder.options.fallback
+        self._expected = len(layout) if layout else None
+
+    def read(self, file: Readable, frame: DefaultFrame) -> str:
+        """Read a document; return what is wrong if it is of no known form, else "".
+
+        Args:
+            file: the document.
+            frame: the frame of objects without one of their own.
+
+        Raises:
+            ValueError: the document is no JSON, or ends early; what comes before is read.
+        """
+        known, landmarks = False, []
+        keys: dict[str | None, None] = {}
+        for key, value, is_element in json_items(file):
+            keys[key] = None
+            if key in _LANDMARKS and is_element and isinstance(value, dict):
+                landmarks.append(value)
+            else:
+                known |= self._item(key, value, is_element, frame)
+        if landmarks:
+            self._person({"landmarks": landmarks}, self._frame_of({}, frame))
+        if known or landmarks:
+            return ""
+        names = ", ".join(f"`{key}`" for key in list(keys)[:8] if key is not None)
+        return EXPECTED + (f"; it has {names}" if names else "")
+
+    def _item(self, key: str | None, value: Any, is_element: bool, frame: DefaultFrame) -> bool:
+        """Read an item of a document; return False if it is of no known form."""
+        if key == "images":
+            if is_element:
+                self._image(value)
+            return True
+        if key == "categories":
+            if is_element:
+                self._category(value)
+            return False
+        if key == "meta_info":
+            self._meta_info(value)
+            return False
+        if value is None or value == []:
+            if key in (None, *_OBJECTS, *_LANDMARKS):
+                self._frame_of({}, frame)  # a frame without objects
+            return key in (None, "annotations", "instance_info", *_OBJECTS, *_LANDMARKS)
+        if key in _OBJECTS:
+            self._frame_of({}, frame)
+        if key in (None, "annotations", "instance_info", "results", "frames", *_OBJECTS):
+            return self._element(value, frame, key)
+        if key in _LANDMARKS and is_element:
+            return self._landmark(value, frame)
+        if isinstance(value, dict) and key is not None and any(k in value for k in _OBJECTS):
+            return self._element(value, DefaultFrame(key), key)  # AlphaPose: image -> people
+        if is_element and isinstance(value, dict) and "keypoints" in value and key:
+            return self._element(value, DefaultFrame(key), key)
+        return False
+
+    def _element(self, value: Any, frame: DefaultFrame, key: str | None) -> bool:
+        """Read an object, a frame, or the list of the objects of a frame."""
+        if isinstance(value, list):  # a list of instances inside `predictions`
+            self._frame_of({}, frame)
+            known = [self._element(each, frame, key) for each in value]
+            return any(known)
+        if not isinstance(value, dict):
+            self._builder.leave_out("are no object", f"{frame.name}: {value!r:.30}")
+            return False
+        try:
+            self._key_of(value)
+        except ValueError as error:
+            self._builder.leave_out(str(error), f"{frame.name}: {value!r:.40}")
+            return True
+        if any(name in value for name in _OBJECTS):
+            self._frame(value, frame)
+            return True
+        if not any(name in value for name in _KEYPOINTS):
+            # Annotations of COCO are boxes of cars, too.
+            if key != "annotations":
+                self._builder.leave_out(
+                    f"have no keypoints, but {', '.join(map(str, value))[:60] or 'nothing'}",
+                    frame.name,
+                )
+            return key == "annotations"
+        self._person(value, self._frame_of(value, frame))
+        return True
+
+    def _frame(self, value: Mapping[str, Any], frame: DefaultFrame) -> None:
+        """Read the objects of a frame."""
+        index = self._frame_of(value, frame)
+        for name in _OBJECTS:
+            objects = value.get(name)
+            if isinstance(objects, list):
+                for person in objects:
+                    if isinstance(person, dict):
+                        self._person(person, index)
+                    elif isinstance(person, list):  # predictions: [[person, ...]]
+                        for each in person:
+                            if isinstance(each, dict):
+                                self._person(each, index)
+                    else:
+                        self._builder.leave_out("are no object", self._place(index))
+            elif objects is not None and name in value:
+                self._builder.leave_out(f"have no list `{name}`", self._place(index))
+
+    def _key_of(self, value: Mapping[str, Any]) -> int | str | None:
+        """Return how an object or frame names its frame; None if it does not.
+
+        Raises:
+            ValueError: it names it by something that is neither a number nor a text.
+        """
+        for name in _FRAME:
+            key = value.get(name)
+            if isinstance(key, float) and key.is_integer():
+                key = int(key)
+            if isinstance(key, (int, str)) and not isinstance(key, bool):
+                return key
+            if key is not None and name.endswith("_id"):
+                raise ValueError(f"have an `{name}` that is neither a number nor a text")
+        return None
+
+    def _frame_of(self, value: Mapping[str, Any], frame: DefaultFrame) -> int:
+        """Return the index of the frame that an object or frame names, or of the default."""
+        key = self._key_of(value)
+        if key is not None:
+            return self._builder.frame(key)
+        return self._builder.frame(frame.name, number=frame.number)
+
+    def _person(self, person: Mapping[str, Any], frame: int) -> None:
+        """Add an object, or count what is wrong with it."""
+        try:
+            keypoints = next((person[name] for name in _KEYPOINTS if name in person), None)
+            if keypoints is None:
+                raise ValueError(NO_KEYPOINTS)
+            scores = next((person[n] for n in _SCORES if isinstance(person.get(n), list)), None)
+            if _are_points(keypoints):
+                keypoints, scores = self._points(keypoints), None
+            values = as_values(keypoints, scores, self._expected)
+        except ValueError as error:
+            self._builder.leave_out(str(error), self._place(frame))
+            return
+        identity = next(
+            (i for n in _IDENTITY if (i := as_identity(person.get(n))) is not None), None
+        )
+        score = next((s for n in _SCORE if (s := as_score(person.get(n))) is not None), None)
+        category = person.get("category_id")
+        category = category if isinstance(category, (int, str)) else None
+        self._builder.add(frame, values, identity, score, category)
+
+    def _points(self, points: list[Mapping[str, Any]]) -> list[list[Any]]:
+        """Return x, y and confidence of points with named coordinates; use their names."""
+        names = [point.get("name", point.get("part")) for point in points]
+        if all(isinstance(name, str) for name in names):
+            self._builder.name_keypoints(names)
+        rows = []
+        for point in points:
+            position = point.get("position", point)
+            confidence = next((point[n] for n in _CONFIDENCE if n in point), 1.0)
+            rows.append([position.get("x"), position.get("y"), confidence])
+        return rows
+
+    def _landmark(self, value: Any, frame: DefaultFrame) -> bool:
+        """Read all landmarks of one of the objects of a frame."""
+        if isinstance(value, list):
+            self._person({"landmarks": value}, self._frame_of({}, frame))
+            return True
+        return False
+
+    def _place(self, frame: int) -> str:
+        """Return the name of a frame, for a warning."""
+        return self._builder.frame_name(frame)
+
+    def _image(self, image: Any) -> None:
+        """Read an entry of `images`."""
+        key = image.get("id") if isinstance(image, dict) else None
+        if not isinstance(key, (int, str)):
+            self._builder.leave_out("are images without `id`", f"{image!r:.40}")
+            return
+        name = image.get("file_name")
+        number = image.get("frame_id", image.get("frame_number"))
+        self._builder.frame(
+            key,
+            name if isinstance(name, str) else "",
+            number if isinstance(number, int) else None,
+            listed=True,
+        )
+
+    def _category(self, category: Any) -> None:
+        """Read an entry of `categories`."""
+        if not isinstance(category, dict) or not isinstance(category.get("id"), (int, str)):
+            return
+        name, names = category.get("name"), category.get("keypoints")
+        if isinstance(names, list) and names:
+            self._builder.name_keypoints(names, category["id"])
+            self._builder.name_category(category["id"], name if isinstance(name, str) else "")
+
+    def _meta_info(self, info: Any) -> None:
+        """Read `meta_info` of MMPose."""
+        if not isinstance(info, dict):
+            return
+        if layout := layout_of_dataset(str(info.get("dataset_name", ""))):
+            self._builder.use_preset(layout)
+        names = info.get("keypoint_id2name")
+        if isinstance(names, dict):
+            try:
+                ordered = [names[key] for key in sorted(names, key=int)]
+            except ValueError:
+                return
+            self._builder.name_keypoints(ordered)
+
+
+def _are_points(keypoints: Any) -> bool:
+    """Return whether keypoints are objects with `x` and `y` (MediaPipe, PoseNet)."""
+    if not isinstance(keypoints, list) or not keypoints:
+        return False
+    if not all(isinstance(point, dict) for point in keypoints):
+        return False
+    return all(isinstance(point.get("position", point), dict) for point in keypoints)

@@ -1,0 +1,101 @@
+"""Names of keypoints in files, in the spelling of the layouts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import cache
+
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
+
+_DATASETS = {
+    "coco": "coco17",
+    "halpe": "halpe136",
+    "halpe26": "halpe26",
+    "body8_halpe26": "halpe26",
+    "coco_wholebody": "coco_wholebody133",
+    "mpii": "mpii16",
+    "h36m": "h36m17",
+    "crowdpose": "crowdpose14",
+    "ap10k": "ap10k17",
+    "posetrack18": "posetrack15",
+    "coco_wholebody_hand": "hand21",
+}
+"""Datasets of MMPose -> presets."""
+_SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
+_ALIASES = {
+    "sho": "shoulder",
+    "elb": "elbow",
+    "wri": "wrist",
+    "kne": "knee",
+    "ank": "ankle",
+    "bigtoe": "big_toe",
+    "smalltoe": "small_toe",
+    "midhip": "mid_hip",
+}
+
+
+def layout_of_dataset(dataset: str) -> KeypointLayout | None:
+    """Return the preset of a dataset of MMPose, "coco"; None if there is none."""
+    name = _DATASETS.get(dataset.lower(), dataset.lower())
+    return LAYOUTS.get(name)
+
+
+def layout_of_names(names: Sequence[str]) -> KeypointLayout:
+    """Return the layout with these keypoints: a preset if one has them, else a layout of them.
+
+    Known keypoints of another spelling ("LShoulder", "shoulder_l", "left shoulder") get that of
+    the presets; a name of no preset remains.
+
+    Raises:
+        ValueError: a name is not unique.
+    """
+    for keypoints in (tuple(names), tuple(map(preset_spelling, names))):
+        for name in LAYOUTS:
+            if LAYOUTS[name].keypoints == keypoints:
+                return LAYOUTS[name]
+    unique = keypoints if len(set(keypoints)) == len(keypoints) else tuple(names)
+    return KeypointLayout("names_of_the_input", unique)
+
+
+def preset_spelling(name: str) -> str:
+    """Return the name of a keypoint as the presets spell it, or `name` if none of them has it."""
+    known = _known()
+    if name in known:
+        return name
+    words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])([A-Z][a-z])", r"\1\3_\2\4", name).lower()
+    parts = [part for part in re.split(r"[^a-z0-9]+", words) if part]
+    sides = [_SIDES[part] for part in parts if part in _SIDES]
+    rest = "_".join(part for part in parts if part not in _SIDES)
+    bare = [rest, _ALIASES.get(rest, rest)]
+    if sides:
+        candidates = [f"{sides[0]}_{name}" for name in bare]
+    elif rest[:1] in _SIDES:  # lshoulder
+        part = rest[1:]
+        candidates = [*bare, *(f"{_SIDES[rest[0]]}_{p}" for p in (part, _ALIASES.get(part, part)))]
+    else:
+        candidates = bare
+    return next((candidate for candidate in candidates if candidate in known), name)
+
+
+@cache
+def _known() -> frozenset[str]:
+    """Return the names of the keypoints of all presets."""
+    return frozenset(keypoint for layout in LAYOUTS.values() for keypoint in layout.keypoints)
+
+
+def contradiction(layout: KeypointLayout, names: KeypointLayout) -> str:
+    """Return how the names that an input gives contradict a layout; "" if they do not.
+
+    Names of another language or numbering contradict nothing, as long as there are as many.
+    """
+    if layout.keypoints == names.keypoints:
+        return ""
+    if len(layout) != len(names):
+        return f"it names {len(names)} keypoints, {layout.name} has {len(layout)}"
+    own = dict.fromkeys(layout.keypoints)
+    for i, name in enumerate(names.keypoints):
+        if name in own and layout.keypoints[i] != name:
+            return f"its keypoint {i} is {name}, that of {layout.name} is {layout.keypoints[i]}"
+    return ""

@@ -1,0 +1,421 @@
+"""What a file says of itself is used; an odd entry is left out and named, and the rest is read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.data.detections import Detections
+from deep_nrsfm_ros.data.formats.frame_numbers import numbers_in
+from deep_nrsfm_ros.data.formats.json_items import JsonItem, json_items
+from deep_nrsfm_ros.data.formats.names import layout_of_names, preset_spelling
+from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
+from deep_nrsfm_ros.data.read_options import ReadOptions
+from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN17
+
+Q = len(COCO17)
+
+
+def person(seed: int = 0, q: int = Q) -> list[float]:
+    """Return x, y, confidence of q keypoints, one after the other."""
+    values = np.random.default_rng(seed).uniform(100, 500, (q, 3))
+    values[:, 2] = 0.9
+    return values.ravel().tolist()
+
+
+def pairs(seed: int = 0) -> list[list[float]]:
+    return np.reshape(person(seed), (Q, 3))[:, :2].tolist()
+
+
+def save(path: Path, content: Any) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def read(path: Path, content: Any, **options: Any) -> Detections:
+    return read_keypoints(save(path, content), ReadOptions(**options))
+
+
+def openpose(*people: list[float], **fields: Any) -> dict[str, Any]:
+    return {"people": [{"pose_keypoints_2d": p, **fields} for p in people]}
+
+
+def test_nobody_and_odd_entries_leave_the_others(tmp_path: Path) -> None:
+    folder = tmp_path / "json"
+    contents: list[Any] = [
+        openpose(person()),
+        openpose([], person(1)),
+        openpose([]),
+        openpose(person(2), [1, 2, 3]),
+        {"people": [{"pose_keypoints_2d": None}, {"face_keypoints_2d": [1]}, 5]},
+        {"people": []},
+        "",
+        '{"people": [',
+    ]
+    for i, content in enumerate(contents):
+        save(folder / f"clip_{i:04}_keypoints.json", content)
+        save(folder / f"._clip_{i:04}_keypoints.json", "\0Mac OS X")
+    save(folder / "calibration.json", {"K": [[1, 0, 0]]})
+    save(folder / "notes.txt", "mine")
+    (folder / "rendered.png").touch()
+    found = read_keypoints(folder, ReadOptions(layout=COCO17))
+    assert found.frame.tolist() == [0, 1, 3] and len(found.stamps) == 6
+    text = "\n".join(found.warnings)
+    for expected in (
+        "8 that are hidden files (._clip_0000_keypoints.json, ",
+        "1 that are no .json files (notes.txt)",
+        "3 that have no keypoints (clip_0001_keypoints.json, clip_0002",
+        "1 that have no keypoints, but face_keypoints_2d (clip_0004",
+        "1 that are no object (clip_0004_keypoints.json: 5)",
+        "1 that have 1 keypoints, not 17",
+        "3 that cannot be read (calibration.json: neither COCO",
+    ):
+        assert expected in text
+    assert "png" not in text
+
+
+def test_only_what_leaves_nothing_is_an_error(tmp_path: Path) -> None:
+    save(tmp_path / "json" / "calibration.json", {"K": []})
+    with pytest.raises(KeypointFileError, match="no file in it has keypoints; .*calibration.json"):
+        read_keypoints(tmp_path / "json")
+    found = read(tmp_path / "a.json", openpose([]), layout=COCO17)
+    assert len(found) == 0 and found.points.shape == (0, Q, 2)
+
+
+def test_numbers_in_file_names_are_times(tmp_path: Path) -> None:
+    for number in (0, 3, 25, 100):
+        save(tmp_path / "json" / f"cam2_{number}_keypoints.json", openpose(person()))
+    found = read_keypoints(tmp_path / "json", ReadOptions(layout=COCO17))
+    assert found.frames.numbers.tolist() == [0, 3, 25, 100]
+    assert found.frames.names[2] == "cam2_25_keypoints.json"
+    assert (found.stamps / 1e9).round(3).tolist() == [0, 0.1, 0.833, 3.333]
+
+
+def test_numbers_of_images_are_times(tmp_path: Path) -> None:
+    images = [{"id": 70 + i, "file_name": f"f{n}.jpg"} for i, n in enumerate((12, 2, 9))]
+    entries = [{"image_id": 70 + i, "keypoints": person(i)} for i in range(3)]
+    content = {"annotations": entries, "images": images}
+    found = read(tmp_path / "a.json", content, rate=1, layout=COCO17)
+    assert found.frames.numbers.tolist() == [2, 9, 12]
+    assert found.frames.names.tolist() == ["f2.jpg", "f9.jpg", "f12.jpg"]
+    assert found.stamps.tolist() == [2_000_000_000, 9_000_000_000, 12_000_000_000]
+    assert found.points[0, 0].tolist() == np.array(person(1)[:2], np.float32).tolist()
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["a7b10.json", "a7b9.json"], [10, 9]),
+        (["cam1_5", "cam2_5"], [1, 2]),
+        (["cam1_5", "cam2_6"], None),
+        (["a5", "b6"], None),
+        (["a5", "a05"], None),
+        (["img_25_keypoints"], [25]),
+        (["9" * 30], None),
+        (["a"], None),
+        ([], None),
+    ],
+)
+def test_numbers_in_names(names: list[str], expected: list[int] | None) -> None:
+    found = numbers_in(names)
+    assert (None if found is None else found.tolist()) == expected
+
+
+def test_numbers_that_are_times_of_day_are_no_frames(tmp_path: Path) -> None:
+    for i in range(3):
+        save(tmp_path / "json" / f"{1_700_000_000_000 + 40 * i}.json", openpose(person()))
+    found = read_keypoints(tmp_path / "json", ReadOptions(rate=25, layout=COCO17))
+    assert found.stamps.tolist() == [0, 40_000_000, 80_000_000]
+    assert "1700000000080 are no count at a rate" in found.warnings[0]
+
+
+@pytest.mark.parametrize("field", ["person_id", "idx", "track_id"])
+def test_identities_of_the_file(tmp_path: Path, field: str) -> None:
+    people = [
+        {"keypoints": person(i), "image_id": i // 3, field: value}
+        for i, value in enumerate([4, [9], -1, [-1], 4.0, "anna"])
+    ]
+    found = read(tmp_path / "a.json", people, layout=COCO17)
+    assert found.identities.tolist() == ["4", "9", "", "", "4", "anna"]
+
+
+def test_one_identity_twice_in_a_frame(tmp_path: Path) -> None:
+    people = [{"keypoints": person(i), "image_id": 0, "idx": 3} for i in range(3)]
+    found = read(tmp_path / "a.json", people, layout=COCO17)
+    assert found.identities.tolist() == ["3", "", ""]
+    assert "2 objects have the identity of another" in found.warnings[0]
+
+
+def test_no_identities_are_the_index(tmp_path: Path) -> None:
+    content = openpose(person(), person(1), person_id=[-1])
+    assert read(tmp_path / "a.json", content, layout=COCO17).identities.tolist() == ["0", "1"]
+
+
+@pytest.mark.parametrize("key", ["keypoints", "pose_keypoints", "pose_keypoints_2d"])
+def test_keypoints_of_any_form(tmp_path: Path, key: str) -> None:
+    flat = person()
+    triples = np.reshape(flat, (Q, 3))
+    scores = triples[:, 2].tolist()
+    forms: list[dict[str, Any]] = [
+        {key: flat},
+        {key: triples.tolist()},
+        {key: [triples.tolist()]},
+        {key: pairs(), "keypoint_scores": scores},
+        {key: pairs(), "scores": scores},
+        {key: triples[:, :2].ravel().tolist(), "scores": scores},
+        {key: [{"x": x, "y": y, "score": s} for x, y, s in triples.tolist()]},
+    ]
+    for i, form in enumerate(forms):
+        found = read(tmp_path / f"{i}.json", {"people": [form]}, layout=COCO17)
+        np.testing.assert_array_equal(found.points[0], triples[:, :2].astype(np.float32))
+        np.testing.assert_allclose(found.confidence, 0.9)
+    for plain in (pairs(), triples[:, :2].ravel().tolist()):
+        found = read(tmp_path / "plain.json", {"people": [{key: plain}]}, layout=COCO17)
+        assert (found.confidence == 1).all() and len(found) == 1
+
+
+def test_null_and_nan_are_missing(tmp_path: Path) -> None:
+    values = person()
+    values[3:6], values[6:9] = [None, None, 0], [float("nan"), 1, 1]  # type: ignore[list-item]
+    found = read(tmp_path / "a.json", [{"image_id": 1, "keypoints": values}], layout=COCO17)
+    assert found.confidence[0, :4].tolist() == [np.float32(0.9), 0, 0, np.float32(0.9)]
+
+
+RIGHT_FIRST = [
+    COCO17.keypoints[i + 1 if i % 2 else i - 1] if i else COCO17.keypoints[0] for i in range(Q)
+]
+
+
+def coco(names: list[str], **more: Any) -> dict[str, Any]:
+    entry = {"image_id": 1, "category_id": 1, "keypoints": person()}
+    return {
+        "annotations": [entry],
+        "categories": [{"id": 1, "name": "person", "keypoints": names}],
+        **more,
+    }
+
+
+def test_names_of_a_category_make_the_layout(tmp_path: Path) -> None:
+    found = read(tmp_path / "a.json", coco(RIGHT_FIRST), fallback=HUMAN17)
+    assert found.layout and found.layout.keypoints == tuple(RIGHT_FIRST)
+    found = read(tmp_path / "a.json", coco(list(COCO17.keypoints)), fallback=HUMAN17)
+    assert found.layout is COCO17
+
+
+def test_names_that_contradict_the_layout_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(KeypointFileError, match="keypoint 1 is right_eye, that of coco17 is le"):
+        read(tmp_path / "a.json", coco(RIGHT_FIRST), layout=COCO17)
+    german = [f"Punkt {i}" for i in range(Q)]
+    assert read(tmp_path / "a.json", coco(german), layout=COCO17).layout is COCO17
+    many = [str(i) for i in range(18)]
+    with pytest.raises(KeypointFileError, match="it names 18 keypoints, coco17 has 17"):
+        read(tmp_path / "a.json", coco(many), layout=COCO17)
+
+
+def test_one_category_is_chosen(tmp_path: Path) -> None:
+    dog = [f"dog_{i}" for i in range(5)]
+    content = coco(list(COCO17.keypoints))
+    content["categories"].append({"id": 2, "name": "dog", "keypoints": dog})
+    content["categories"].append({"id": 3, "name": "car"})
+    content["annotations"] += [
+        {"image_id": 1, "category_id": 2, "keypoints": person(1, 5)},
+        {"image_id": 1, "category_id": 3, "bbox": [1, 2, 3, 4]},
+    ]
+    with pytest.raises(KeypointFileError, match=r"person \(1\), dog \(2\); choose one with --cat"):
+        read(tmp_path / "a.json", content)
+    for name in ("dog", "2"):
+        found = read(tmp_path / "a.json", content, category=name)
+        assert found.layout and found.layout.keypoints == tuple(dog) and len(found) == 1
+    with pytest.raises(KeypointFileError, match="no category 'cat' with keypoints; there are: per"):
+        read(tmp_path / "a.json", content, category="cat")
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["Nose", "LShoulder", "RBigToe"], ["nose", "left_shoulder", "right_big_toe"]),
+        (["shoulder_l", "Left Knee", "right-ankle"], ["left_shoulder", "left_knee", "right_ankle"]),
+        (["leftElbow", "lshoulder", "REye"], ["left_elbow", "left_shoulder", "right_eye"]),
+        (["snout", "TailBase", "l"], ["snout", "TailBase", "l"]),
+    ],
+)
+def test_spelling_of_names(names: list[str], expected: list[str]) -> None:
+    assert [preset_spelling(name) for name in names] == expected
+
+
+def test_names_of_a_preset_are_the_preset() -> None:
+    assert layout_of_names(list(BODY25.keypoints)) is BODY25
+    assert layout_of_names([n.title().replace("_", " ") for n in COCO17.keypoints]) is COCO17
+
+
+def instance(seed: int, **more: Any) -> dict[str, Any]:
+    scores = [0.9] * Q
+    return {"keypoints": pairs(seed), "keypoint_scores": scores, "bbox_score": 0.8, **more}
+
+
+def test_mmpose(tmp_path: Path) -> None:
+    names = {str(i): name for i, name in enumerate(COCO17.keypoints)}
+    frames = [
+        {"frame_id": 1, "instances": [instance(0, track_id=5), instance(1, track_id=6)]},
+        {"frame_id": 3, "instances": []},
+        {"frame_id": 4, "instances": [instance(2)]},
+    ]
+    for meta in (
+        {"dataset_name": "coco", "keypoint_id2name": names},
+        {"dataset_name": "coco"},
+    ):
+        content = {"meta_info": meta, "instance_info": frames}
+        found = read(tmp_path / "video.json", content, fallback=HUMAN17)
+        assert found.layout is COCO17
+        assert found.frames.numbers.tolist() == [1, 3, 4] and found.frame.tolist() == [0, 0, 2]
+        assert found.identities.tolist() == ["5", "6", ""]
+        assert found.scores.tolist() == [np.float32(0.8)] * 3
+    people = [instance(0), instance(1)]
+    for image in (people, {"predictions": [people]}):
+        found = read(tmp_path / "image.json", image, layout=COCO17)
+        assert found.frame.tolist() == [0, 0]
+        assert found.frames.names.tolist() == ["image.json"]
+
+
+def test_alphapose_by_image(tmp_path: Path) -> None:
+    content = {f"{i}.jpg": {"version": "v0.3", **openpose(person(i))} for i in (3, 7)}
+    found = read(tmp_path / "a.json", content, layout=COCO17)
+    assert found.frames.names.tolist() == ["3.jpg", "7.jpg"] and len(found) == 2
+    bodies = {"1.jpg": {"version": "0.1", "bodies": [{"joints": person()}]}}
+    assert len(read(tmp_path / "a.json", bodies, layout=COCO17)) == 1
+
+
+def test_scores_leave_people_out(tmp_path: Path) -> None:
+    people = [
+        {"image_id": 0, "keypoints": person(i), "score": score}
+        for i, score in enumerate((0.9, 0.2, 2.5))
+    ]
+    found = read(tmp_path / "a.json", people, layout=COCO17, min_score=0.5)
+    assert found.scores.tolist() == [np.float32(0.9), 2.5]
+    assert found.warnings == ("left out: 1 that have a score below --min-score 0.5",)
+    for entry in people:
+        del entry["score"]
+    with pytest.raises(KeypointFileError, match="no object a score: leave out --min-score"):
+        read(tmp_path / "a.json", people, layout=COCO17, min_score=0.5)
+
+
+def test_the_largest_is_no_ghost(tmp_path: Path) -> None:
+    sizes = {0.2: 10.0, 0.8: 1.0, 0.9: 0.5}
+    people = [
+        {"image_id": 0, "keypoints": (np.array(person()) * size).tolist(), "score": score}
+        for score, size in sizes.items()
+    ]
+    found = read(tmp_path / "a.json", people, layout=COCO17)
+    assert found.largest().scores.tolist() == [np.float32(0.8)]
+
+
+def test_a_mark_of_missing_keypoints(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(50, 900, (60, Q, 2))
+    points[::2, 3] = -1
+    np.savez(tmp_path / "a.npz", points=points)
+    found = read_keypoints(tmp_path / "a.npz")
+    assert "30 of 60 objects have keypoints at (-1, -1)" in found.warnings[0]
+    assert "--missing-value -1" in found.warnings[0]
+    found = read_keypoints(tmp_path / "a.npz", ReadOptions(missing_value=-1))
+    assert not found.warnings and (found.confidence == 0).sum() == 30
+    assert not found.points[::2, 3].any()
+
+
+def test_arrays_of_others(tmp_path: Path) -> None:
+    path, points = tmp_path / "a.npz", np.ones((6, Q, 2))
+    np.savez(
+        path, points=points, metadata=np.array({"w": 1280}, object), ids=np.array(["a"] * 6, object)
+    )
+    found = read_keypoints(path, ReadOptions(layout=COCO17))
+    assert len(found) == 6 and not found.warnings
+    np.savez(path, points=points, identities=np.array(["a"] * 6, object))
+    assert "`identities` holds Python objects" in read_keypoints(path).warnings[0]
+    np.savez(path, positions_2d=np.array({"S1": {}}, object), metadata=np.array({}, object))
+    with pytest.raises(KeypointFileError, match=r"VideoPose3D's data_2d_\*.npz .*np.savez\(NEW"):
+        read_keypoints(path)
+    objects = np.array([None, [1]], object)
+    np.savez(path, boxes=objects, keypoints=objects, segments=objects)
+    with pytest.raises(KeypointFileError, match="detections of Detectron.*`keypoints`"):
+        read_keypoints(path)
+
+
+def test_arrays_name_their_keypoints_and_frames(tmp_path: Path) -> None:
+    np.savez(
+        tmp_path / "a.npz",
+        points=np.ones((3, Q, 2)),
+        names=np.array(COCO17.keypoints),
+        frame_numbers=np.array([4, 5, 9]),
+        frame_names=np.array(["a", "b", "c"]),
+        scores=np.array([0.1, 0.9, 0.9]),
+    )
+    found = read_keypoints(tmp_path / "a.npz", ReadOptions(rate=1, min_score=0.5))
+    assert found.layout is COCO17 and found.frame.tolist() == [1, 2]
+    assert found.stamps.tolist() == [4_000_000_000, 5_000_000_000, 9_000_000_000]
+    assert found.frames.names.tolist() == ["a", "b", "c"]
+
+
+def test_plain_arrays(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(1, 9, (4, 2, Q, 3))
+    np.save(tmp_path / "a.npy", points)
+    found = read_keypoints(tmp_path / "a.npy", ReadOptions(rate=10))
+    assert found.frame.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert found.stamps.tolist() == [0, 100_000_000, 200_000_000, 300_000_000]
+    np.save(tmp_path / "a.npy", points[:, 0, :, :2])
+    assert read_keypoints(tmp_path / "a.npy").frame.tolist() == [0, 1, 2, 3]
+    np.save(tmp_path / "a.npy", np.array([{}], object))
+    with pytest.raises(KeypointFileError, match="it holds Python objects"):
+        read_keypoints(tmp_path / "a.npy")
+
+
+def test_an_option_that_cannot_act_is_an_error(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", points=np.ones((1, Q, 2)), stamps=np.array([5]))
+    for options, expected in (
+        (ReadOptions(topic="/people"), "--topic has no effect on a file that is no bag"),
+        (ReadOptions(category="dog"), "--category has no effect on a file that is not COCO"),
+        (ReadOptions(rate=5), "`stamps` of its own: leave out --rate"),
+        (ReadOptions(min_score=0.5), "no array `scores`"),
+    ):
+        with pytest.raises(KeypointFileError, match=expected):
+            read_keypoints(tmp_path / "a.npz", options)
+
+
+def test_a_file_that_ends_early_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    text = json.dumps([{"image_id": i, "keypoints": person(i)} for i in range(5)])
+    found = read(tmp_path / "a.json", text[:-300], layout=COCO17)
+    assert len(found) == 4 and "read up to a damaged place" in found.warnings[0]
+
+
+class Slow:
+    """A file that gives a few bytes at a time."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def read(self, size: int = -1, /) -> bytes:
+        part, self.data = self.data[:3], self.data[3:]
+        return part
+
+
+def test_items_of_a_document_in_parts() -> None:
+    text = '\ufeff{"a": [1, [2, "ü]"], {}], "b": 1234567, "c": [], "d": {"e": [1]}}'
+    assert list(json_items(Slow(text.encode()))) == [
+        JsonItem("a", 1, True),
+        JsonItem("a", [2, "ü]"], True),
+        JsonItem("a", {}, True),
+        JsonItem("b", 1234567, False),
+        JsonItem("c", [], False),
+        JsonItem("d", {"e": [1]}, False),
+    ]
+    assert list(json_items(Slow(b"[12, 345]"))) == [
+        JsonItem(None, 12, True),
+        JsonItem(None, 345, True),
+    ]
+    with pytest.raises(ValueError, match="ends early"):
+        list(json_items(Slow(b'[1, {"a": 2')))
+    with pytest.raises(ValueError, match="after its end"):
+        list(json_items(Slow(b"[1] 2")))
