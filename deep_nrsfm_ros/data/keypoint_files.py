@@ -24,6 +24,7 @@ from deep_nrsfm_ros.data.formats.frame_numbers import natural
 from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
 from deep_nrsfm_ros.data.formats.json_items import Readable
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
+from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 
 __all__ = ["KINDS", "KeypointFileError", "is_bag", "read_bag", "read_keypoints", "stamp_of"]
@@ -108,13 +109,16 @@ def _refuse(options: ReadOptions, names: tuple[str, ...], kind: str) -> None:
 
 
 def _finish(detections: Detections, options: ReadOptions) -> Detections:
-    """Return detections without marks of missing keypoints, with warnings of likely ones."""
+    """Return detections in pixels, without marks of missing keypoints; warn of likely ones."""
     points, confidence = detections.points, detections.confidence
     if options.missing_value is not None:
         marked = (points == np.float32(options.missing_value)).any(-1) & (confidence > 0)
         points, confidence = points.copy(), confidence.copy()
         points[marked], confidence[marked] = 0, 0
         detections = dataclasses.replace(detections, points=points, confidence=confidence)
+    pixels = to_pixels(points, confidence, options.image_size)
+    if pixels is not points:
+        detections = dataclasses.replace(detections, points=pixels)
     if warning := _likely_mark(detections):
         return dataclasses.replace(detections, warnings=(*detections.warnings, warning))
     return detections
@@ -251,7 +255,10 @@ FORMATS = (
 )
 """The formats of single files."""
 KINDS = "; ".join(
-    ["a bag (folder, .db3, .mcap, or .bag of ROS 1)", *(form.description for form in (*FORMATS, _FOLDER))]
+    [
+        "a bag (folder, .db3, .mcap, or .bag of ROS 1)",
+        *(form.description for form in (*FORMATS, _FOLDER)),
+    ]
 )
 """What `read_keypoints` reads, for the help of programs."""
 

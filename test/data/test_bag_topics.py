@@ -269,7 +269,7 @@ def test_bags_of_ros_1(tmp_path: Path, recorded: Any) -> None:
         reading = read_bags([path], COCO17, COCO17)
         assert reading[1:] == (6, 0, "", ())
         np.testing.assert_array_equal(reading.dataset.points, given[..., :2])
-    detections = read_keypoints(whole, 17)
+    detections = read_keypoints(whole)
     assert detections.stamps.tolist() == [10**9] * 6 and detections.frame_id == "camera"
     cut = tmp_path / "cut.bag"
     cut.write_bytes(whole.read_bytes()[:-300])

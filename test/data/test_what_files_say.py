@@ -419,3 +419,15 @@ def test_items_of_a_document_in_parts() -> None:
         list(json_items(Slow(b'[1, {"a": 2')))
     with pytest.raises(ValueError, match="after its end"):
         list(json_items(Slow(b"[1] 2")))
+
+
+def test_normalised_keypoints_become_pixels(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0.1, 1, (4, Q, 2))
+    points[0, 0] = -1
+    np.save(tmp_path / "a.npy", points)
+    options = ReadOptions(image_size=(1280, 720), missing_value=-1)
+    found = read_keypoints(tmp_path / "a.npy", options)
+    np.testing.assert_allclose(found.points[1:], points[1:] * [1280, 720], rtol=1e-5)
+    assert found.confidence[0, 0] == 0
+    np.save(tmp_path / "a.npy", points * 500)
+    np.testing.assert_allclose(read_keypoints(tmp_path / "a.npy", options).points, points * 500)
