@@ -37,6 +37,12 @@ class CameraOptions:
         "raw image (K and D)",
         read_only=True,
     )
+    frame_id: str = option(
+        "",
+        "frame of points, markers and /tf where the header of the keypoints has no frame_id, or "
+        "their type has no header; empty = the frame of CameraInfo, if that is known",
+        read_only=True,
+    )
     tf_prefix: str = option(
         "",
         "prefix of the frames of objects on /tf; the name of a frame is the prefix and the "

@@ -39,7 +39,8 @@ class LifterDiagnostics:
     ERROR: messages were received and none could be lifted; or a publisher cannot be received and no
         other message was lifted.
     WARN: some messages were rejected; no message for 3 s; more messages were dropped than received;
-        the median reprojection error is above 0.3; or the median confidence is below 0.3.
+        the median reprojection error is above 0.3; the median confidence is below 0.3; or
+        something is wrong with the frame of the points.
     OK: otherwise.
 
     Attributes:
@@ -48,6 +49,7 @@ class LifterDiagnostics:
         total_rejected: messages since the start that could not be lifted.
         total_dropped: messages since the start that were sent and not received.
         last_problem: reason of the last rejected message or publisher that cannot be received.
+        frame_problem: what is wrong with the frame of points in this period; "" if nothing is.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -68,6 +70,7 @@ class LifterDiagnostics:
         self.total_rejected = 0
         self.total_dropped = 0
         self.last_problem = ""
+        self.frame_problem = ""
 
     @property
     def idle(self) -> bool:
@@ -134,6 +137,7 @@ class LifterDiagnostics:
             "last problem": self.last_problem or "none",
         }
         self._last_report, self._rejected, self._empty, self._dropped = now, 0, 0, 0
+        self.frame_problem = ""
         self._seconds.clear()
         self._residuals.clear()
         self._confidences.clear()
@@ -168,26 +172,29 @@ class LifterDiagnostics:
                 "faster than they are lifted; set test_time_rotations to 1 or refill to 0, or send "
                 "fewer"
             )
+        problems = [self.frame_problem] if self.frame_problem else []
         if residual > _MAX_RESIDUAL:
-            return WARN, f"poor fit: median reprojection error {residual:.2f}"
-        if confidence < _MIN_CONFIDENCE:
-            return WARN, f"low confidence: median {confidence:.2f}"
+            problems.insert(0, f"poor fit: median reprojection error {residual:.2f}")
+        elif confidence < _MIN_CONFIDENCE:
+            problems.insert(0, f"low confidence: median {confidence:.2f}")
+        if problems:
+            return WARN, "; ".join(problems)
         if self._empty and not self._seconds:
             return OK, "the detector sees no object"
         return OK, "lifting" if self._seconds else "waiting for keypoints"
 
 
 def status(
-    name: str, level: int, message: str, values: Mapping[str, Any], hardware_id: str = ""
+    name: str, level: int, message: str, values: Mapping[str, Any], hardware_id: str
 ) -> DiagnosticStatus:
     """Return a diagnostic status whose values are written as text.
 
     Args:
-        name: of the status, "node: task".
+        name: of the status, "/namespace/node: task".
         level: `OK`, `WARN` or `ERROR`.
         message: one line that says why.
         values: named figures.
-        hardware_id: "" for none.
+        hardware_id: full name of the node, by which aggregators tell lifters apart.
     """
     return DiagnosticStatus(
         level=bytes([level]),

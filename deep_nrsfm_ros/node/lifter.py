@@ -66,6 +66,7 @@ from deep_nrsfm_ros.training.request import (
 _SMOOTHING = "smoothing."
 _TRAIN = "train."
 _REPORT_PERIOD = 1.0  # seconds
+_FRAME_LOG_PERIOD = 60.0  # seconds
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _TRAINING_GRACE = 1.0  # seconds in which a training may save its model when the node ends
 
@@ -97,6 +98,7 @@ class LifterNode(Node):
         )
         self._pipeline = self._proposed = self._build_pipeline(())
 
+        self._frame_id = camera.frame_id
         self._camera = CameraInfoSubscription(self, camera)
         self._tf = TransformBroadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._lifter_diagnostics = LifterDiagnostics()
@@ -146,8 +148,8 @@ class LifterNode(Node):
             else:
                 identities = ("",) * len(observation.confidence)
             header = header or self._now()
-            if not header.frame_id:
-                header = header._replace(frame_id=self._camera.frame)
+            if not header.frame_id or (self._frame_id and header.frame_id != self._frame_id):
+                header = header._replace(frame_id=self._frame(source, header.frame_id))
             seconds = 1e-9 * (header.stamp or self._now().stamp)
             lifted, identities = self._pipeline.lift(
                 observation, intrinsics, identities, source.topic, seconds
@@ -183,6 +185,26 @@ class LifterNode(Node):
             f"message on {source.topic} rejected: {reason}", throttle_duration_sec=LOG_PERIOD
         )
 
+    def _frame(self, source: KeypointTopic, frame: str) -> str:
+        """Return the frame of the points of a message in `frame`; warn if they have none."""
+        diagnostics, problem = self._lifter_diagnostics, ""
+        if frame:
+            if not self._frame_id:
+                return frame
+            problem = (
+                f"frame_id is {self._frame_id!r} and is not used: the header of the keypoints on "
+                f"{source.topic} says {frame!r}; leave frame_id empty, or change the detector"
+            )
+        elif not (frame := self._frame_id or self._camera.frame):
+            problem = (
+                f"keypoints on {source.topic} have no frame_id, so neither have points and "
+                "markers: set frame_id to the camera's optical frame"
+            )
+        if problem and not diagnostics.frame_problem:  # a log entry costs more than a lift
+            diagnostics.frame_problem = problem
+            self.get_logger().warning(problem, throttle_duration_sec=_FRAME_LOG_PERIOD)
+        return frame
+
     def _now(self) -> Header:
         """Return the header of input without one: the present time and no frame."""
         return Header(*self.get_clock().now().seconds_nanoseconds())
@@ -194,7 +216,8 @@ class LifterNode(Node):
         model = self._pipeline.model
         values |= {"model": model.name, "topic": ", ".join(self._keypoint_topics.topics)}
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
-        lifting = status(f"{self.get_name()}: lifting", level, message, values)
+        node = self.get_fully_qualified_name()
+        lifting = status(f"{node}: lifting", level, message, values, node)
         self._diagnostics_publisher.publish(
             DiagnosticArray(
                 header=publishing.to_header(self._now()), status=[lifting, self._training.status]

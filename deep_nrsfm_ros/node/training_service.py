@@ -157,8 +157,8 @@ class TrainingService:
         if progress.state == "finished":
             self._last_failure = "none"
         self._state = progress.state
-        name = f"{self._node.get_name()}: training"
+        node = self._node.get_fully_qualified_name()
         values = {"state": progress.state, **progress.values, "last failure": self._last_failure}
         level = ERROR if failed else OK
-        self.status = status(name, level, progress.message, values)
+        self.status = status(f"{node}: training", level, progress.message, values, node)
         self._publisher.publish(self.status)

@@ -104,6 +104,17 @@ def test_low_confidence_is_a_warning_of_half_of_the_objects(health: LifterDiagno
     assert health.report().level == OK
 
 
+def test_points_without_a_frame_are_a_warning_beside_others(health: LifterDiagnostics) -> None:
+    health.lifted(0.001, GOOD, SURE)
+    health.frame_problem = "no frame_id"
+    assert health.report()[:2] == (WARN, "no frame_id")
+    health.lifted(0.001, POOR, SURE)
+    assert "no frame_id" not in health.report().message
+    health.lifted(0.001, POOR, SURE)
+    health.frame_problem = "no frame_id"
+    assert health.report().message == "poor fit: median reprojection error 0.60; no frame_id"
+
+
 def test_a_model_of_fewer_keypoints_may_take_over_between_two_reports(
     health: LifterDiagnostics,
 ) -> None:

@@ -254,6 +254,19 @@ def test_markers_come_when_someone_listens(client: Client) -> None:
     assert all(m.scale.x > 0 for m in markers)
 
 
+def test_points_without_a_frame_are_warned_of(
+    running: tuple[LifterProcess, Client], client: Client
+) -> None:
+    lifter, _ = running
+    message = cloud(pixels(1))
+    message.header.frame_id = ""
+    publisher = client.publisher(PointCloud2)
+    sender = client.node.create_timer(0.1, lambda: publisher.publish(message))
+    client.wait_for_health(lambda status, _: "have no frame_id" in status.message)
+    client.node.destroy_timer(sender)
+    lifter.wait_for_log("set frame_id to the camera's optical frame")
+
+
 def test_smoothing_follows_slower_and_fills_a_gap(
     start_lifter: StartLifter, connect: Connect
 ) -> None:

@@ -294,7 +294,7 @@ def test_data_that_cannot_be_trained_on_is_refused_with_advice(
             # A report of before the failure may still be on its way.
             diagnosed = client.wait(
                 lambda: [s for m in client.heard["/diagnostics"] for s in m.status
-                         if s.name == "lifter: training" and s.level == b"\x02"], "the diagnosis"
+                         if s.name == "/lifter: training" and s.level == b"\x02"], "the diagnosis"
             )  # fmt: skip
             assert complaint in values(diagnosed[0])["last failure"]
         else:

@@ -253,7 +253,7 @@ class Client:
     def _take_report(self, message: DiagnosticArray) -> None:
         """Keep the values of the latest diagnostics."""
         for status in message.status:
-            if status.name == "lifter: lifting":
+            if status.name == "/lifter: lifting":
                 self.health = {pair.key: pair.value for pair in status.values}
                 self._errors.append(float(self.health["reprojection error"]))
 

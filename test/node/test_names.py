@@ -1,0 +1,68 @@
+"""Names of nodes, frames and parameters, of a lifter that is one of several."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float32MultiArray
+
+from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY
+from test.node.conftest import Client, LifterProcess, lifters, own_domain, write_models
+from test.node.test_lifter import cloud, multi_array, pixels
+
+NAMESPACED = ("-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-r", "__ns:=/robot1", "--")
+"""Program of a lifter in the namespace /robot1."""
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LifterProcess, Client]]:
+    """Start a lifter in a namespace, with a frame for arrays, and a client of it."""
+    folder = tmp_path_factory.mktemp("running")
+    with own_domain() as number, lifters(write_models(folder / "models"), folder) as start:
+        lifter = start(NAMESPACED, input_type=MULTI_ARRAY, frame_id="optical")
+        client = Client(number)
+        client.listen("/robot1/lifter/points", PointCloud2)
+        yield lifter, client
+        client.close()
+
+
+def test_diagnostics_have_the_full_name_of_the_node(
+    running: tuple[LifterProcess, Client],
+) -> None:
+    _, client = running
+    heard: list[DiagnosticArray] = client.heard["/diagnostics"]
+    client.wait(lambda: heard, "diagnostics")
+    names = {(status.name, status.hardware_id) for status in heard[-1].status}
+    expected = {"/robot1/lifter: lifting", "/robot1/lifter: training"}
+    assert names == {(name, "/robot1/lifter") for name in expected}
+
+
+def test_keypoints_without_a_header_get_the_frame_of_the_parameter(
+    running: tuple[LifterProcess, Client],
+) -> None:
+    _, client = running
+    publisher = client.publisher(Float32MultiArray, topic="/robot1/keypoints")
+    heard = client.heard["/robot1/lifter/points"]
+
+    def answered() -> list[Any]:
+        publisher.publish(multi_array(pixels(1)))
+        return heard
+
+    assert client.wait(answered, "points")[0].header.frame_id == "optical"
+    client.destroy_publishers()
+
+
+def test_points_without_a_frame_and_a_frame_that_is_not_used_are_warned_of(
+    start_lifter: Any, connect: Any
+) -> None:
+    """A header with a frame has precedence over the parameter."""
+    lifter = start_lifter(frame_id="optical")
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    message = cloud(pixels(1))
+    assert client.exchange(publisher, message).header.frame_id == message.header.frame_id
+    lifter.wait_for_log("frame_id is 'optical' and is not used")
