@@ -181,7 +181,8 @@ def test_an_object_that_is_no_preset_is_trained_anew_from_its_model_and_by_numbe
     network = initialise(Architecture(widths=(8, 4)), len(PAW), np.random.default_rng(0))
     paw = Model("paw", network, PAW, Normaliser(), np.eye(3, dtype=np.float32))
     save_model(models / "paw.safetensors", paw)
-    train = {"bags": [str(tmp_path / "bag")], "topic": "/keypoints", "steps": 5, "name": "anew"}
+    source: dict[str, Any] = {"bags": [str(tmp_path / "bag")], "topic": "/keypoints"}
+    train = source | {"name": "anew", "steps": 5, "seeds": 1}
     start_lifter(input_type="std_msgs/Float32MultiArray", model="paw", train=train)
     client = connect()
     publisher = client.publisher(Float32MultiArray)
