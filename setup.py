@@ -93,6 +93,7 @@ setup(
         "rosbags",  # reads and writes rosbag2 without a ROS installation
         "pyyaml",  # layout files, parameter files and bag metadata
         "jinja2",  # reports and recordings as pages: templates that escape whatever comes from data
+        "lap",  # optimal assignment for identities: 2 MB and NumPy alone, where SciPy has 100 MB
         "tqdm",  # progress of training, evaluation and lifting
     ],
     extras_require={

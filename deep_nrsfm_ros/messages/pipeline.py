@@ -14,6 +14,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
+from deep_nrsfm_ros.lifting.tracking import keypoint_tolerances
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, POINT_CLOUD
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.serialised import Header, MessageReader
@@ -102,6 +103,7 @@ class Pipeline:
         detector: layout that `keypoint_layout` names; None: the model's own.
         source: layout of the messages, `detector` or the model's.
         edges: pairs of keypoint indices of the model's layout, to draw.
+        tolerances: (p,) of the keypoints of the model's layout, for identities.
     """
 
     def __init__(
@@ -127,6 +129,7 @@ class Pipeline:
         self.model, self.detector = model, detector
         self.source = detector or model.layout
         self.edges = model.layout.edge_indices()
+        self.tolerances = keypoint_tolerances(model.layout)
         self._map = KeypointMap(self.source, model.layout)
         self._lifter = Lifter(model, lifting, layout=self.source)
         self._min_confidence = inputs.min_confidence

@@ -144,7 +144,9 @@ class LifterNode(Node):
             header, observation = self._pipeline.read(raw, source.reader, self._camera.size)
             has_subscriber = self._objects.get_subscription_count()
             if has_subscriber or self._tf or self._pipeline.needs_identities:
-                identities = source.tracker(observation, started)
+                identities = source.tracker(
+                    observation, started, tolerances=self._pipeline.tolerances
+                )
             else:
                 identities = ("",) * len(observation.confidence)
             header = header or self._now()

@@ -1,11 +1,16 @@
 """Objects keep their identities while they are seen."""
 
+from typing import Any
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.observation import Identities, Observation
-from deep_nrsfm_ros.lifting.tracking import MAX_AGE, Tracker
+from deep_nrsfm_ros.lifting.tracking import MAX_AGE, Tracker, keypoint_tolerances
 
 BODY = np.random.default_rng(0).uniform(-50, 50, (8, 2)).astype(np.float32)
 
@@ -50,15 +55,110 @@ def test_another_number_of_keypoints_is_another_object() -> None:
     assert a != b == tracker(fewer, 0.2)[0]
 
 
-def test_only_keypoints_that_both_show_are_compared() -> None:
+def test_what_is_hidden_is_where_the_rest_has_moved_it() -> None:
     tracker = Tracker()
     (a,) = tracker(seen((100, 100)), 0.0)
-    half = seen((100, 100))
-    half.points[0, 4:] = half.confidence[0, 4:] = 0
+    half = hide(seen((110, 100)), slice(4, None))
     assert tracker(half, 0.1) == (a,)
-    other = seen((100, 100))
-    other.points[0, :4] = other.confidence[0, :4] = 0
-    assert tracker(other, 0.2) != (a,)
+    assert tracker(hide(seen((120, 100)), slice(0, 4)), 0.2) == (a,)
+
+
+def test_an_object_without_a_common_keypoint_is_known_by_its_place() -> None:
+    tracker = Tracker()
+    (a,) = tracker(hide(seen((100, 100)), slice(4, None)), 0.0)
+    far, near = tracker(hide(seen((900, 100), (100, 100)), slice(0, 4)), 0.1)
+    assert near == a != far
+
+
+def hide(observation: Observation, keypoints: slice) -> Observation:
+    """Return the observation without some of the keypoints."""
+    observation.points[:, keypoints] = observation.confidence[:, keypoints] = 0
+    return observation
+
+
+@pytest.mark.parametrize("rate", [5, 30, 240])
+def test_people_who_cross_keep_their_identities(rate: int) -> None:
+    tracker = Tracker()
+    rng = np.random.default_rng(rate)
+    names = []
+    for frame in range(3 * rate):
+        x = 200 * frame / rate  # pixels: 4 sizes a second
+        both = seen((100 + x, 100), (700 - x, 130))
+        if abs(600 - 2 * x) < 60:  # the second person is hidden for 0.15 s
+            names.append((tracker(_rows(both, [0]), frame / rate)[0], None))
+            continue
+        order = rng.permutation(2)
+        identities = tracker(_rows(both, order), frame / rate)
+        names.append(tuple(identities[i] for i in np.argsort(order)))
+    assert {a for a, _ in names} == {names[0][0]}
+    assert {b for _, b in names} - {None} == {names[0][1]}
+
+
+def _rows(observation: Observation, rows: Any) -> Observation:
+    """Return some of the objects."""
+    return Observation(observation.points[rows], observation.confidence[rows])
+
+
+def test_people_who_exchange_wrong_keypoints_keep_their_identities() -> None:
+    tracker = Tracker()
+    a, b = tracker(seen((100, 100), (130, 100)), 0.0)
+    mixed = seen((102, 100), (128, 100))
+    mixed.points[:, :3] = mixed.points[::-1, :3]
+    assert tracker(mixed, 0.1) == (a, b)
+
+
+def test_the_assignment_is_the_best_of_all_and_not_the_nearest_pair_first() -> None:
+    tracker = Tracker()
+    a, b = tracker(seen((100, 100), (150, 100)), 0.0)
+    # The nearest pair is the first detection and b, which leaves a to the second one, far away.
+    assert tracker(seen((127, 100), (173, 100)), 0.1) == (a, b)
+
+
+def test_the_order_of_objects_does_not_matter() -> None:
+    places = [(100.0, 100.0), (160.0, 100.0), (220.0, 100.0), (900.0, 0.0)]
+    forward, backward = Tracker(), Tracker()
+    for frame in range(5):
+        moved = [(x + 20 * frame, y) for x, y in places]
+        names = forward(seen(*moved), frame / 10)
+        assert names == backward(seen(*moved[::-1]), frame / 10)[::-1]
+
+
+def test_of_two_objects_with_one_identity_the_more_visible_one_keeps_it() -> None:
+    both = seen((0, 0), (300, 0), identities=("7", "7"))
+    both.confidence[0, :3] = both.points[0, :3] = 0
+    assert Tracker()(both, 0.0) == ("object1", "7")
+
+
+def test_a_stream_of_one_image_a_second_keeps_identities() -> None:
+    tracker = Tracker()
+    a, b = tracker(seen((100, 100), (600, 100)), 0.0)
+    for second in range(1, 5):
+        assert tracker(seen((100 + 40 * second, 100), (600, 100)), second, 1.0) == (a, b)
+    assert tracker(seen((600, 100)), 6.0, 1.0) == (b,)
+    assert tracker(seen((600, 100)), 8.9, 1.0) == (b,)
+    assert tracker(seen((600, 100)), 12.1, 1.0) != (b,)
+
+
+def test_stamps_that_begin_anew_begin_new_identities() -> None:
+    tracker = Tracker()
+    (a,) = tracker(seen((100, 100)), 10.0)
+    assert tracker(seen((100, 100)), 9.99) == (a,)
+    assert tracker(seen((100, 100)), 2.0) != (a,)
+
+
+def test_the_number_of_tracks_is_bounded() -> None:
+    tracker = Tracker()
+    for frame in range(300):
+        tracker(seen(*[(1e4 * frame + 900 * i, 0) for i in range(5)]), frame / 1e4)
+    assert tracker.track_count <= 5 + 256
+
+
+def test_keypoints_of_known_names_have_the_tolerance_of_coco() -> None:
+    tolerances = keypoint_tolerances(HUMAN17)
+    assert tolerances.shape == (17,) and (tolerances >= 0.1).all()
+    hip, wrist = HUMAN17.index("left_hip"), HUMAN17.index("right_wrist")
+    assert tolerances[hip] > tolerances[wrist]
+    assert set(keypoint_tolerances(KeypointLayout.numbered(5)).tolist()) == {np.float32(0.2)}
 
 
 def test_the_detectors_identities_stay_and_a_second_of_the_same_is_another() -> None:
