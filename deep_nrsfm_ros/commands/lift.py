@@ -1,4 +1,8 @@
-"""Lift a file of 2D keypoints to 3D, without ROS: npz, JSON or bag in, npz, JSON or bag out."""
+"""Lift a file of 2D keypoints to 3D, without ROS: npz, JSON or bag in, npz, JSON or bag out.
+
+Exit code 0: the answer can be believed; 2: the input or an option is at fault; 3: the answer is
+written, and something about it looks wrong (--force: 0).
+"""
 
 from __future__ import annotations
 
@@ -8,23 +12,44 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from tqdm import tqdm
 
 from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments, override
-from deep_nrsfm_ros.data.camera_file import read_camera_file
+from deep_nrsfm_ros.data.camera_file import read_camera_file, read_image_size
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import KINDS, read_keypoints
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, lift_recording
+from deep_nrsfm_ros.data.summary import Summary, resolve_layout, summarise
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.sanity import Size
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
-from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER, InputOptions
+from deep_nrsfm_ros.messages.pipeline import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
+
+_OF_THE_NODE = ("input_type", "topics", "bags_dir", "max_objects")
+"""Options of the node's input that mean nothing for a file."""
+_DOUBTFUL = 3
+"""Exit code of an answer that looks wrong."""
+
+
+class Camera(NamedTuple):
+    """What the options say of the camera.
+
+    Attributes:
+        intrinsics: of the camera; None: not given.
+        image_size: width and height of the image in pixels; None: unknown.
+    """
+
+    intrinsics: Intrinsics | None
+    image_size: Size | None
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -36,6 +61,11 @@ def arguments() -> argparse.ArgumentParser:
         type=Path,
         required=True,
         help="what to write, by its suffix: .npz, .json, or a bag (a name without suffix)",
+    )
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="end with exit code 0 even if the answer looks wrong",
     )
     add_reading_arguments(parser)
     return parser
@@ -68,32 +98,69 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         help="the keypoints are those of the rectified image, to which CameraInfo's P belongs",
     )
     add_arguments(parser, ReadOptions)
-    add_arguments(parser, InputOptions, without=("input_type", "topics"))
+    add_arguments(parser, InputOptions, without=_OF_THE_NODE)
     add_arguments(parser, LiftingOptions)
 
 
 def read_model(args: argparse.Namespace) -> tuple[Model, KeypointLayout | None]:
-    """Return the model, and the layout that the user names for the keypoints; None = no layout.
+    """Return the model, and the layout that the user names for the keypoints; None = auto.
 
     Raises:
-        ValueError: the model or the layout is missing.
+        ValueError: the model or the layout is missing, or an option has no effect.
     """
     inputs = override(InputOptions(), args)
     model = load_model(inputs.model, Path(inputs.models_dir).expanduser())
-    if inputs.keypoint_layout == MODEL_ORDER:
+    check_options(args, model)
+    if inputs.keypoint_layout == AUTO:
         return model, None
+    if inputs.keypoint_layout == MODEL_ORDER:
+        return model, model.layout
     return model, find_layout("--keypoint-layout", inputs.keypoint_layout)
+
+
+def check_options(args: argparse.Namespace, model: Model) -> None:
+    """Raise ValueError for an option that would have no effect, and say why."""
+    inputs, lifting = override(InputOptions(), args), override(LiftingOptions(), args)
+    if bool(inputs.image_width) != bool(inputs.image_height):
+        raise ValueError(
+            f"--image-width is {inputs.image_width} and --image-height is {inputs.image_height}: "
+            "the size of the image needs both"
+        )
+    if args.rectified and not args.intrinsics:
+        raise ValueError("--rectified has no effect without --intrinsics: it chooses P there")
+    if "noise" in args and lifting.correction == "none":
+        raise ValueError("--noise has no effect with --correction none: leave one out")
+    if lifting.mirror and model.layout.partners() is None:
+        raise ValueError(
+            f"--mirror has no effect on model {model.name!r}: its layout {model.layout.name!r} has "
+            "no handedness, or no pairs of left_ and right_ keypoints"
+        )
+
+
+def read_camera(args: argparse.Namespace) -> Camera:
+    """Return the camera; raise ValueError if its file cannot be read or contradicts the options."""
+    size = override(InputOptions(), args).image_size
+    if not args.intrinsics:
+        return Camera(None, size)
+    path = Path(args.intrinsics).expanduser()
+    intrinsics, own = read_camera_file(path, rectified=args.rectified), read_image_size(path)
+    if size and own and size != own:
+        raise ValueError(
+            f"--image-width and --image-height say {size[0]} x {size[1]}, and {path} is of an "
+            f"image of {own[0]} x {own[1]}: keypoints and camera must be of the same image"
+        )
+    return Camera(intrinsics, size or own)
 
 
 def read_objects(
     args: argparse.Namespace, model: Model, layout: KeypointLayout | None
 ) -> tuple[Detections, KeypointLayout]:
-    """Return the objects in the input, and the layout of their keypoints.
+    """Return the objects in the input, in pixels, and the layout of their keypoints.
 
     Args:
         args: the command line.
-        model: its layout is that of an input that does not name its keypoints.
-        layout: as the user names it; None = that of the input or of the model.
+        model: lifts them.
+        layout: as the user names it; None = that of the input, or the one that fits best.
 
     Raises:
         ValueError: the input cannot be read, or has other keypoints than the layout.
@@ -103,16 +170,19 @@ def read_objects(
         override(ReadOptions(), args),
         min_confidence=inputs.min_confidence,
         mapping=read_mapping(Path(args.mapping).expanduser()) if args.mapping else None,
-        image_size=inputs.image_size,
+        image_size=read_camera(args).image_size,
         layout=layout,
-        fallback=model.layout,
     )
     with progress("reading") as on_progress:
         detections = read_keypoints(args.input, options, on_progress)
     for warning in detections.warnings:
         warn(warning)
     chosen = detections.largest() if args.objects == "largest" else detections
-    return chosen, detections.layout or model.layout
+    if detections.layout:
+        return chosen, detections.layout
+    layout, reason = resolve_layout(chosen, model)
+    note(f"keypoint layout {layout.name}: {reason}")
+    return chosen, layout
 
 
 def lift_objects(
@@ -120,10 +190,21 @@ def lift_objects(
 ) -> Recording:
     """Return the recording of the objects, lifted with the options of the command line."""
     lifter = Lifter(model, override(LiftingOptions(), args))
-    file = Path(args.intrinsics).expanduser()
-    intrinsics = read_camera_file(file, rectified=args.rectified) if args.intrinsics else None
+    intrinsics = read_camera(args).intrinsics
     with progress("lifting") as on_progress:
         return lift_recording(detections, source, lifter, on_progress, intrinsics)
+
+
+def summary_of(args: argparse.Namespace, model: Model, recording: Recording) -> Summary:
+    """Return the summary of a recording; raise ValueError if nothing in it is lifted."""
+    camera, min_visible = read_camera(args), override(LiftingOptions(), args).min_visible
+    summary = summarise(recording, model, *camera, min_visible)
+    if not summary.total:
+        raise ValueError(f"{args.input} has no object in its {summary.frames} frames")
+    if not summary.lifted:
+        findings = "".join(f"; {finding}" for finding in summary.findings)
+        raise ValueError(f"none of {summary.total} objects is lifted: {summary.reasons}{findings}")
+    return summary
 
 
 @contextmanager
@@ -138,6 +219,11 @@ def progress(label: str) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
+def note(message: str) -> None:
+    """Print how the input is taken, on standard error."""
+    tqdm.write(message, file=sys.stderr)
+
+
 def warn(message: str) -> None:
     """Print a warning on standard error."""
     tqdm.write(f"warning: {message}", file=sys.stderr)
@@ -145,22 +231,26 @@ def warn(message: str) -> None:
 
 @program
 def main(argv: Sequence[str] | None = None) -> None:
-    """Write the lifted objects; exit code 2 says that the input was at fault."""
+    """Write the lifted objects and print a summary; the exit code says whether to believe it."""
     args = arguments().parse_args(argv)
     try:
         check_output(args.output)
         model, layout = read_model(args)
         detections, source = read_objects(args, model, layout)
         recording = lift_objects(args, model, source, detections)
+        summary = summary_of(args, model, recording)
         write_recording(args.output, recording, model.name)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)
-    lifted, total = recording.is_lifted.sum(), len(recording.detections)
-    frames = len(recording.detections.stamps)
-    print(f"{args.output}: {lifted} of {total} objects in {frames} frames lifted")
-    if lifted < total:
-        warn(f"{total - lifted} objects have too few detected keypoints, or all on one line")
+    print(f"{args.output}: {summary.figures}")
+    if summary.reasons:
+        print(f"left out: {summary.reasons}")
+    for finding in summary.findings:
+        warn(str(finding))
+    if summary.findings and not args.force:
+        warn(f"the answer is doubtful: exit code {_DOUBTFUL} (--force: 0)")
+        sys.exit(_DOUBTFUL)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,11 @@ from deep_nrsfm_ros.commands.lift import (
     progress,
     read_model,
     read_objects,
+    summary_of,
     warn,
 )
 from deep_nrsfm_ros.commands.program import program, program_name
-from deep_nrsfm_ros.configuration import override
+from deep_nrsfm_ros.configuration import options, override
 from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import KINDS, is_bag
@@ -26,6 +27,7 @@ from deep_nrsfm_ros.data.lifted_bags import has_lifted_messages, read_lifted_mes
 from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.reporting.player import (
@@ -36,6 +38,9 @@ from deep_nrsfm_ros.reporting.player import (
     scenes,
 )
 from deep_nrsfm_ros.reporting.serving import HOST, Broadcast, in_real_time, server
+
+_PORT = 8765
+_LIFTER = "/lifter"
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -59,25 +64,45 @@ def arguments() -> argparse.ArgumentParser:
     out.add_argument(
         "--port",
         type=int,
-        default=8765,
-        help="port of the served page; 0 = a free port (default: %(default)s)",
+        help=f"port of the served page; 0 = a free port (default: {_PORT})",
     )
     out.add_argument(
         "--max-frames",
         type=int,
-        default=MOST_FRAMES,
-        help="most frames in --html; a longer recording is subsampled (default: %(default)s)",
+        help=f"most frames in --html; a longer recording is subsampled (default: {MOST_FRAMES})",
     )
     out.add_argument(
         "--lift-again",
         action="store_true",
         help="lift the keypoints again instead of showing the lifted points of the bag",
     )
-    out.add_argument(
-        "--lifter", default="/lifter", help="name of the running lifter (default: /lifter)"
-    )
+    out.add_argument("--lifter", help=f"name of the running lifter (default: {_LIFTER})")
     add_reading_arguments(parser)
     return parser
+
+
+def given_options(args: argparse.Namespace, cls: type) -> list[str]:
+    """Return the options of a dataclass that are on the command line, as they are written."""
+    return ["--" + f.name.replace("_", "-") for f, _, _ in options(cls) if f.name in args]
+
+
+def check_output_options(args: argparse.Namespace) -> None:
+    """Raise ValueError for an option that would have no effect, and say why."""
+    live = args.input is None
+    for name, value, needs, has_effect in (
+        ("--port", args.port, "--serve", args.serve),
+        ("--max-frames", args.max_frames, "--html", args.html),
+        ("--lifter", args.lifter, "a running lifter, not a recording", live),
+        ("--intrinsics", args.intrinsics or None, "a recording", not live),
+        ("--lift-again", args.lift_again or None, "a recording", not live),
+        ("--mapping", args.mapping or None, "a recording", not live),
+    ):
+        if value is not None and not has_effect:
+            raise ValueError(f"{name} has no effect here: it needs {needs}")
+    if live and (unused := given_options(args, LiftingOptions)):
+        raise ValueError(
+            f"{', '.join(unused)} has no effect on a running lifter: set its parameters instead"
+        )
 
 
 def read_recording(
@@ -93,7 +118,14 @@ def read_recording(
     if args.lift_again or not is_bag(args.input) or not has_lifted_messages(args.input):
         detections, source = read_objects(args, model, layout)
         recording = lift_objects(args, model, source, detections)
+        for finding in summary_of(args, model, recording).findings:
+            warn(str(finding))
         return recording, f"lifted with model {model.name}"
+    if unused := given_options(args, LiftingOptions):
+        raise ValueError(
+            f"{', '.join(unused)} has no effect on the lifted points of a bag, which are shown as "
+            "recorded: add --lift-again, or leave it out"
+        )
     with progress("reading lifted points") as on_progress:
         lifted = read_lifted_messages(args.input, on_progress, warn)
     try:
@@ -106,18 +138,18 @@ def read_recording(
     return recording, f"as recorded; drawn as model {model.name}"
 
 
-def serve(page: str, port: int, work: Callable[[Broadcast, threading.Event], None]) -> None:
+def serve(page: str, port: int | None, work: Callable[[Broadcast, threading.Event], None]) -> None:
     """Serve a page until Ctrl-C.
 
     Args:
         page: HTML.
-        port: 0 = a free port.
+        port: 0 = a free port; None = the usual one.
         work: puts frames into the broadcast; it may return before Ctrl-C.
     """
     broadcast, stop = Broadcast(), threading.Event()
     # `program` lets SIGPIPE end the process; a browser that disconnects must not end the server.
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
-    with server(page, broadcast, port) as made:
+    with server(page, broadcast, _PORT if port is None else port) as made:
         threading.Thread(target=made.serve_forever, daemon=True).start()
         print(f"http://{HOST}:{made.server_port}/ (Ctrl-C ends it)", flush=True)
         try:
@@ -154,14 +186,18 @@ def watch(args: argparse.Namespace, model: Model, source: KeypointLayout) -> Non
             topic = args.topic or "/keypoints"
             layouts = (source, model.layout)
             limits = (inputs.min_confidence, inputs.image_size)
-            topics = LifterTopics(args.lifter, topic, *layouts, *limits)
+            topics = LifterTopics(args.lifter or _LIFTER, topic, *layouts, *limits)
             rclpy.spin(LifterClient(topics, show))
         except ExternalShutdownException:
             raise KeyboardInterrupt from None
         finally:
             rclpy.try_shutdown()
 
-    serve(live_page(source, model.layout, f"live: {args.lifter}"), args.port, work)
+    serve(
+        live_page(source, model.layout, f"live: {args.lifter or _LIFTER}"),
+        _PORT if args.port is None else args.port,
+        work,
+    )
 
 
 def play(args: argparse.Namespace, recording: Recording, origin: str) -> None:
@@ -171,7 +207,11 @@ def play(args: argparse.Namespace, recording: Recording, origin: str) -> None:
     def work(broadcast: Broadcast, stop: threading.Event) -> None:
         in_real_time(scenes(recording), broadcast.put, stop.wait)
 
-    serve(live_page(source, target, f"{args.input.name}, {origin}"), args.port, work)
+    serve(
+        live_page(source, target, f"{args.input.name}, {origin}"),
+        _PORT if args.port is None else args.port,
+        work,
+    )
 
 
 @program
@@ -181,6 +221,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         if not args.html and not args.serve:
             raise ValueError("no output chosen: give --html FILE, --serve, or both")
+        check_output_options(args)
         model, layout = read_model(args)
         if args.input is None:
             if args.html:
@@ -191,7 +232,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             return
         recording, origin = read_recording(args, model, layout)
         if args.html:
-            page = recording_page(recording, args.input.name, [origin], args.max_frames)
+            frames = MOST_FRAMES if args.max_frames is None else args.max_frames
+            page = recording_page(recording, args.input.name, [origin], frames)
             args.html.write_text(page, encoding="utf-8")
             size = args.html.stat().st_size / 1e6
             print(f"{args.html}: {size:.1f} MB, open it in a browser")

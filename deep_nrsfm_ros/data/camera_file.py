@@ -47,9 +47,9 @@ def read_image_size(path: Path) -> Size | None:
     """Return width and height in pixels of the image of a camera file; None if it lacks them."""
     fields = read_fields(path, "k: [600, 0, 320, ...]")
     width, height = (fields.get(f"image_{side}", fields.get(side)) for side in ("width", "height"))
-    if not isinstance(width, int) or not isinstance(height, int):
-        return None
-    return (width, height) if width > 0 and height > 0 else None
+    if isinstance(width, int) and isinstance(height, int) and min(width, height) > 0:
+        return width, height
+    return None
 
 
 def _message(content: dict[Any, Any]) -> SimpleNamespace:

@@ -17,7 +17,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
-from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
+from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, find_sentinel
 from deep_nrsfm_ros.model_files.model_file import Model
 
 MAX_OBJECTS = 200
@@ -61,6 +61,8 @@ def fit_layouts(
     """
     chosen = _sample(confidence)
     points, confidence = points[chosen], confidence[chosen]
+    if sentinel := find_sentinel(points, confidence > 0):
+        confidence = np.where((points == sentinel[0]).all(-1), np.float32(0), confidence)
     lifter = Lifter(model, _QUICK)
     fits = []
     for layout in _candidates(confidence.shape[1], model, layouts):
@@ -140,5 +142,4 @@ def _sample(confidence: NDArray[np.float32]) -> NDArray[np.int64]:
     full = np.flatnonzero(visible >= np.median(visible)) if len(visible) else np.arange(0)
     if len(full) <= MAX_OBJECTS:
         return full
-    chosen: NDArray[np.int64] = full[np.linspace(0, len(full) - 1, MAX_OBJECTS).astype(int)]
-    return chosen
+    return np.asarray(full[np.linspace(0, len(full) - 1, MAX_OBJECTS).astype(int)], np.int64)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
 
@@ -28,6 +29,9 @@ LOW_CONFIDENCE = 0.3
 _MAX_OBJECTS = 5000  # objects of a sample; more cost time and change no finding
 _NORMALISED = 2.0  # largest normalised coordinate; a detector puts some points beyond the border
 _SIGNED = 0.05  # fraction of points with a negative coordinate, above which the range is -1 to 1
+_TINY = 3.0  # pixels; no detector finds keypoints of smaller objects
+_UPRIGHT = 0.7  # cosine between the up axis of a person and an axis of the image
+_NEARLY_ALL = 0.9  # fraction of people that makes an orientation suspicious
 _MIN_FOCAL = 10.0  # pixels; a smaller focal length belongs to normalised coordinates
 _MIN_REPEATS = 3  # points on one spot that may be a sentinel
 _OUTSIDE = 0.05  # fraction of points far outside the image that is too many
@@ -180,6 +184,40 @@ def quality(residual: Floats, confidence: Floats) -> list[Finding]:
     return []
 
 
+def is_person(layout: KeypointLayout) -> bool:
+    """Return whether a layout is of people, whose up axis is known."""
+    return bool(layout.handedness) and {"left_hip", "left_ankle"} <= set(layout.keypoints)
+
+
+def orientation(rotations: Floats) -> list[Finding]:
+    """Return whether nearly all people are upside down, or lie on their side, in the image.
+
+    Args:
+        rotations: (n, 3, 3) from object axes (x front, y left, z up) to camera axes (y down); NaN
+            where not lifted.
+    """
+    up = rotations[~np.isnan(rotations[:, 0, 0]), :2, 2]
+    if not len(up):
+        return []
+    if (upside_down := (up[:, 1] > _UPRIGHT).mean()) > _NEARLY_ALL:
+        return [
+            Finding(
+                "orientation",
+                f"{upside_down:.0%} of the people are upside down: y must point down; use "
+                "height - y if it points up, or turn the image",
+            )
+        ]
+    if (sideways := (np.abs(up[:, 0]) > _UPRIGHT).mean()) > _NEARLY_ALL:
+        return [
+            Finding(
+                "orientation",
+                f"{sideways:.0%} of the people lie on their side: check that x and y are not "
+                "exchanged and that the image is not turned",
+            )
+        ]
+    return []
+
+
 def _sentinel(spot: Floats, times: int, total: int) -> Finding:
     """Return the finding of a sentinel."""
     x, y = (float(value) for value in spot)
@@ -218,6 +256,14 @@ def _coordinates(
                 "pixels; give the size of the image (image_width and image_height)",
             )
         return
+    extent = _extent(points, visible)
+    if extent < _TINY and not (intrinsics and min(intrinsics.focal) < _MIN_FOCAL):
+        yield Finding(
+            "normalised",
+            f"the middle object is {extent:.2g} pixels large: these are no pixels; convert the "
+            "keypoints to pixels",
+        )
+        return
     if image_size is None and intrinsics is None:
         return
     principal = intrinsics.principal if intrinsics else (0.0, 0.0)
@@ -243,6 +289,15 @@ def _coordinates(
             f"({worst[0]:.0f}, {worst[1]:.0f}): give the size and the camera of the image in which "
             "they were detected",
         )
+
+
+def _extent(points: Floats, visible: NDArray[np.bool_]) -> float:
+    """Return the median of the larger sides of the objects' bounding boxes."""
+    mask = visible[..., None]
+    high = np.max(points, axis=1, where=mask, initial=-np.inf)
+    low = np.min(points, axis=1, where=mask, initial=np.inf)
+    several = visible.sum(1) > 1
+    return float(np.median((high - low)[several].max(-1))) if several.any() else np.inf
 
 
 def _stamps(stamps: NDArray[np.int64]) -> Iterator[Finding]:

@@ -64,6 +64,11 @@ def type_name(input_type: InputType) -> str:
     return input_type if isinstance(input_type, str) else input_type.type
 
 
+def implied_layout(input_type: InputType) -> str:
+    """Return the name of the preset in which messages of a type are by definition; "" if none."""
+    return _IMPLIED.get(input_type, "") if isinstance(input_type, str) else ""
+
+
 def read_observation(
     message: Any,
     input_type: InputType,
@@ -216,6 +221,8 @@ _READERS: dict[str, Callable[[Any, int], NDArray[np.floating]]] = {
     MULTI_ARRAY: _multi_array,
     POLYGON: _polygon,
 }
+
+_IMPLIED = {"yolo_msgs/DetectionArray": "coco17", "hri_msgs/Skeleton2D": "rep155"}
 
 INPUT_TYPES = (*_READERS, *MAPPINGS)
 """Message types that are read without a mapping file."""

@@ -13,9 +13,10 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
+from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
 from deep_nrsfm_ros.lifting.tracking import keypoint_tolerances
-from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, POINT_CLOUD
+from deep_nrsfm_ros.messages.decoding import INPUT_TYPES
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.serialised import Header, MessageReader
 from deep_nrsfm_ros.model_files.folders import default_bags_dir, default_models_dir
@@ -24,7 +25,8 @@ from deep_nrsfm_ros.model_files.model_file import Model
 MODEL_ORDER = "model"
 """Value of `keypoint_layout` for keypoints in the order of the model's layout."""
 AUTO = "auto"
-"""Value of `input_type` for the type of the first publisher."""
+"""Value of `input_type` for the type of the first publisher, and of `keypoint_layout` for the
+layout that the input names or that fits best."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class InputOptions:
         read_only=True,
     )
     input_type: str = option(
-        POINT_CLOUD,
+        AUTO,
         f"type of the keypoint messages: one of {', '.join(INPUT_TYPES)}; the path of a field "
         "mapping for any other type; or 'auto' for the type of the first publisher",
         read_only=True,
@@ -56,20 +58,23 @@ class InputOptions:
     )
     image_width: int = option(
         0,
-        "width of the image in pixels, needed for normalised keypoints; 0 = unknown, 640 typical",
+        "width of the image in pixels, by which normalised keypoints (0 to 1) are multiplied; 0 = "
+        "unknown, 640 typical",
         low=0,
         high=1000000,
     )
     image_height: int = option(
         0,
-        "height of the image in pixels, needed for normalised keypoints; 0 = unknown, 480 typical",
+        "height of the image in pixels, by which normalised keypoints (0 to 1) are multiplied; 0 = "
+        "unknown, 480 typical",
         low=0,
         high=1000000,
     )
     keypoint_layout: str = option(
-        MODEL_ORDER,
-        "order of the detector's keypoints: a preset such as coco17, the path of a layout file, or "
-        "'model' for the order of the model's layout",
+        AUTO,
+        "order of the detector's keypoints: a preset such as coco17, the path of a layout file, "
+        "'model' for the order of the model's layout, or 'auto' for the layout that the input "
+        "implies, or else the one of that number of keypoints that fits clearly best",
     )
     max_objects: int = option(
         100,
@@ -104,6 +109,8 @@ class Pipeline:
         source: layout of the messages, `detector` or the model's.
         edges: pairs of keypoint indices of the model's layout, to draw.
         tolerances: (p,) of the keypoints of the model's layout, for identities.
+        min_confidence: detector confidence below which a keypoint is missing.
+        image_size: width and height of the image in pixels that the options give; None: unknown.
     """
 
     def __init__(
@@ -132,8 +139,8 @@ class Pipeline:
         self.tolerances = keypoint_tolerances(model.layout)
         self._map = KeypointMap(self.source, model.layout)
         self._lifter = Lifter(model, lifting, layout=self.source)
-        self._min_confidence = inputs.min_confidence
-        self._size = inputs.image_size
+        self.min_confidence = inputs.min_confidence
+        self.image_size = inputs.image_size
         self._min_visible, self._max_objects = lifting.min_visible, inputs.max_objects
         self._smoothing = smoothing
         self._smoothers: dict[str, Smoother] = {}
@@ -146,7 +153,8 @@ class Pipeline:
         Args:
             raw: the serialised message.
             reader: of the message's topic.
-            size: of the image in pixels; None: that of the options.
+            size: of the image in pixels; None: that of the options. Normalised keypoints of any
+                type are multiplied by it.
 
         Returns:
             The header, and an observation in the order of the model's layout.
@@ -154,14 +162,15 @@ class Pipeline:
         Raises:
             MessageError: the message is malformed or has more than `max_objects` objects.
         """
-        q = len(self.source)
-        header, observation = reader(raw, q, self._min_confidence, size or self._size)
+        size = size or self.image_size
+        header, observation = reader(raw, len(self.source), self.min_confidence, size)
         points, confidence, identities = observation
         if len(confidence) > self._max_objects:
             raise MessageError(
                 f"message has {len(confidence)} objects; expected at most "
                 f"{self._max_objects} (max_objects)"
             )
+        points = to_pixels(points, confidence, size)
         return header, Observation(*self._map(points, confidence), identities)
 
     @property

@@ -20,7 +20,12 @@ from deep_nrsfm_ros.lifting.observation import (
     Observation,
     to_observation,
 )
-from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, InputType, read_observation
+from deep_nrsfm_ros.messages.decoding import (
+    POINT_CLOUD,
+    InputType,
+    count_keypoints,
+    read_observation,
+)
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.point_cloud import PointCloudFormat, point_cloud_format
 
@@ -160,6 +165,14 @@ class MessageReader:
         if self.input_type == POINT_CLOUD and header:
             self._add_format(raw, message, header, point_cloud_format(message, keypoints))
         return header, observation
+
+    def count(self, raw: bytes) -> int:
+        """Return the number of keypoints of each object in a message, 0 if there is no object.
+
+        Raises:
+            MessageError: as `count_keypoints`; and what `decode` raises.
+        """
+        return count_keypoints(self._decode(raw), self.input_type)
 
     def find_format(self, raw: bytes, keypoints: int) -> SerialisedFormat | None:
         """Return the kept format of a message; None: it has none or another number of keypoints."""

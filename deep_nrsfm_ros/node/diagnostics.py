@@ -77,6 +77,11 @@ class LifterDiagnostics:
         """Whether no message has been received since the last report."""
         return not self._seconds and not self._rejected and not self._empty
 
+    @property
+    def residual(self) -> float:
+        """The median reprojection error of objects since the last report; NaN if none."""
+        return self._medians()[0]
+
     def lifted(
         self, seconds: float, residual: NDArray[np.float32], confidence: NDArray[np.float32]
     ) -> None:

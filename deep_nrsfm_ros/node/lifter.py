@@ -37,18 +37,21 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
-from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER, InputOptions, Pipeline
+from deep_nrsfm_ros.messages.pipeline import AUTO, MODEL_ORDER, InputOptions, Pipeline
 from deep_nrsfm_ros.messages.serialised import Header
+from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameters, publishing
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
-from deep_nrsfm_ros.node.diagnostics import LifterDiagnostics, status
+from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.training_service import TrainingService
 from deep_nrsfm_ros.node.transforms import TransformBroadcaster
@@ -67,6 +70,9 @@ _SMOOTHING = "smoothing."
 _TRAIN = "train."
 _REPORT_PERIOD = 1.0  # seconds
 _FRAME_LOG_PERIOD = 60.0  # seconds
+_EARLY_CHECKS = 5  # reports at the start in each of which the input is looked at
+_CHECK_EVERY = 10  # reports between two looks at an input in which nothing looked wrong
+_FINDING_PERIOD = 30.0  # seconds between two log entries of the same finding
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _TRAINING_GRACE = 1.0  # seconds in which a training may save its model when the node ends
 
@@ -96,7 +102,13 @@ class LifterNode(Node):
             Path(self._inputs.bags_dir).expanduser(),
             (self._inputs.model, self._inputs.keypoint_layout, *paths_of(training)),
         )
+        self._auto = self._inputs.keypoint_layout == AUTO
+        self._chosen: Choice | None = None
         self._pipeline = self._proposed = self._build_pipeline(())
+        self._stream = StreamCheck(search=self._auto)
+        self._findings: list[Finding] = []
+        self._logged: dict[str, float] = {}
+        self._checks = 0
 
         self._frame_id = camera.frame_id
         self._camera = CameraInfoSubscription(self, camera)
@@ -117,8 +129,13 @@ class LifterNode(Node):
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self.get_logger().info(
-            f"lifting with model {self._pipeline.model.name!r} {len(self._pipeline.source)} "
-            f"keypoints in the order of {self._pipeline.source.name!r}"
+            f"lifting with model {self._pipeline.model.name!r} "
+            + (
+                "keypoints in a layout that the first messages show (keypoint_layout: auto)"
+                if self._stream.searching
+                else f"{len(self._pipeline.source)} keypoints in the order of "
+                f"{self._pipeline.source.name!r}"
+            )
         )
         self._keypoint_topics = KeypointSubscriptions(
             self,
@@ -139,6 +156,9 @@ class LifterNode(Node):
     def _lift(self, source: KeypointTopic, raw: bytes) -> None:
         """Lift one serialised message and publish the result; this is the hot path."""
         started = time.perf_counter()
+        self._stream.received(source.topic, source.reader, raw)
+        if self._stream.searching:
+            self._search_layout()
         try:
             intrinsics = self._camera.require_intrinsics()
             header, observation = self._pipeline.read(raw, source.reader, self._camera.size)
@@ -162,6 +182,7 @@ class LifterNode(Node):
         if not identities:
             self._lifter_diagnostics.empty()
             return
+        self._stream.lifted(lifted)
         positioned = self._camera.enabled
         self._points.publish(publishing.point_cloud(header, lifted))
         if not math.isnan(lifted.residual[0]):
@@ -177,6 +198,30 @@ class LifterNode(Node):
             self._markers.publish(publishing.markers(header, lifted, edges, positioned=positioned))
         self._lifter_diagnostics.lifted(
             time.perf_counter() - started, lifted.residual, lifted.confidence
+        )
+
+    def _search_layout(self) -> None:
+        """Choose the layout of the keypoints from the first messages; see `StreamCheck.search`."""
+        try:
+            choice = self._stream.search(self._pipeline, self._camera.size)
+        except Exception as problem:  # a bad message must not end the node
+            self.get_logger().warning(f"keypoint_layout: auto failed: {_error_text(problem)}")
+            return
+        if choice:
+            self._set_layout(choice)
+
+    def _set_layout(self, choice: Choice) -> None:
+        """Lift with a layout that was chosen, and log it."""
+        if self._chosen and self._chosen.layout.keypoints == choice.layout.keypoints:
+            return
+        self._chosen = choice
+        own = choice.layout.keypoints == self._pipeline.model.layout.keypoints
+        self._pipeline = self._proposed = self._assemble(
+            self._pipeline.model, None if own else choice.layout
+        )
+        self.get_logger().info(
+            f"keypoint_layout auto: {choice.layout.name} ({choice.reason}); "
+            f"-p keypoint_layout:={choice.layout.name} sets it for good"
         )
 
     def _reject(self, source: KeypointTopic, problem: Exception) -> None:
@@ -213,8 +258,18 @@ class LifterNode(Node):
 
     def _report(self) -> None:
         """Publish diagnostics."""
-        self._keypoint_topics.update(idle=self._lifter_diagnostics.idle)
+        idle = self._lifter_diagnostics.idle
+        self._keypoint_topics.update(idle=idle)
+        residual = self._lifter_diagnostics.residual
         level, message, values = self._lifter_diagnostics.report()
+        self._check_input(level, residual, idle=idle)
+        layouts = [f for f in self._findings if f.code == "layout"]
+        if level == OK and self._findings or level == WARN and layouts:
+            level, message = WARN, str((layouts or self._findings)[0])
+        values["findings"] = "; ".join(map(str, self._findings)) or "none"
+        values["keypoint layout"] = self._pipeline.source.name + (
+            f" (auto: {self._chosen.reason})" if self._chosen else ""
+        )
         model = self._pipeline.model
         values |= {"model": model.name, "topic": ", ".join(self._keypoint_topics.topics)}
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
@@ -226,11 +281,53 @@ class LifterNode(Node):
             )
         )
 
+    def _check_input(self, level: int, residual: float, *, idle: bool) -> None:
+        """Look at the last messages; log what looks wrong, at a limited rate.
+
+        It looks in the first reports, while something looks wrong, and then once in 10 s.
+
+        Args:
+            level: of the diagnostics.
+            residual: median reprojection error of the last second; NaN if nothing was lifted.
+            idle: there was no message in the last second.
+        """
+        if idle:
+            self._findings, self._checks = [], 0
+            return
+        self._checks += 1
+        early = self._checks <= _EARLY_CHECKS
+        if not (early or self._findings or level != OK or self._checks % _CHECK_EVERY == 0):
+            return
+        size = self._camera.size
+        try:
+            poor = level == ERROR or residual >= POOR_RESIDUAL
+            choice = self._stream.choose(self._pipeline, size) if poor and self._auto else None
+            if choice:
+                self._set_layout(choice)
+            self._findings = self._stream.look(
+                self._pipeline, size, self._camera.intrinsics, residual
+            )
+            inputs = parameters.read(self, InputOptions)
+            if bool(inputs.image_width) != bool(inputs.image_height):
+                text = (
+                    f"image_width is {inputs.image_width} and image_height is "
+                    f"{inputs.image_height}: the size of the image needs both"
+                )
+                self._findings.insert(0, Finding("image-size", text))
+        except Exception as problem:  # looking must not end the node
+            self.get_logger().warning(
+                f"the input could not be looked at: {_error_text(problem)}",
+                throttle_duration_sec=_FINDING_PERIOD,
+            )
+        now = time.monotonic()
+        for finding in self._findings:
+            if now - self._logged.get(finding.code, -math.inf) >= _FINDING_PERIOD:
+                self._logged[finding.code] = now
+                self.get_logger().warning(str(finding))
+
     def _build_pipeline(self, changes: Sequence[Parameter]) -> Pipeline:
         """Return the pipeline for the parameters after `changes`; raise ValueError if invalid."""
         inputs = parameters.read(self, InputOptions, changes=changes)
-        lifting = parameters.read(self, LiftingOptions, changes=changes)
-        smoothing = parameters.read(self, SmoothingOptions, _SMOOTHING, changes)
         self._training_parameters(changes)
         # A file is read only when its parameter is set: it may have been deleted since.
         changed = {change.name for change in changes} or {"model", "keypoint_layout"}
@@ -240,14 +337,38 @@ class LifterNode(Node):
             model = load_model(self._sandbox.model("model", inputs.model))
         else:
             model = self._pipeline.model
-        if "keypoint_layout" not in changed:
+        if inputs.keypoint_layout == AUTO:
+            detector = self._layout_so_far(model)
+        elif "keypoint_layout" not in changed:
             detector = self._pipeline.detector
         elif inputs.keypoint_layout == MODEL_ORDER:
             detector = None
         else:
             word = self._sandbox.layout("keypoint_layout", inputs.keypoint_layout)
             detector = find_layout("keypoint_layout", word)
-        return Pipeline(model, detector, inputs, lifting, smoothing)
+        return self._assemble(model, detector, changes)
+
+    def _assemble(
+        self, model: Model, detector: KeypointLayout | None, changes: Sequence[Parameter] = ()
+    ) -> Pipeline:
+        """Return the pipeline of a model and a layout for the parameters after `changes`."""
+        return Pipeline(
+            model,
+            detector,
+            parameters.read(self, InputOptions, changes=changes),
+            parameters.read(self, LiftingOptions, changes=changes),
+            parameters.read(self, SmoothingOptions, _SMOOTHING, changes),
+        )
+
+    def _layout_so_far(self, model: Model) -> KeypointLayout | None:
+        """Return the layout that was chosen for the input, if a model can lift it."""
+        if self._chosen is None or self._chosen.layout.keypoints == model.layout.keypoints:
+            return None
+        try:
+            KeypointMap(self._chosen.layout, model.layout)
+        except ValueError:  # they share too few keypoints
+            return None
+        return self._chosen.layout
 
     def _validate_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         """Build a pipeline for changed parameters, or refuse them with the reason."""
@@ -261,14 +382,21 @@ class LifterNode(Node):
         """Swap in the pipeline of the accepted parameters."""
         if self._proposed.model is not self._pipeline.model:
             self.get_logger().info(f"lifting with model {self._proposed.model.name!r}")
+        search = parameters.read(self, InputOptions).keypoint_layout == AUTO
+        if self._proposed.model is not self._pipeline.model or search != self._auto:
+            self._auto, self._chosen = search, None
+            self._stream.restart(search=search)
         self._pipeline = self._proposed
 
     def _training_request(self) -> TrainingRequest:
         """Return the training that the present parameters ask for."""
         inputs, topics = parameters.read(self, InputOptions), self._keypoint_topics.topics
+        layout = inputs.keypoint_layout
+        if layout == AUTO:
+            layout = self._pipeline.detector.name if self._pipeline.detector else MODEL_ORDER
         lifter = LifterInput(
             topic=topics[0] if len(topics) == 1 else "",
-            keypoint_layout=self._sandbox.layout("keypoint_layout", inputs.keypoint_layout),
+            keypoint_layout=self._sandbox.layout("keypoint_layout", layout),
             model=self._sandbox.model("model", inputs.model),
             min_confidence=inputs.min_confidence,
             mapping=inputs.input_type if inputs.input_type.endswith(MAPPING_SUFFIXES) else "",

@@ -7,9 +7,17 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos import (
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_policy_name_from_kind,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
@@ -24,6 +32,12 @@ from deep_nrsfm_ros.node.message_types import decoder, message_class
 DEFAULT_TOPIC = "keypoints"
 SENSOR_INPUT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort, depth 1: messages that arrive during a lift are dropped."""
+
+_WAITING_PERIOD = 0.1  # seconds between two looks for the first publisher
+_POLICIES: dict[str, Callable[[str], Any]] = {
+    "history": HistoryPolicy.get_from_short_key,
+    "reliability": ReliabilityPolicy.get_from_short_key,
+}
 
 LOG_PERIOD = 2.0
 """Seconds between two log entries of the same kind."""
@@ -81,8 +95,9 @@ class KeypointSubscriptions:
             self._type = resolve_input_type("input_type", inputs.input_type)
             message_class(type_name(self._type))
         self._own = f"{node.get_fully_qualified_name()}/"
-        resolved = map(self._resolve, inputs.topics or (DEFAULT_TOPIC,))
-        self.topics = tuple(dict.fromkeys(resolved))
+        names = inputs.topics or (DEFAULT_TOPIC,)
+        self.topics = tuple(dict.fromkeys(map(self._resolve, names)))
+        self._names = {self._resolve(name): name for name in names if WILDCARD not in name}
         self._subscribed: dict[str, tuple[KeypointTopic, Subscription]] = {}
         for topic in self.topics:
             if self._type and WILDCARD not in topic:
@@ -91,6 +106,10 @@ class KeypointSubscriptions:
         for topic in self.topics:
             if not any(match(topic, name) is not None for name in self._subscribed):
                 self._log.info(f"waiting for a publisher on {topic}")
+        # A publisher that appears later is found within a second by the reports.
+        self._waiting = node.create_timer(
+            _WAITING_PERIOD, self._wait, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     @property
     def description(self) -> str:
@@ -122,6 +141,44 @@ class KeypointSubscriptions:
             for topic, _ in list(self._subscribed.values()):
                 self._check_types(topic)
 
+    def _wait(self) -> None:
+        """Subscribe to the topics whose type the first publisher shows, soon after it appears."""
+        if self._subscribed:
+            self._waiting.cancel()
+        else:
+            self.update(idle=False)
+
+    def _quality(self, topic: str) -> QoSProfile:
+        """Return the quality of service of a topic.
+
+        rclpy takes overrides under the name that the topic has after remapping. These are those
+        under its own name, /keypoints, so that a remapping does not silently drop them.
+        """
+        profile = QoSProfile(depth=SENSOR_INPUT.depth, reliability=SENSOR_INPUT.reliability)
+        name = self._names.get(topic, "")
+        if not name:
+            return profile
+        own = expand_topic_name(name, self._node.get_name(), self._node.get_namespace())
+        if own == topic:
+            return profile
+        prefix = f"qos_overrides.{own}.subscription"
+        for policy, convert in _POLICIES.items():
+            default = getattr(profile, policy).short_key
+            word = self._declared(f"{prefix}.{policy}", default)
+            try:
+                setattr(profile, policy, convert(word))
+            except (KeyError, TypeError, AttributeError):
+                raise ValueError(f"{prefix}.{policy} is {word!r}; it is no such policy") from None
+        profile.depth = self._declared(f"{prefix}.depth", profile.depth)
+        return profile
+
+    def _declared(self, name: str, default: Any) -> Any:
+        """Return the value of a parameter that is declared at the first call."""
+        if self._node.has_parameter(name):
+            return self._node.get_parameter(name).value
+        descriptor = ParameterDescriptor(read_only=True)
+        return self._node.declare_parameter(name, default, descriptor).value
+
     def _matching(self, pattern: str) -> list[str]:
         """Return the topics that match a pattern, except those of the lifter itself."""
         names = (name for name, _ in self._node.get_topic_names_and_types())
@@ -137,7 +194,7 @@ class KeypointSubscriptions:
         elif len(usable) == 1:
             try:
                 self._subscribe(topic, self._type or resolve_input_type("input_type", usable[0]))
-            except ValueError as problem:
+            except (ValueError, RuntimeError) as problem:
                 self._report(f"cannot subscribe to {topic}: {problem}")
         elif types and idle:  # while other topics are lifted, this is no problem
             remedy = (
@@ -173,7 +230,7 @@ class KeypointSubscriptions:
             message_class(kind),
             topic,
             partial(self._receive, source),
-            SENSOR_INPUT,
+            self._quality(topic),
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=partial(self._report_qos, topic)

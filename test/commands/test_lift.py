@@ -11,8 +11,10 @@ import pytest
 from deep_nrsfm_ros.commands.lift import arguments, main
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.keypoint_files import read_keypoints
-from deep_nrsfm_ros.layouts.presets import COCO17
+from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from test.fixtures.walking import CAMERA as WALKING_CAMERA
+from test.fixtures.walking import DISTANCE, IMAGE, in_layout
 
 HEIGHTS = {
     "nose": 0,
@@ -143,6 +145,106 @@ def test_with_intrinsics_people_come_out_at_their_place(people: Path, tmp_path: 
         assert (np.abs(x[file["frame"] < 3]) < 0.3).all()
         assert z[here[small]] > 1.8 * z[here[1 - small]]  # 0.4 of the size, so much farther
         assert x[here[small]] > 1
+
+
+def lift(folder: Path, layout: str, *options: str, **arrays: np.ndarray) -> int:
+    """Lift the walking person of a layout, with arrays changed; return the exit code."""
+    points, confidence = in_layout(LAYOUTS[layout])
+    path = folder / "keypoints.npz"
+    np.savez(path, **({"points": points, "confidence": confidence} | arrays))  # type: ignore[arg-type]
+    (folder / "camera.yaml").write_text(WALKING_CAMERA)
+    try:
+        main([str(path), "--output", str(folder / "out.npz"), *options])
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+@pytest.mark.parametrize("layout", ["coco17", "human17"])
+def test_the_layout_is_found(
+    layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lift(tmp_path, layout) == 0
+    said = capsys.readouterr()
+    assert said.err.startswith(f"keypoint layout {layout}: it fits with residual 0.0")
+    assert "60 of 60 objects in 60 frames lifted; median residual 0.0" in said.out
+    assert "warning" not in said.err
+
+
+def test_the_wrong_layout_is_doubtful(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lift(tmp_path, "coco17", "--keypoint-layout", "human17") == 3
+    assert "is it coco17? It fits 0.0" in capsys.readouterr().err
+    assert (tmp_path / "out.npz").exists()
+    assert lift(tmp_path, "coco17", "--keypoint-layout", "model", "--force") == 0
+    assert "is it coco17?" in capsys.readouterr().err
+
+
+def test_the_size_of_the_image_acts_on_every_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pixels, _ = in_layout(COCO17)
+    assert lift(tmp_path, "coco17") == 0
+    with np.load(tmp_path / "out.npz") as file:
+        expected = file["shapes"]
+    capsys.readouterr()
+    normalised = pixels / np.array(IMAGE, np.float32)
+    assert lift(tmp_path, "coco17", points=normalised) == 3
+    assert "they are normalised, not pixels" in capsys.readouterr().err
+    size = ("--image-width", str(IMAGE[0]), "--image-height", str(IMAGE[1]))
+    assert lift(tmp_path, "coco17", *size, points=normalised) == 0
+    with np.load(tmp_path / "out.npz") as file:
+        np.testing.assert_allclose(file["shapes"], expected, atol=1e-3)
+    camera = ("--intrinsics", str(tmp_path / "camera.yaml"), "--reference-length", "0.5")
+    assert lift(tmp_path, "coco17", *camera, points=normalised) == 0
+    with np.load(tmp_path / "out.npz") as file:
+        np.testing.assert_allclose(file["shapes"].mean((0, 1)), (0, 0, DISTANCE), atol=0.6)
+    assert lift(tmp_path, "coco17", *camera, *size[:2], "--image-height", "800") == 2
+    assert "1280 x 800, and" in capsys.readouterr().err
+
+
+POINTS, CONFIDENCE = in_layout(COCO17)
+SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "options", "code", "expected"),
+    [
+        ({"stamps": np.arange(60) * 33}, (), 3, "they look like milliseconds"),
+        ({"stamps": np.zeros(60, int)}, (), 3, "all 60 frames have the stamp 0"),
+        ({"points": SENTINEL}, (), 3, "lie at exactly (-1, -1)"),
+        ({"points": POINTS * [1, -1] + [0, 720]}, (), 3, "people are upside down"),
+        ({"points": POINTS[..., ::-1]}, (), 3, "lie on their side"),
+        ({"points": POINTS / 1000 + 5}, (), 3, "these are no pixels"),
+        ({"confidence": CONFIDENCE * (np.arange(17) < 3)}, (), 2, "60 have fewer than 4 detected"),
+        ({"points": POINTS[:0], "confidence": CONFIDENCE[:0]}, (), 2, "has no object"),
+        ({}, ("--image-width", "640"), 2, "--image-height is 0: the size of the image needs both"),
+        ({}, ("--rectified",), 2, "--rectified has no effect without --intrinsics"),
+        ({}, ("--correction", "none", "--noise", "0.1"), 2, "--noise has no effect"),
+        ({}, ("--image-width", "160", "--image-height", "90"), 3, "far outside the image of 160 x"),
+    ],
+)
+def test_what_looks_wrong_is_said(
+    arrays: dict[str, np.ndarray],
+    options: tuple[str, ...],
+    code: int,
+    expected: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert lift(tmp_path, "coco17", *options, **arrays) == code
+    assert expected in capsys.readouterr().err
+
+
+def test_people_far_away_and_those_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = ("--intrinsics", str(tmp_path / "camera.yaml"))
+    assert lift(tmp_path, "coco17", *camera, "--reference-length", "1000") == 3
+    assert "60 of 60 objects are more than 1000 m away" in capsys.readouterr().err
+    few = CONFIDENCE * (np.arange(60)[:, None] > 3)
+    assert lift(tmp_path, "coco17", confidence=few) == 0
+    said = capsys.readouterr().out
+    assert "56 of 60 objects" in said and "left out: 4 have fewer than 4 detected" in said
 
 
 def test_a_camera_file_that_says_nothing(

@@ -59,6 +59,9 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
     stub._sandbox = PathSandbox(tmp_path, tmp_path, ["thing"])
     stub._pipeline = Pipeline(bench.model, None, inputs, LiftingOptions(), SmoothingOptions())
     stub._build_pipeline = lambda changes: LifterNode._build_pipeline(stub, changes)
+    stub._chosen = None
+    stub._assemble = lambda *given: LifterNode._assemble(stub, *given)
+    stub._layout_so_far = lambda model: LifterNode._layout_so_far(stub, model)
     stub._training_parameters = lambda changes: LifterNode._training_parameters(stub, changes)
     p = len(bench.layout)
     points = np.random.default_rng(0).uniform(50, 600, (1, p, 2))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
-from deep_nrsfm_ros.lifting.sanity import check, looks_normalised
+from deep_nrsfm_ros.lifting.sanity import check, is_person, looks_normalised, orientation
 
 CAMERA = Intrinsics((1000.0, 1000.0), (640.0, 360.0))
 SIZE = (1280, 720)
@@ -122,3 +124,21 @@ def test_poor_fit_and_low_confidence() -> None:
     assert codes(people(), lifted=low) == ["low-confidence"]
     nothing = lifted(residual=np.nan)
     assert not codes(people(), lifted=nothing)
+
+
+def test_objects_of_less_than_a_pixel() -> None:
+    assert codes(people() / 1000 + 50) == ["normalised"]
+
+
+def test_people_upside_down_and_on_their_side() -> None:
+    upright = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], np.float32)
+    assert not orientation(np.tile(upright, (N, 1, 1)))
+    (finding,) = orientation(np.tile(upright * [[1], [-1], [1]], (N, 1, 1)))
+    assert "100% of the people are upside down" in finding.message
+    (finding,) = orientation(np.tile(upright[[1, 0, 2]], (N, 1, 1)))
+    assert "on their side" in finding.message
+    assert not orientation(np.full((N, 3, 3), np.nan))
+    some = np.tile(upright, (N, 1, 1))
+    some[::4, 1] *= -1
+    assert not orientation(some)
+    assert is_person(HUMAN17) and not is_person(KeypointLayout.numbered(17))

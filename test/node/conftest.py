@@ -33,6 +33,7 @@ from visualization_msgs.msg import MarkerArray
 import deep_nrsfm_ros
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -168,7 +169,8 @@ def lifters(models: Path, folder: Path) -> Iterator[StartLifter]:
         **parameters: Any,
     ) -> LifterProcess:
         folders = {"models_dir": str(models), "bags_dir": str(folder)}
-        parameters = {"model": "person"} | folders | parameters
+        usual = {"model": "person", "input_type": POINT_CLOUD}
+        parameters = usual | folders | parameters
         lifter = LifterProcess([*program], parameters, folder / f"lifter{len(started)}")
         started.append(lifter)
         if listens:

@@ -193,7 +193,7 @@ def test_bad_input_is_counted_and_the_next_message_lifted(
         np.testing.assert_array_equal(unpack(after), expected)
     status = client.wait_for_health(lambda _, v: v["messages rejected"] == str(len(bad)))
     last = {pair.key: pair.value for pair in status.values}["last problem"]
-    assert "3 visible keypoints" in last
+    assert "3 detected keypoints" in last
     assert "rejected" in lifter.log
 
 

@@ -1,0 +1,240 @@
+"""Looks at the last messages of a stream: the layout that fits them, and what looks wrong.
+
+The hot path only keeps references to messages. They are read a second time when the node asks, at
+most once a second.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.layout_fit import LayoutFit, better_layout, choose_layout, fit_layouts
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.observation import Observation
+from deep_nrsfm_ros.lifting.sanity import (
+    POOR_RESIDUAL,
+    Finding,
+    Size,
+    check,
+    is_person,
+    orientation,
+    to_pixels,
+)
+from deep_nrsfm_ros.messages.decoding import implied_layout, type_name
+from deep_nrsfm_ros.messages.pipeline import Pipeline
+from deep_nrsfm_ros.messages.serialised import MessageReader
+from deep_nrsfm_ros.model_files.model_file import Model
+
+_MESSAGES = 16  # kept; enough objects to tell layouts apart, few enough to read again in 1 ms
+_MAX_BYTES = 2**18  # of a kept message: 1000 people of 17 keypoints
+_SEARCHES = (1, 2, 4, 8, 16)  # messages with objects at which the layout is chosen anew
+
+
+class Choice(NamedTuple):
+    """The layout that was chosen for a stream.
+
+    Attributes:
+        layout: of the keypoints.
+        reason: why, in words.
+    """
+
+    layout: KeypointLayout
+    reason: str
+
+
+class _Sample(NamedTuple):
+    """The objects of the kept messages of one topic, in pixels, and their stamps in ns."""
+
+    points: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    stamps: NDArray[np.int64]
+
+
+class StreamCheck:
+    """Keeps the last messages of a lifter's input and looks at them.
+
+    Attributes:
+        searching: whether the layout is still to be chosen, from the first messages.
+    """
+
+    def __init__(self, *, search: bool) -> None:
+        """Start without messages.
+
+        Args:
+            search: the layout is to be chosen.
+        """
+        self.searching = search
+        self._recent: deque[tuple[str, MessageReader, bytes]] = deque(maxlen=_MESSAGES)
+        self._lifted: Lifted | None = None
+        self._with_objects = 0
+
+    def restart(self, *, search: bool) -> None:
+        """Forget all messages, because the input or the model has changed."""
+        self.__init__(search=search)  # type: ignore[misc]
+
+    def received(self, topic: str, reader: MessageReader, raw: bytes) -> None:
+        """Keep a message, unless it is so large that reading it again would take long."""
+        if len(raw) < _MAX_BYTES:
+            self._recent.append((topic, reader, raw))
+
+    def lifted(self, lifted: Lifted) -> None:
+        """Keep the objects of the last lifted message."""
+        self._lifted = lifted
+
+    def search(self, pipeline: Pipeline, size: Size | None) -> Choice | None:
+        """Return the layout of the first messages, if it is time to choose it anew.
+
+        It is chosen after 1, 2, 4, 8 and 16 messages, so that the first message is lifted in the
+        right order already and one bad message does not decide. Messages without objects do not
+        count.
+        """
+        if not self._recent or not self._has_objects():
+            return None
+        choice = None
+        if self._with_objects + 1 in _SEARCHES:
+            choice = self.choose(pipeline, size)
+            if choice is None:
+                return None
+        self._with_objects += 1
+        self.searching = self._with_objects < _SEARCHES[-1]
+        return choice
+
+    def choose(self, pipeline: Pipeline, size: Size | None) -> Choice | None:
+        """Return the layout that fits the kept messages best.
+
+        It is the one that the type of the messages implies, or else the model's, unless another
+        one fits clearly better.
+
+        Args:
+            pipeline: its model lifts; its options say how messages are read.
+            size: of the image in pixels; None: that of the pipeline.
+
+        Returns:
+            None if there is no object, or no layout of its number of keypoints.
+        """
+        if not self._recent:
+            return None
+        model, (topic, reader, _) = pipeline.model, self._recent[-1]
+        implied = _implied(reader, model)
+        layouts = [implied] if implied else []
+        for q in _sizes(model, implied):
+            sample = self._sample(topic, pipeline, size, q)
+            if sample is None or not len(sample.points):
+                continue
+            fits = fit_layouts(sample.points, sample.confidence, model, layouts)
+            chosen = choose_layout(fits, implied or model.layout)
+            if chosen:
+                return Choice(chosen.layout, _reason(chosen, fits, implied, reader))
+            if q == len(model.layout):
+                return Choice(model.layout, "the order of the model")
+        return None
+
+    def look(
+        self,
+        pipeline: Pipeline,
+        size: Size | None,
+        intrinsics: Intrinsics | None,
+        residual: float,
+    ) -> list[Finding]:
+        """Return what looks wrong in the last messages.
+
+        Args:
+            pipeline: with which they were lifted.
+            size: of the image in pixels; None: that of the pipeline.
+            intrinsics: of the camera; None: not used.
+            residual: median reprojection error of the last second; NaN if nothing was lifted.
+        """
+        if not self._recent:
+            return []
+        topic = self._recent[-1][0]
+        sample = self._sample(topic, pipeline, size, len(pipeline.source))
+        if sample is None or not len(sample.points):
+            return []
+        findings = check(
+            sample.points,
+            sample.confidence,
+            intrinsics,
+            size or pipeline.image_size,
+            sample.stamps,
+            self._lifted,
+        )
+        # Poor fit and low confidence are rated by the diagnostics, over all objects of a second.
+        findings = [f for f in findings if f.code not in ("poor-fit", "low-confidence")]
+        if self._lifted is not None and is_person(pipeline.model.layout):
+            findings += orientation(self._lifted.rotations)
+        if residual >= POOR_RESIDUAL:
+            fits = fit_layouts(sample.points, sample.confidence, pipeline.model)
+            better = better_layout(fits, pipeline.source, residual)
+            findings += [better] if better else []
+        return findings
+
+    def _has_objects(self) -> bool:
+        """Return whether the last message may have objects."""
+        _, reader, raw = self._recent[-1]
+        try:
+            return reader.count(raw) > 0
+        except Exception:  # a layout that was not counted is found by reading
+            return True
+
+    def _sample(self, topic: str, pipeline: Pipeline, size: Size | None, q: int) -> _Sample | None:
+        """Return the objects of a topic, read with q keypoints; None if none can be."""
+        observations: list[Observation] = []
+        stamps: list[int] = []
+        size = size or pipeline.image_size
+        for _, reader, raw in (kept for kept in self._recent if kept[0] == topic):
+            try:
+                header, observation = reader(raw, q, pipeline.min_confidence, size)
+            except Exception:  # damaged bytes fail in many ways; the hot path has reported it
+                continue
+            observations.append(observation)
+            if header:
+                stamps.append(header.stamp)
+        if not observations:
+            return None
+        points = np.concatenate([observation.points for observation in observations])
+        confidence = np.concatenate([observation.confidence for observation in observations])
+        points = to_pixels(points, confidence, size).astype(np.float32, copy=False)
+        return _Sample(points, confidence, np.array(stamps, np.int64))
+
+
+def _implied(reader: MessageReader, model: Model) -> KeypointLayout | None:
+    """Return the layout that the type of messages implies, if the model can lift it."""
+    name = implied_layout(reader.input_type)
+    if not name:
+        return None
+    try:
+        KeypointMap(LAYOUTS[name], model.layout)
+    except ValueError:
+        return None
+    return LAYOUTS[name]
+
+
+def _sizes(model: Model, implied: KeypointLayout | None) -> Iterator[int]:
+    """Yield the numbers of keypoints to try, the likely ones first."""
+    sizes = [*([len(implied)] if implied else []), len(model.layout), *map(len, LAYOUTS.values())]
+    yield from dict.fromkeys(sizes)
+
+
+def _reason(
+    chosen: LayoutFit,
+    fits: list[LayoutFit],
+    implied: KeypointLayout | None,
+    reader: MessageReader,
+) -> str:
+    """Return why a layout was chosen."""
+    if implied and chosen.layout.keypoints == implied.keypoints:
+        return f"the layout of {type_name(reader.input_type)}"
+    others = ", ".join(
+        f"{fit.layout.name} {fit.residual:.2f}" for fit in fits if fit.layout is not chosen.layout
+    )
+    instead = f"instead of {others}" if others else "the only layout of that size"
+    return f"it fits {chosen.residual:.2f}, {instead}"

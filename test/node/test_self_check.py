@@ -1,0 +1,96 @@
+"""The running lifter looks at its input: layout, unit, options under their documented names."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from rclpy.qos import ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2
+
+from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
+from test.fixtures.walking import IMAGE, in_layout
+from test.node.conftest import Client, Connect, StartLifter
+from test.node.test_lifter import cloud, unpack
+
+AUTO = {"model": "human", "input_type": "auto", "keypoint_layout": "auto"}
+
+
+@contextmanager
+def stream(client: Client, points: np.ndarray, confidence: np.ndarray) -> Iterator[None]:
+    """Publish the frames at 30 Hz, over and over."""
+    publisher = client.publisher(PointCloud2, topic="keypoints")
+    start, frame = time.time_ns(), 0
+
+    def send() -> None:
+        nonlocal frame
+        message = cloud(points[[frame % len(points)]], confidence[[frame % len(points)]])
+        stamp = start + frame * 33_333_333
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        publisher.publish(message)
+        frame += 1
+
+    timer = client.node.create_timer(1 / 30, send)
+    yield
+    client.node.destroy_timer(timer)
+    client.node.destroy_publisher(publisher)
+
+
+@pytest.mark.parametrize("layout", ["coco17", "human17", "mediapipe33"])
+def test_the_layout_is_found(start_lifter: StartLifter, connect: Connect, layout: str) -> None:
+    lifter = start_lifter(listens=False, **AUTO)
+    client = connect()
+    with stream(client, *in_layout(LAYOUTS[layout])):
+        status = client.wait_for_health(
+            lambda _, v: int(v["messages lifted"]) > 20 and v["keypoint layout"].startswith(layout)
+        )
+    assert status.level == b"\x00", status.message
+    assert f"keypoint_layout auto: {layout}" in lifter.log
+
+
+def test_a_layout_that_does_not_fit_is_said(start_lifter: StartLifter, connect: Connect) -> None:
+    lifter = start_lifter(model="human", keypoint_layout="human17")
+    client = connect()
+    with stream(client, *in_layout(COCO17)):
+        status = client.wait_for_health(lambda s, _: "is it coco17?" in s.message)
+        assert status.level == b"\x01"
+        lifter.wait_for_log("set the keypoint layout to coco17")
+        client.wait_for_health(lambda _, v: int(v["messages lifted"]) > 60)
+        assert lifter.log.count("is it coco17?") == 1  # at a limited rate
+        assert not client.set_parameters(keypoint_layout="auto")
+        client.wait_for_health(lambda s, v: s.level == b"\x00" and "coco17" in v["keypoint layout"])
+
+
+def test_the_size_of_the_image_acts_on_clouds(start_lifter: StartLifter, connect: Connect) -> None:
+    points, confidence = in_layout(COCO17)
+    start_lifter(model="human", keypoint_layout="coco17")
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    expected = unpack(client.exchange(publisher, cloud(points[:1], confidence[:1]))).copy()
+    normalised = points / np.array(IMAGE, np.float32)
+    with stream(client, normalised, confidence):
+        status = client.wait_for_health(lambda _, v: "they are normalised" in v["findings"])
+        assert status.level == b"\x01" and "image_width" in status.message
+        assert not client.set_parameters(image_width=IMAGE[0])
+        client.wait_for_health(lambda _, v: "image_height is 0" in v["findings"])
+        assert not client.set_parameters(image_height=IMAGE[1])
+        client.wait_for_health(lambda s, v: s.level == b"\x00" and v["findings"] == "none")
+    message = cloud(normalised[:1], confidence[:1])
+    # Answers to the stream may still arrive.
+    while (after := client.exchange(publisher, message)).header.stamp != message.header.stamp:
+        pass
+    np.testing.assert_allclose(unpack(after), expected, atol=1e-3)
+
+
+def test_qos_overrides_act_on_a_remapped_topic(start_lifter: StartLifter, connect: Connect) -> None:
+    program = ("-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-r", "keypoints:=/detector/out")
+    overrides = {"/keypoints": {"subscription": {"reliability": "reliable", "depth": 7}}}
+    start_lifter(program, qos_overrides=overrides)
+    client = connect()
+    (info,) = client.wait(
+        lambda: client.node.get_subscriptions_info_by_topic("/detector/out"), "the subscription"
+    )
+    assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
