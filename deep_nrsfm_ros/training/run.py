@@ -15,13 +15,14 @@ from safetensors import SafetensorError
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
+from deep_nrsfm_ros.training.data_check import check_dataset
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data
 from deep_nrsfm_ros.training.record import checkpoint_file, keep_record
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
-from deep_nrsfm_ros.training.validation import validate
+from deep_nrsfm_ros.training.validation import find_layouts, validate
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.training.trainer import Trainer
@@ -63,7 +64,11 @@ def run(
         CancelledError: the training was stopped before anything was learned.
     """
     validate(config, COMMAND_LINE)
-    prepared = prepare(config.curation, read_data(config, reporter), reporter)
+    dataset = read_data(config, reporter)
+    if not config.data.cmu:
+        source, _ = find_layouts(config, COMMAND_LINE)
+        dataset = check_dataset(dataset, source, config.data.image_size, reporter)
+    prepared = prepare(config.curation, dataset, reporter)
     try:
         with _record(config) as checkpoint:
             return _train_and_save(config, prepared, checkpoint, reporter, should_stop)

@@ -11,11 +11,14 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
 from deep_nrsfm_ros.model_files.model_file import check_name, load_model
-from deep_nrsfm_ros.training.config import OptionNames, TrainingConfig
+from deep_nrsfm_ros.training.config import DataConfig, OptionNames, TrainingConfig
 from deep_nrsfm_ros.training.disk import check_room
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
 
 _NUMBERED_LAYOUT = KeypointLayout(NUMBERED, ())  # its points are counted when the bags are read
+
+_OF_BAGS = ("topic", "keypoint_layout", "min_confidence", "mapping", "image_width", "image_height")
+_OF_CMU = ("subjects", "all_trials", "stride", "camera_seed")
 
 
 def validate(config: TrainingConfig, names: OptionNames) -> str:
@@ -86,6 +89,18 @@ def _check_data(config: TrainingConfig, names: OptionNames) -> None:
     """Raise ValueError unless there is data of exactly one kind, and each bag exists."""
     if bool(config.data.bags) == bool(config.data.cmu):
         raise ValueError(f"name what to train on: {names('data')}")
+    data = config.data
+    if bool(data.image_width) != bool(data.image_height):
+        raise ValueError(
+            f"{names('image_width')} is {data.image_width} and {names('image_height')} is "
+            f"{data.image_height}: the size of the image needs both"
+        )
+    default = DataConfig()
+    of_the_other = _OF_BAGS if data.cmu else _OF_CMU
+    for name in of_the_other:
+        if getattr(data, name) != getattr(default, name):
+            kind = "motion capture" if data.cmu else "bags"
+            raise ValueError(f"{names(name)} has no effect on {kind}: leave it out")
     for bag in config.data.bags:
         if not bag.expanduser().exists():
             raise ValueError(f"{names('bags')} names {bag}, which does not exist")
