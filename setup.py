@@ -100,6 +100,9 @@ setup(
         "train": [
             "torch>=2.2",  # training; lifting needs none
         ],
+        "hdf5": [
+            "h5py",  # reads the .h5 of DeepLabCut without pandas and PyTables (200 MB)
+        ],
         "ros": [
             "ros-jazzy-rclpy",  # the node, where no ROS installation is sourced
             "ros-jazzy-common-interfaces",  # the messages it receives and sends
@@ -109,6 +112,7 @@ setup(
             "pytest",  # runs the tests; colcon test needs its name here to run any
             "pytest-xdist",  # several test files at a time: make test TEST_PROCESSES=2
             "pytest-timeout",  # a process that never answers fails its test instead of hanging all
+            "h5py",  # writes files as DeepLabCut does
             "hypothesis",  # properties over generated input
             "ruff",  # lint and format
             "mypy",  # types

@@ -18,7 +18,11 @@ class Extra(NamedTuple):
     other_way: str
 
 
-EXTRAS = {"train": Extra("torch", ""), "ros": Extra("rclpy", " (or source your ROS installation)")}
+EXTRAS = {
+    "train": Extra("torch", ""),
+    "hdf5": Extra("h5py", ""),
+    "ros": Extra("rclpy", " (or source your ROS installation)"),
+}
 
 
 class MissingExtraError(ImportError, ValueError):

@@ -9,6 +9,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -23,6 +24,7 @@ from deep_nrsfm_ros.data.formats.builder import DetectionsBuilder, KeypointFileE
 from deep_nrsfm_ros.data.formats.frame_numbers import natural
 from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
 from deep_nrsfm_ros.data.formats.json_items import Readable
+from deep_nrsfm_ros.data.formats.tables import read_csv, read_h5, read_trc
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
@@ -206,6 +208,18 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
     return builder.detections("it is empty")
 
 
+def _table(
+    read: Callable[[Path, DetectionsBuilder], None],
+    path: Path,
+    options: ReadOptions,
+    on_progress: Progress,
+) -> Detections:
+    """Return the objects in a table."""
+    builder = DetectionsBuilder(options)
+    read(path, builder)
+    return builder.detections("it has no row")
+
+
 def _folder(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
     """Return the objects in a folder with a document, which is a frame, in each file."""
     builder = DetectionsBuilder(options)
@@ -251,6 +265,14 @@ FORMATS = (
         _json,
         has_categories=True,
     ),
+    Format(
+        "a table (.csv) of DeepLabCut, MediaPipe, or with columns such as nose_x",
+        (".csv", ".tsv"),
+        partial(_table, read_csv),
+        has_categories=True,
+    ),
+    Format("a table (.h5) of DeepLabCut", (".h5", ".hdf5"), partial(_table, read_h5), True),
+    Format("2D markers (.trc) of Sports2D", (".trc",), partial(_table, read_trc)),
     Format("such JSON of a frame a line (.jsonl, .jsonl.gz)", (".jsonl", ".jsonl.gz"), _lines),
 )
 """The formats of single files."""

@@ -17,6 +17,7 @@ from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.observation import to_observation
+from deep_nrsfm_ros.lifting.sanity import looks_normalised
 
 NO_KEYPOINTS = "have no keypoints"
 _ROWS = 8192  # of a chunk: large enough that a freed one returns to the system
@@ -66,12 +67,15 @@ class DetectionsBuilder:
     Attributes:
         options: of reading.
         warnings: sentences about what was left out or looks wrong.
+        is_mediapipe: the input is landmarks, which MediaPipe gives as fractions of the image's
+            size.
     """
 
     def __init__(self, options: ReadOptions) -> None:
         """Start without frames."""
         self.options = options
         self.warnings: list[str] = []
+        self.is_mediapipe = False
         self._groups: dict[tuple[Any, int], _Group] = {}
         self._frames: dict[Any, int] = {}
         self._keys: list[Any] = []
@@ -207,6 +211,12 @@ class DetectionsBuilder:
             raise KeypointFileError("; ".join(["no object is left", *self.reasons()]))
         frame = np.array(group.frame, np.int64)
         points, confidence = group.arrays(options.min_confidence)
+        is_normalised = self.is_mediapipe and looks_normalised(points, confidence > 0)
+        if is_normalised and options.image_size is None:
+            raise KeypointFileError(
+                "its landmarks are fractions of the image's size: give --image-width and "
+                "--image-height"
+            )
         identities, warning = identities_of(group.identities, frame)
         self.warnings += [warning] if warning else []
         scores = np.array(group.scores, np.float32)
@@ -325,6 +335,8 @@ class DetectionsBuilder:
                 f"each other at {rate:g} a second"
             )
         if f and None not in stamps:
+            if self.options.rate:
+                raise KeypointFileError("it has times of its own: leave out --rate")
             times = np.array(stamps, np.int64)[order]
         called = Frames(
             np.arange(f) if numbers is None else numbers,

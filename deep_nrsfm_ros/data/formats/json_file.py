@@ -184,7 +184,9 @@ class JsonReader:
     def _person(self, person: Mapping[str, Any], frame: int) -> None:
         """Add an object, or count what is wrong with it."""
         try:
-            keypoints = next((person[name] for name in _KEYPOINTS if name in person), None)
+            field = next((name for name in _KEYPOINTS if name in person), "")
+            keypoints = person.get(field)
+            self._builder.is_mediapipe |= field in _LANDMARKS
             if keypoints is None:
                 raise ValueError(NO_KEYPOINTS)
             scores = next((person[n] for n in _SCORES if isinstance(person.get(n), list)), None)
