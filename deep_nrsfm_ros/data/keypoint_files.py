@@ -28,6 +28,7 @@ from deep_nrsfm_ros.data.formats.tables import read_csv, read_h5, read_trc
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
+from deep_nrsfm_ros.messages.stamps import one_clock
 
 __all__ = ["KINDS", "KeypointFileError", "is_bag", "read_bag", "read_keypoints", "stamp_of"]
 
@@ -299,7 +300,8 @@ def read_bag(
 ) -> Detections:
     """Return the detections on a topic of a bag, in order of time.
 
-    Stamps are those of the headers, or the time of recording for messages without a header.
+    Stamps are those of the headers, on one clock (`one_clock`), or the time of recording for
+    messages without a header.
     Unreadable messages are left out.
 
     Args:
@@ -311,7 +313,7 @@ def read_bag(
         BagError: the bag cannot be read, or has no such topic.
         KeypointFileError: no message is readable.
     """
-    observations, stamps, reason, camera, count = [], [], "", "", 0
+    observations, stamps, times, reason, camera, count = [], [], [], "", "", 0
     warnings: list[str] = []
     layout = options.layout or options.fallback
     keypoints = len(layout) if layout else keypoint_count([path], options)
@@ -326,7 +328,8 @@ def read_bag(
                         record.raw, keypoints, options.min_confidence, options.image_size
                     )
                     observations.append(observation)
-                    stamps.append((header and header.stamp) or record.time)
+                    stamps.append(header.stamp if header else 0)
+                    times.append(record.time)
                     camera = camera or (header.frame_id if header else "")
                 except Exception as error:  # damaged bytes fail in many ways; read the others
                     reason = reason or str(error) or repr(error)
@@ -340,9 +343,11 @@ def read_bag(
         warnings.append(
             f"{count - len(observations)} of {count} messages could not be read: {reason}"
         )
-    order = np.argsort(stamps, kind="stable")
-    ordered = [observations[i] for i in order], [stamps[i] for i in order]
-    detections = gather(*ordered, keypoints, camera)
+    on_one_clock, clock_warnings = one_clock(stamps, times)
+    order = np.argsort(on_one_clock, kind="stable")
+    ordered = [observations[i] for i in order]
+    detections = gather(ordered, on_one_clock[order], keypoints, camera)
+    warnings += clock_warnings
     return dataclasses.replace(detections, layout=layout, warnings=tuple(warnings))
 
 

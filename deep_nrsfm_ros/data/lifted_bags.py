@@ -18,6 +18,7 @@ from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import stamp_of
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.decoding import read_points
+from deep_nrsfm_ros.messages.stamps import one_clock
 from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_quaternion
 
 KEYPOINTS, POINTS, ROTATION = "/keypoints", "/lifter/points", "/lifter/camera_rotation"
@@ -71,26 +72,35 @@ def read_lifted_messages(
             raise BagError(f"bag {path} has {len(pairs)} lifters' points ({names}); expected one")
         points, rotation = pairs[0]
         rotations: dict[int, NDArray[np.float32]] = {}
-        for stamp, message in _messages(bag, rotation, warn):
+        for _, stamp, message in _messages(bag, rotation, warn):
             q = message.quaternion
             rotations[stamp] = rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w]))
-        lifted = []
-        for stamp, message in _messages(bag, points, warn):
+        lifted, times = [], []
+        for time, stamp, message in _messages(bag, points, warn):
             values = read_points(message)
             shapes, confidence = values[..., :3], values[..., 3]
             lifted.append(LiftedMessage(stamp, shapes, confidence, rotations.get(stamp)))
+            times.append(time)
             on_progress(len(lifted), max(len(lifted), points.total))
+    stamps, warnings = one_clock([each.stamp for each in lifted], times)
+    for warning in warnings:
+        warn(warning)
+    lifted = [
+        each._replace(stamp=stamp) for each, stamp in zip(lifted, stamps.tolist(), strict=True)
+    ]
     return sorted(lifted, key=lambda each: each.stamp)
 
 
-def _messages(bag: BagFile, topic: Topic, warn: Callable[[str], None]) -> list[tuple[int, Any]]:
-    """Return the messages of a topic with their stamps; warn about unreadable ones."""
-    messages: list[tuple[int, Any]] = []
+def _messages(
+    bag: BagFile, topic: Topic, warn: Callable[[str], None]
+) -> list[tuple[int, int, Any]]:
+    """Return time of recording, stamp and message of a topic; warn about unreadable ones."""
+    messages: list[tuple[int, int, Any]] = []
     reason, damaged = "", 0
     for record in bag.records(topic):
         try:
             message = _STORE.deserialize_cdr(record.raw, topic.type)
-            messages.append((stamp_of(message) or record.time, message))
+            messages.append((record.time, stamp_of(message), message))
         except Exception as error:  # damaged bytes fail in many ways; read the others
             reason, damaged = reason or repr(error), damaged + 1
     if warning := bag.warning(topic):

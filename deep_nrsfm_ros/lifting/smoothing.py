@@ -24,6 +24,7 @@ Floats = NDArray[Any]
 
 MAX_AGE = 1.0
 """Seconds after which an object that was not lifted is filtered from its next frame on."""
+_INTERVALS = 3.0  # between messages, for which a filter lives and a gap is filled at least
 _SPEED_CUTOFF = 1.0  # Hz, of the low-pass of the speed, as in the paper
 
 
@@ -52,9 +53,9 @@ class SmoothingOptions:
     )
     max_gap: float = option(
         0.3,
-        "longest gap in s that is filled: an object that cannot be lifted, or is missing from the "
-        "message, keeps its last shape and rotation while its confidence falls to 0; 0 = off, "
-        "0.3 typical",
+        "longest gap in s that is filled, or 3 intervals of a slower stream: an object that cannot "
+        "be lifted, or is missing from the message, keeps its last shape and rotation while its "
+        "confidence falls to 0; 0 = off, 0.3 typical",
         low=0.0,
         high=60.0,
     )
@@ -135,21 +136,21 @@ def _decompose(lifted: Lifted) -> tuple[Floats, Floats, Floats]:
 class Smoother:
     """Smooths all objects of one topic, each by its identity.
 
-    The filter of an object starts anew when the object is lifted again after more than `MAX_AGE`
-    and `max_gap`. A frame of an object with the stamp of its last frame, or an earlier one, is
-    returned as lifted and does not change the filter. A clock that jumps back by more than
-    `MAX_AGE` deletes all filters.
+    The filter of an object starts anew when the object is lifted again after more than `MAX_AGE`,
+    `max_gap` and 3 periods of the stream. A frame of an object with the stamp of its last frame, or
+    an earlier one, is returned as lifted and does not change the filter. A clock that jumps back by
+    more than `MAX_AGE` and 3 periods deletes all filters.
     """
 
     def __init__(self, options: SmoothingOptions) -> None:
         """Start without objects."""
         self._options = options
-        self._max_age = max(MAX_AGE, options.max_gap)
+        self._period = 0.0
         self._tracks: dict[str, _Track] = {}
         self._now = -np.inf
 
     def __call__(
-        self, lifted: Lifted, identities: tuple[str, ...], time: float
+        self, lifted: Lifted, identities: tuple[str, ...], time: float, period: float = 0.0
     ) -> tuple[Lifted, tuple[str, ...]]:
         """Return the smoothed objects and their identities.
 
@@ -159,14 +160,16 @@ class Smoother:
             lifted: n objects.
             identities: n.
             time: of the message, seconds of any clock.
+            period: typical interval between messages in seconds; 0: unknown.
         """
         if not self._options.enabled:
             return lifted, identities
-        if time < self._now - MAX_AGE:
+        self._period = period
+        if time < self._now - max(MAX_AGE, _INTERVALS * period):
             self._tracks.clear()
             self._now = -np.inf
         self._now = max(time, self._now)
-        oldest = self._now - self._max_age
+        oldest = self._now - max(MAX_AGE, self._max_gap, _INTERVALS * period)
         self._tracks = {
             identity: track for identity, track in self._tracks.items() if track.time >= oldest
         }
@@ -187,6 +190,12 @@ class Smoother:
         together = Lifted(*(np.concatenate(parts) for parts in zip(*objects, strict=True)))
         return together, (*identities, *absent)
 
+    @property
+    def _max_gap(self) -> float:
+        """The longest gap that is filled, in seconds: `max_gap`, or 3 periods; 0 = off."""
+        max_gap = self._options.max_gap
+        return max(max_gap, _INTERVALS * self._period) if max_gap else 0.0
+
     def _smooth(self, lifted: Lifted, identity: str, time: float) -> Lifted:
         """Return one object (n = 1), smoothed, or its last state if it could not be lifted."""
         track = self._tracks.get(identity)
@@ -203,7 +212,7 @@ class Smoother:
 
     def _gap_left(self, identity: str, time: float) -> float:
         """Return the fraction of `max_gap` that remains for an object, 0 if it has no track."""
-        track, max_gap = self._tracks.get(identity), self._options.max_gap
+        track, max_gap = self._tracks.get(identity), self._max_gap
         if track is None or not max_gap or time < track.time:
             return 0.0
         return max(0.0, 1 - (time - track.time) / max_gap)

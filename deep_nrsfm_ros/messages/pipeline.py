@@ -19,6 +19,7 @@ from deep_nrsfm_ros.lifting.tracking import keypoint_tolerances
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.serialised import Header, MessageReader
+from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.folders import default_bags_dir, default_models_dir
 from deep_nrsfm_ros.model_files.model_file import Model
 
@@ -178,13 +179,17 @@ class Pipeline:
         """Whether `lift` needs the identities of objects: smoothing is enabled."""
         return self._smoothing.enabled
 
+    def restart(self, topic: str) -> None:
+        """Delete the filters of a topic, as when its stamps begin anew."""
+        self._smoothers.pop(topic, None)
+
     def lift(
         self,
         observation: Observation,
         intrinsics: Intrinsics | None,
         identities: tuple[str, ...],
         topic: str,
-        time: float,
+        moment: Moment,
     ) -> tuple[Lifted, tuple[str, ...]]:
         """Return the lifted objects of a message, smoothed if so configured, and their identities.
 
@@ -196,7 +201,7 @@ class Pipeline:
             intrinsics: of the camera: shapes are at their positions; None: shapes are centred.
             identities: n, unique on the topic; "" if unknown.
             topic: of the message; each topic has its own filters.
-            time: stamp of the message in seconds.
+            moment: time of the message.
 
         Raises:
             MessageError: there are objects, and none can be lifted.
@@ -209,7 +214,7 @@ class Pipeline:
         smoother = self._smoothers.get(topic)
         if smoother is None:
             smoother = self._smoothers[topic] = Smoother(self._smoothing)
-        lifted, identities = smoother(lifted, identities, time)
+        lifted, identities = smoother(lifted, identities, moment.seconds, moment.period)
         if identities and np.isnan(lifted.residual).all():
             detected = self._lifter.detected_count(confidence).max()
             if detected >= self._min_visible:

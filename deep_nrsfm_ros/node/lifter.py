@@ -46,6 +46,8 @@ from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.pipeline import AUTO, MODEL_ORDER, InputOptions, Pipeline
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
+
+from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
@@ -162,19 +164,19 @@ class LifterNode(Node):
         try:
             intrinsics = self._camera.require_intrinsics()
             header, observation = self._pipeline.read(raw, source.reader, self._camera.size)
+            moment = self._moment(source, header.stamp if header else 0)
             has_subscriber = self._objects.get_subscription_count()
             if has_subscriber or self._tf or self._pipeline.needs_identities:
                 identities = source.tracker(
-                    observation, started, tolerances=self._pipeline.tolerances
+                    observation, moment.seconds, moment.period, self._pipeline.tolerances
                 )
             else:
                 identities = ("",) * len(observation.confidence)
             header = header or self._now()
             if not header.frame_id or (self._frame_id and header.frame_id != self._frame_id):
                 header = header._replace(frame_id=self._frame(source, header.frame_id))
-            seconds = 1e-9 * (header.stamp or self._now().stamp)
             lifted, identities = self._pipeline.lift(
-                observation, intrinsics, identities, source.topic, seconds
+                observation, intrinsics, identities, source.topic, moment
             )
         except Exception as problem:  # one bad message must not end the node
             self._reject(source, problem)
@@ -194,8 +196,12 @@ class LifterNode(Node):
         if self._tf:
             self._tf.send(header, lifted, identities)
         if self._markers.get_subscription_count():
-            edges = self._pipeline.edges
-            self._markers.publish(publishing.markers(header, lifted, edges, positioned=positioned))
+            self._markers.publish(
+                publishing.markers(
+                    *(header, lifted, self._pipeline.edges, moment),
+                    positioned=positioned,
+                )
+            )
         self._lifter_diagnostics.lifted(
             time.perf_counter() - started, lifted.residual, lifted.confidence
         )
@@ -223,6 +229,19 @@ class LifterNode(Node):
             f"keypoint_layout auto: {choice.layout.name} ({choice.reason}); "
             f"-p keypoint_layout:={choice.layout.name} sets it for good"
         )
+=======
+    def _moment(self, source: KeypointTopic, stamp: int) -> Moment:
+        """Return the time of a message on its topic; begin anew where its stamps do."""
+        warned = source.clock.warning
+        moment = source.clock(stamp, time.monotonic_ns())
+        if moment.restarted:
+            source.tracker.restart()
+            self._pipeline.restart(source.topic)
+            self.get_logger().info(f"stamps on {source.topic} begin anew: so do identities")
+        if source.clock.warning != warned:
+            self.get_logger().warning(f"{source.topic}: {source.clock.warning}")
+        return moment
+>>>>>>> 8b5ec1f (One clock for a topic; identities, markers and filters follow the rate of the stream)
 
     def _reject(self, source: KeypointTopic, problem: Exception) -> None:
         """Count a message that could not be lifted, and log the reason, throttled."""

@@ -24,6 +24,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP
 from deep_nrsfm_ros.messages.serialised import Header
+from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.nrsfm.geometry import centre, quaternion
 
 NO_EVENT_CALLBACKS = PublisherEventCallbacks(use_default_callbacks=False)
@@ -35,7 +36,9 @@ node reports as well.
 
 _MAX_TEMPLATES = 16  # kept of each kind of message: one per camera and number of objects
 
-_LIFETIME = Duration(nanosec=300_000_000)
+_LIFETIME = 0.3  # s, of markers in a stream of at least 10 Hz
+_INTERVALS = 3  # between messages, for which markers live at least
+_NO_MOMENT = Moment(0.0)
 _BONES = std_msgs.ColorRGBA(r=0.2, g=0.6, b=1.0, a=1.0)
 _JOINTS = std_msgs.ColorRGBA(r=1.0, g=0.7, b=0.1, a=1.0)
 _JOINT_SIZE = 0.08  # diameter, relative to the shape's RMS radius
@@ -148,7 +151,12 @@ def to_quaternion(rotation: NDArray[np.float32]) -> Quaternion:
 
 
 def markers(
-    header: Header, lifted: Lifted, edges: Sequence[tuple[int, int]], *, positioned: bool = False
+    header: Header,
+    lifted: Lifted,
+    edges: Sequence[tuple[int, int]],
+    moment: Moment = _NO_MOMENT,
+    *,
+    positioned: bool = False,
 ) -> MarkerArray:
     """Return for each lifted object a list of lines (edges) and a list of spheres (keypoints).
 
@@ -156,10 +164,16 @@ def markers(
         header: of the message.
         lifted: n objects.
         edges: pairs of keypoint indices.
+        moment: time of the message: markers live for 0.3 s or 3 periods; where the stamps begin
+            anew, all earlier markers are deleted.
         positioned: whether the shapes are at their positions. If not, the first object is at the
             origin, as in the point cloud, and the others stand beside it as in the image.
     """
     message, stamped = MarkerArray(), to_header(header)
+    if moment.restarted:
+        message.markers.append(Marker(header=stamped, action=Marker.DELETEALL))
+    seconds = max(_LIFETIME, _INTERVALS * moment.period)
+    lifetime = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
     lifted = Lifted(*(part[~np.isnan(lifted.residual)] for part in lifted))
     sizes = np.sqrt((centre(lifted.shapes) ** 2).sum(-1).mean(-1)).tolist()
     offsets = (lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]
@@ -174,7 +188,7 @@ def markers(
         joint, bone = _JOINT_SIZE * size, _BONE_SIZE * size
         joints.scale, bones.scale = Vector3(x=joint, y=joint, z=joint), Vector3(x=bone)
         for marker in (bones, joints):
-            marker.header, marker.id, marker.lifetime = stamped, i, _LIFETIME
+            marker.header, marker.id, marker.lifetime = stamped, i, lifetime
             marker.pose.position = Point(x=x, y=y)
         message.markers += [bones, joints]
     return message

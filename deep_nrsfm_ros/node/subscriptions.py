@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -26,6 +26,7 @@ from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, InputType, resolve_inp
 from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
 from deep_nrsfm_ros.messages.pipeline import AUTO, InputOptions
 from deep_nrsfm_ros.messages.serialised import MessageReader
+from deep_nrsfm_ros.messages.stamps import TopicClock
 from deep_nrsfm_ros.messages.topics import WILDCARD, match
 from deep_nrsfm_ros.node.message_types import decoder, message_class
 
@@ -52,12 +53,14 @@ class KeypointTopic:
         reader: reads its messages.
         tracker: gives identities to its objects.
         dropped: counts its dropped messages.
+        clock: gives its messages their times.
     """
 
     topic: str
     reader: MessageReader
     tracker: Tracker
     dropped: DroppedMessages
+    clock: TopicClock = field(default_factory=TopicClock)
 
 
 class KeypointSubscriptions:

@@ -27,6 +27,7 @@ from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.decoding import InputType
 from deep_nrsfm_ros.messages.pipeline import InputOptions, Pipeline
 from deep_nrsfm_ros.messages.serialised import MessageReader
+from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -161,7 +162,7 @@ class Bench:
         if not len(seen.confidence):
             raise ValueError("no object, which is no error and no answer either")
         names = ("one",) * len(seen.confidence)
-        return pipeline.lift(seen, intrinsics, names, "topic", 0.0)[0]
+        return pipeline.lift(seen, intrinsics, names, "topic", Moment(0.0))[0]
 
     @classmethod
     def loose(cls, value: Any) -> Any:

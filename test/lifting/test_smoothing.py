@@ -178,3 +178,18 @@ def test_a_clock_that_goes_far_back_begins_anew() -> None:
     smoother(one(2 * SHAPE), ("a",), 1.0)
     again, _ = smoother(one(3 * SHAPE), ("a",), 1.1)
     assert 2 < (again.shapes[0] / SHAPE).mean() < 2.5
+
+
+@pytest.mark.parametrize("rate", [1, 5, 30, 240])
+def test_gaps_and_restart_follow_the_rate_of_the_stream(rate: int) -> None:
+    period, empty = 1 / rate, Lifted(*(part[:0] for part in one()))
+    smoother = Smoother(ON)
+    smoother(one(), ("a",), 0.0, period)
+    assert smoother(empty, (), 2 * period, period)[1] == ("a",)
+    gone = max(0.3, 3 * period) + period
+    assert smoother(empty, (), gone, period)[1] == ()
+    weak = Smoother(dataclasses.replace(ON, min_cutoff=0.001, beta=0.0))
+    weak(one(), ("a",), 0.0, period)
+    moved = one()._replace(shapes=one().shapes * np.float32(1.5))
+    kept = weak(moved, ("a",), 2.5 * period, period)[0]
+    assert not np.allclose(kept.shapes, moved.shapes, atol=1e-3)

@@ -12,6 +12,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.pipeline import InputOptions, Pipeline
+from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.model_file import load_model
 
 HUMAN = load_model("human")
@@ -47,8 +48,8 @@ def test_min_visible_counts_detected_keypoints(
     lifted = Lifter(HUMAN, layout=source)(*points)
     if detected >= lifting.min_visible:
         assert np.isfinite(lifted.shapes).all()
-        pipeline.lift(mapped, intrinsics, ("",), "topic", 0.0)
+        pipeline.lift(mapped, intrinsics, ("",), "topic", Moment(0.0))
         return
     assert np.isnan(lifted.shapes).all() and not lifted.confidence.any()
     with pytest.raises(MessageError, match=f"at most {detected} detected .* min_visible is 4"):
-        pipeline.lift(mapped, intrinsics, ("",), "topic", 0.0)
+        pipeline.lift(mapped, intrinsics, ("",), "topic", Moment(0.0))

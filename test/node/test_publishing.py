@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
+from visualization_msgs.msg import Marker
 
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
@@ -23,6 +24,7 @@ from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read_observation
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS as FIELDS
 from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
 from deep_nrsfm_ros.messages.serialised import Header, MessageReader
+from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.node import lifter, publishing
 from deep_nrsfm_ros.node.message_types import decoder
 from deep_nrsfm_ros.node.subscriptions import KeypointTopic
@@ -131,6 +133,21 @@ def test_markers_draw_edges_and_put_objects_side_by_side() -> None:
     np.testing.assert_allclose(ends, part.shapes[0][[0, 1, 1, 4]], rtol=1e-6)
 
 
+@pytest.mark.parametrize(("rate", "lifetime"), [(1, 3.0), (5, 0.6), (30, 0.3), (240, 0.3)])
+def test_markers_live_until_the_next_ones(rate: int, lifetime: float) -> None:
+    made = publishing.markers(Header(), lifted(1), [(0, 1)], Moment(0.0, 1 / rate)).markers
+    for marker in made:
+        seconds = marker.lifetime.sec + 1e-9 * marker.lifetime.nanosec
+        assert seconds == pytest.approx(lifetime, abs=1e-6)
+
+
+def test_markers_of_a_loop_before_are_deleted() -> None:
+    moment = Moment(0.0, 0.1, restarted=True)
+    first, *others = publishing.markers(Header(), lifted(1), [(0, 1)], moment).markers
+    assert first.action == Marker.DELETEALL and len(others) == 2
+    assert all(marker.action == Marker.ADD for marker in others)
+
+
 def test_markers_are_not_made_when_nobody_listens(
     domain: int, models: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +169,31 @@ def test_markers_are_not_made_when_nobody_listens(
             publishing.point_cloud(Header(), lifted(1, len(HUMAN17))),
         )
         assert heard and not made
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def test_stamps_that_go_back_begin_identities_and_filters_anew(
+    domain: int, models: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = ["-p", "model:=person", "-p", f"models_dir:={models}"]
+    rclpy.init(args=["--ros-args", *settings, "-p", "smoothing.enabled:=true"], domain_id=domain)
+    try:
+        node, tracker = lifter.LifterNode(), Tracker()
+        reader = MessageReader(POINT_CLOUD, decoder(POINT_CLOUD))
+        source = KeypointTopic("/keypoints", reader, tracker, DroppedMessages())
+        names: list[str] = []
+        identify = Tracker.__call__
+
+        def record(*arguments: Any) -> tuple[str, ...]:
+            names.extend(result := identify(*arguments))
+            return result
+
+        monkeypatch.setattr(Tracker, "__call__", record)
+        for second in (10, 11, 12, 3, 4):
+            node._lift(source, publishing.point_cloud(Header(second), lifted(1, len(HUMAN17))))
+        assert names == ["object1"] * 3 + ["object2"] * 2
         node.destroy_node()
     finally:
         rclpy.try_shutdown()

@@ -1,0 +1,161 @@
+"""One clock for the messages of a topic: stamps that are 0 or of another clock are replaced.
+
+A detector that starts before /clock stamps its first messages with 0 or with the wall clock. Such a
+stamp is replaced by the time of receipt, moved to the clock of the topic's other stamps.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+MAX_LATE = 1.0
+"""Seconds by which a stamp may be before an earlier message's; more: the stamps begin anew."""
+
+_SECOND = 1_000_000_000  # ns
+_OTHER_CLOCK = 1_000_000 * _SECOND  # two clocks that differ by more are not the same, 11 days
+_ADOPTED = 10  # messages of another clock in sequence after which it is the topic's clock
+_INTERVALS = 15  # of which the median is the period
+_MAX_PERIOD = 10.0  # s
+
+
+class Moment(NamedTuple):
+    """The time of a message on the clock of its topic.
+
+    Attributes:
+        seconds: time, on the clock of the topic.
+        period: typical interval between messages in seconds, a running median; 0: unknown.
+        restarted: whether the stamps begin anew with this message, as in a looped bag.
+    """
+
+    seconds: float
+    period: float = 0.0
+    restarted: bool = False
+
+
+class TopicClock:
+    """Gives each message of a topic its time, as it arrives.
+
+    Attributes:
+        warning: a sentence about stamps that were replaced; "" as long as there are none.
+    """
+
+    def __init__(self) -> None:
+        """Start without messages."""
+        self.warning = ""
+        self._offset = 0  # ns, from the time of receipt to the clock of the topic
+        self._shift = 0  # ns, added to the stamps, so that no clock's end is a jump
+        self._has_stamps = False
+        self._other = 0  # messages of another clock in sequence
+        self._last: int | None = None  # ns
+        self._intervals: deque[int] = deque(maxlen=_INTERVALS)
+
+    def __call__(self, stamp: int, received: int) -> Moment:
+        """Return the time of the next message.
+
+        Args:
+            stamp: of its header in ns; 0: none.
+            received: when it was received, ns of any clock that is never set back.
+        """
+        now = self._on_topic_clock(stamp, received)
+        interval = 0 if self._last is None else now - self._last
+        if interval > 0:
+            self._intervals.append(interval)
+        period = self._period()
+        restarted = interval < -_SECOND * MAX_LATE and interval < -3 * _SECOND * period
+        # A late message does not set the clock back.
+        if self._last is None or restarted or interval > 0:
+            self._last = now
+        return Moment(1e-9 * now, period, restarted)
+
+    def _on_topic_clock(self, stamp: int, received: int) -> int:
+        """Return the stamp in ns, or what replaces it."""
+        offset = stamp + self._shift - received
+        if stamp and not self._has_stamps:
+            if self._last is not None:  # messages without a stamp came first
+                self._shift, offset = self._offset - (stamp - received), self._offset
+            self._has_stamps, self._offset = True, offset
+        is_other = abs(offset - self._offset) > _OTHER_CLOCK
+        if stamp and is_other:
+            self._other += 1
+            if self._other >= _ADOPTED:
+                self._shift = self._offset - (stamp - received)
+                is_other, offset = False, self._offset
+        if stamp and not is_other:
+            self._offset, self._other = offset, 0
+            return stamp + self._shift
+        if stamp or self._has_stamps:
+            self.warning = self.warning or (
+                f"a stamp is {'of another clock' if stamp else '0'}: identities and smoothing take "
+                "the time of receipt instead; does the publisher start before /clock?"
+            )
+        return received + self._offset
+
+    def _period(self) -> float:
+        """Return the median interval in seconds, 0 if there is none."""
+        if not self._intervals:
+            return 0.0
+        median = sorted(self._intervals)[len(self._intervals) // 2]
+        return min(1e-9 * median, _MAX_PERIOD)
+
+
+def one_clock(
+    stamps: Sequence[int] | NDArray[np.int64], received: ArrayLike
+) -> tuple[NDArray[np.int64], list[str]]:
+    """Return the stamps of recorded messages on one clock, and warnings about those changed.
+
+    Stamps that are 0, or far from the clock of most stamps, are replaced by the time of receipt,
+    moved to that clock. Where stamps go back by more than a second, as in a bag that was played
+    in a loop, the later ones are moved so that they follow; the order of the messages stays.
+
+    Args:
+        stamps: (n,) of the headers in ns, in the order of receipt; 0: none.
+        received: (n,) when the messages were received, ns of any clock.
+    """
+    result, arrived = np.array(stamps, np.int64), np.asarray(received, np.int64)
+    has_stamp, warnings = result != 0, []
+    if not has_stamp.any():
+        return arrived.copy(), []
+    offset = result - arrived
+    clock = int(np.median(offset[has_stamp]))
+    # The median of an even number may be between two clocks.
+    clock = int(offset[has_stamp][np.abs(offset[has_stamp] - clock).argmin()])
+    other = has_stamp & (np.abs(offset - clock) > _OTHER_CLOCK)
+    valid = np.flatnonzero(has_stamp & ~other)
+    replaced = np.flatnonzero(~has_stamp | other)
+    if len(replaced):
+        after = np.minimum(np.searchsorted(valid, replaced), len(valid) - 1)
+        result[replaced] = arrived[replaced] + offset[valid[after]]
+        warnings.append(
+            f"{len(replaced)} of {len(result)} stamps are "
+            f"{'of another clock' if other.all() else '0 or of another clock'}: replaced by the "
+            "time of receipt on the clock of the others"
+        )
+    result, loops = _unrolled(result, arrived)
+    if loops:
+        warnings.append(
+            f"the stamps go back {loops} times, as of a bag played in a loop: the later ones "
+            "are moved to follow"
+        )
+    return result, warnings
+
+
+def _unrolled(
+    stamps: NDArray[np.int64], arrived: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], int]:
+    """Return stamps that do not go back, by the times of receipt, and how often they did."""
+    latest = np.maximum.accumulate(stamps)
+    if not (stamps < latest - _SECOND * MAX_LATE).any():
+        return stamps, 0
+    result, shift, last, loops = stamps.copy(), 0, int(stamps[0]), 0
+    for i in range(1, len(stamps)):
+        stamp = int(stamps[i]) + shift
+        if stamp < last - _SECOND * MAX_LATE:
+            follows = last + max(int(arrived[i] - arrived[i - 1]), 1)
+            shift, stamp, loops = shift + follows - stamp, follows, loops + 1
+        result[i], last = stamp, max(last, stamp)
+    return result, loops
