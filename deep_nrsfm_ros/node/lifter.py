@@ -45,9 +45,8 @@ from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.pipeline import AUTO, MODEL_ORDER, InputOptions, Pipeline
 from deep_nrsfm_ros.messages.serialised import Header
-from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
-
 from deep_nrsfm_ros.messages.stamps import Moment
+from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
@@ -229,7 +228,7 @@ class LifterNode(Node):
             f"keypoint_layout auto: {choice.layout.name} ({choice.reason}); "
             f"-p keypoint_layout:={choice.layout.name} sets it for good"
         )
-=======
+
     def _moment(self, source: KeypointTopic, stamp: int) -> Moment:
         """Return the time of a message on its topic; begin anew where its stamps do."""
         warned = source.clock.warning
@@ -241,7 +240,6 @@ class LifterNode(Node):
         if source.clock.warning != warned:
             self.get_logger().warning(f"{source.topic}: {source.clock.warning}")
         return moment
->>>>>>> 8b5ec1f (One clock for a topic; identities, markers and filters follow the rate of the stream)
 
     def _reject(self, source: KeypointTopic, problem: Exception) -> None:
         """Count a message that could not be lifted, and log the reason, throttled."""
