@@ -1,5 +1,7 @@
 """Start the lifter: ros2 launch deep_nrsfm_ros lifter.launch.py keypoints:=/detector/keypoints."""
 
+import os
+
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
@@ -35,6 +37,8 @@ def generate_launch_description() -> LaunchDescription:
                 parameters=[LaunchConfiguration("config")],
                 remappings=[("keypoints", LaunchConfiguration("keypoints"))],
                 output="screen",
+                # The lifter ends with this launch, even if the launch is killed.
+                additional_env={"DEEP_NRSFM_LAUNCH_PID": str(os.getpid())},
             ),
         ]
     )

@@ -58,15 +58,6 @@ def generate_launch_description() -> LaunchDescription:
                 output="screen",
                 condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration("detector"), "")),
             ),
-            IncludeLaunchDescription(
-                PythonLaunchDescriptionSource(
-                    PathJoinSubstitution([share, "launch", "lifter.launch.py"])
-                ),
-                launch_arguments={
-                    "keypoints": LaunchConfiguration("keypoints"),
-                    "config": LaunchConfiguration("config"),
-                }.items(),
-            ),
             Node(
                 package="tf2_ros",
                 executable="static_transform_publisher",
@@ -85,6 +76,16 @@ def generate_launch_description() -> LaunchDescription:
                     *("-f", LaunchConfiguration("fixed_frame")),
                 ],
                 condition=IfCondition(LaunchConfiguration("rviz")),
+            ),
+            # Last: if a package above is missing, no lifter is left running.
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(
+                    PathJoinSubstitution([share, "launch", "lifter.launch.py"])
+                ),
+                launch_arguments={
+                    "keypoints": LaunchConfiguration("keypoints"),
+                    "config": LaunchConfiguration("config"),
+                }.items(),
             ),
         ]
     )

@@ -39,6 +39,15 @@ def generate_launch_description() -> LaunchDescription:
                 default_value="camera",
                 description="Optical frame of the camera, as in the keypoints' header.",
             ),
+            ExecuteProcess(
+                cmd=[
+                    *("ros2", "bag", "play", LaunchConfiguration("bag")),
+                    *("--rate", LaunchConfiguration("rate")),
+                    *("--topics", LaunchConfiguration("keypoints")),
+                ],
+                output="screen",
+            ),
+            # Last: if a package above is missing, no lifter is left running.
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(
                     PathJoinSubstitution([share, "launch", "live.launch.py"])
@@ -49,14 +58,6 @@ def generate_launch_description() -> LaunchDescription:
                     "rviz": LaunchConfiguration("rviz"),
                     "camera_frame": LaunchConfiguration("camera_frame"),
                 }.items(),
-            ),
-            ExecuteProcess(
-                cmd=[
-                    *("ros2", "bag", "play", LaunchConfiguration("bag")),
-                    *("--rate", LaunchConfiguration("rate")),
-                    *("--topics", LaunchConfiguration("keypoints")),
-                ],
-                output="screen",
             ),
         ]
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import runpy
 import sys
@@ -112,6 +113,16 @@ def test_included_files_have_the_arguments_they_are_given(description: Entity) -
         path = ROOT.joinpath(*source.given[0].given[0][1:])
         given = {name for name, _ in included.named["launch_arguments"]}
         assert given and given <= arguments_of(path)
+
+
+@each_file
+def test_the_lifter_comes_last_and_ends_with_its_launch(description: Entity) -> None:
+    *before, last = [e for e in description.given[0] if e.kind != "DeclareLaunchArgument"]
+    assert last.kind in ("Node", "IncludeLaunchDescription")
+    assert all(e.kind != "IncludeLaunchDescription" for e in before)
+    for node in of_kind(description, "Node"):
+        if node.named["package"] == NAME:
+            assert node.named["additional_env"] == {"DEEP_NRSFM_LAUNCH_PID": str(os.getpid())}
 
 
 @each_file

@@ -65,11 +65,17 @@ class CameraInfoSubscription:
         """Subscribe to the topic of the options.
 
         Raises:
-            ValueError: `tf_prefix` without `camera_info`.
+            ValueError: `tf_prefix` or `rectified` without `camera_info`.
         """
+        if options.rectified and not options.camera_info:
+            raise ValueError(
+                "rectified is true without camera_info: it chooses between the two cameras of a "
+                "CameraInfo; set camera_info to its topic, or leave rectified out"
+            )
         if options.tf_prefix and not options.camera_info:
             raise ValueError(
-                f"tf_prefix is {options.tf_prefix!r} without camera_info: a frame needs a place"
+                f"tf_prefix is {options.tf_prefix!r} without camera_info: a frame needs a place; "
+                "set camera_info to the topic of the camera's CameraInfo, or leave tf_prefix empty"
             )
         self.enabled = bool(options.camera_info)
         self.intrinsics: Intrinsics | None = None

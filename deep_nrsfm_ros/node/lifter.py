@@ -54,8 +54,10 @@ from deep_nrsfm_ros.node import parameters, publishing
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
+from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
 from deep_nrsfm_ros.node.training_service import TrainingService
 from deep_nrsfm_ros.node.transforms import TransformBroadcaster
+from deep_nrsfm_ros.node.unused_options import unused_options
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.request import (
@@ -145,6 +147,9 @@ class LifterNode(Node):
             on_problem=self._lifter_diagnostics.publisher_problem,
             on_dropped=self._lifter_diagnostics.dropped,
         )
+        self._name_check = NameCheck(self)
+        for warning in (*parameters.undeclared(self), *self._unused_options()):
+            self.get_logger().warning(warning)
 
     def _quiet_publisher(self, kind: type, topic: str) -> Publisher:
         """Return a publisher without event callbacks."""
@@ -274,7 +279,13 @@ class LifterNode(Node):
         return Header(*self.get_clock().now().seconds_nanoseconds())
 
     def _report(self) -> None:
-        """Publish diagnostics."""
+        """Publish diagnostics; end with the launch."""
+        if launch_has_ended():
+            self.get_logger().warning("the launch that started this node has ended, so it ends too")
+            rclpy.try_shutdown(context=self.context)
+            return
+        if warning := self._name_check():
+            self.get_logger().warning(warning)
         idle = self._lifter_diagnostics.idle
         self._keypoint_topics.update(idle=idle)
         residual = self._lifter_diagnostics.residual
@@ -404,6 +415,20 @@ class LifterNode(Node):
             self._auto, self._chosen = search, None
             self._stream.restart(search=search)
         self._pipeline = self._proposed
+        for warning in self._unused_options(changes):
+            self.get_logger().warning(warning)
+
+    def _unused_options(self, changes: Sequence[Parameter] | None = None) -> list[str]:
+        """Return a warning for each parameter, or each of `changes`, that has no effect."""
+        warnings = unused_options(
+            parameters.read(self, InputOptions, changes=changes or ()),
+            parameters.read(self, LiftingOptions, changes=changes or ()),
+            parameters.read(self, SmoothingOptions, _SMOOTHING, changes or ()),
+        )
+        if changes is not None:
+            names = {change.name for change in changes}
+            warnings = {name: text for name, text in warnings.items() if name in names}
+        return list(dict.fromkeys(warnings.values()))
 
     def _training_request(self) -> TrainingRequest:
         """Return the training that the present parameters ask for."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import Field
 from typing import Any, TypeVar
@@ -13,6 +14,9 @@ from rclpy.parameter import Parameter
 from deep_nrsfm_ros.configuration import Option, options
 
 Config = TypeVar("Config")
+
+_OF_ROS = ("qos_overrides.", "use_sim_time")  # declared when they are used
+_ALIKE = 0.6  # difflib's ratio of two names, from which on one may be meant by the other
 
 
 def declare(node: Node, cls: type[Config], prefix: str = "") -> Config:
@@ -57,6 +61,26 @@ def read(
         values[field.name] = _from_ros(name, value, field.default)
         opt.check(name, values[field.name])
     return cls(**values)
+
+
+def undeclared(node: Node) -> list[str]:
+    """Return a warning for each parameter that was set from outside and that no code declares.
+
+    Args:
+        node: has declared all of its parameters.
+    """
+    # rclpy has no public way to the overrides without declaring all of them.
+    overrides = getattr(node, "_parameter_overrides", {})
+    declared = node.list_parameters([], 0).names
+    warnings = []
+    for name in overrides:
+        if name in declared or name.startswith(_OF_ROS):
+            continue
+        text = f"there is no parameter {name!r}; its value is not used"
+        if alike := difflib.get_close_matches(name, declared, 1, _ALIKE):
+            text += f"; do you mean {alike[0]!r}?"
+        warnings.append(text)
+    return warnings
 
 
 def parameter_name(field: Field[Any], prefix: str = "") -> str:

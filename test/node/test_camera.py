@@ -109,6 +109,7 @@ def test_a_camera_that_is_not_calibrated_is_reported(
     ("parameters", "reason"),
     [
         ({"tf_prefix": "person_"}, "tf_prefix is 'person_' without camera_info"),
+        ({"rectified": True}, "rectified is true without camera_info"),
         pytest.param(
             {"tf_prefix": "person_", "camera_info": "camera_info"},
             "tf2_msgs is missing; install it (apt install ros-jazzy-tf2-msgs)",
@@ -118,7 +119,7 @@ def test_a_camera_that_is_not_calibrated_is_reported(
         ),
     ],
 )
-def test_frames_that_cannot_be_sent_are_refused_at_the_start(
+def test_options_that_need_camera_info_are_refused_without_it(
     start_lifter: Callable[..., Any], parameters: dict[str, Any], reason: str
 ) -> None:
     lifter = start_lifter(listens=False, **parameters)

@@ -298,6 +298,20 @@ def test_smoothing_follows_slower_and_fills_a_gap(
     assert np.abs(smoothed - alone)[..., :3].max() < 0.05 * np.abs(alone[..., :3]).max()
 
 
+def test_a_parameter_without_effect_is_set_with_a_warning(
+    running: tuple[LifterProcess, Client], client: Client
+) -> None:
+    lifter, _ = running
+    assert client.set_parameters(image_width=640) == ""
+    lifter.wait_for_log("image_width is 640 and has no effect without image_height: set both")
+    assert client.set_parameters(image_height=480) == ""
+    assert client.set_parameters(image_width=0, image_height=0) == ""
+    assert client.set_parameters(smoothing__beta=2.0) == ""
+    lifter.wait_for_log("smoothing.beta is 2 and has no effect, since smoothing.enabled is false")
+    assert client.set_parameters(smoothing__beta=4.0) == ""
+    assert lifter.log.count("has no effect") == 2
+
+
 def test_parameters_change_what_the_next_message_gets(
     running: tuple[LifterProcess, Client], client: Client
 ) -> None:

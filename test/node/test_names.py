@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +13,17 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float32MultiArray
 
 from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY
-from test.node.conftest import Client, LifterProcess, lifters, own_domain, write_models
+from deep_nrsfm_ros.node.surroundings import LAUNCH_PID
+from test.node.conftest import (
+    DEADLINE,
+    Client,
+    Connect,
+    LifterProcess,
+    StartLifter,
+    lifters,
+    own_domain,
+    write_models,
+)
 from test.node.test_lifter import cloud, multi_array, pixels
 
 NAMESPACED = ("-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-r", "__ns:=/robot1", "--")
@@ -23,7 +35,9 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LifterPr
     """Start a lifter in a namespace, with a frame for arrays, and a client of it."""
     folder = tmp_path_factory.mktemp("running")
     with own_domain() as number, lifters(write_models(folder / "models"), folder) as start:
-        lifter = start(NAMESPACED, input_type=MULTI_ARRAY, frame_id="optical")
+        lifter = start(
+            NAMESPACED, input_type=MULTI_ARRAY, frame_id="optical", keypoints_layout="coco17"
+        )
         client = Client(number)
         client.listen("/robot1/lifter/points", PointCloud2)
         yield lifter, client
@@ -56,8 +70,39 @@ def test_keypoints_without_a_header_get_the_frame_of_the_parameter(
     client.destroy_publishers()
 
 
+def test_a_parameter_that_does_not_exist_is_warned_of_with_the_nearest_name(
+    running: tuple[LifterProcess, Client],
+) -> None:
+    lifter, _ = running
+    lifter.wait_for_log(
+        "there is no parameter 'keypoints_layout'; its value is not used; do you mean "
+        "'keypoint_layout'?"
+    )
+    assert lifter.log.count("there is no parameter") == 1
+
+
+def test_a_name_that_is_taken_is_warned_of(
+    running: tuple[LifterProcess, Client], tmp_path: Path
+) -> None:
+    with lifters(write_models(tmp_path / "models"), tmp_path) as start:
+        start(NAMESPACED, input_type=MULTI_ARRAY).wait_for_log(
+            "another node is named /robot1/lifter"
+        )
+
+
+def test_a_lifter_ends_with_the_launch_that_started_it(
+    start_lifter: StartLifter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with subprocess.Popen(["sleep", "600"]) as launch:
+        monkeypatch.setenv(LAUNCH_PID, str(launch.pid))
+        lifter = start_lifter()
+        launch.kill()
+    assert lifter.process.wait(DEADLINE) == 0, lifter.log
+    assert "the launch that started this node has ended" in lifter.log
+
+
 def test_points_without_a_frame_and_a_frame_that_is_not_used_are_warned_of(
-    start_lifter: Any, connect: Any
+    start_lifter: StartLifter, connect: Connect
 ) -> None:
     """A header with a frame has precedence over the parameter."""
     lifter = start_lifter(frame_id="optical")

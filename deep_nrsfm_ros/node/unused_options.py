@@ -1,0 +1,32 @@
+"""Options that are set and cannot have an effect, with the reason."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.pipeline import InputOptions
+
+
+def unused_options(
+    inputs: InputOptions, lifting: LiftingOptions, smoothing: SmoothingOptions
+) -> dict[str, str]:
+    """Return a warning for each parameter of the lifter that has no effect, by its name."""
+    warnings: dict[str, str] = {}
+    size = {"image_width": inputs.image_width, "image_height": inputs.image_height}
+    if any(size.values()) and not all(size.values()):
+        given, missing = sorted(size, key=lambda name: not size[name])
+        text = f"{given} is {size[given]} and has no effect without {missing}: set both"
+        warnings |= dict.fromkeys(size, text)
+    if lifting.correction == "none" and lifting.noise != LiftingOptions.noise:
+        text = f"noise is {lifting.noise:g} and has no effect, since correction is 'none'"
+        warnings["noise"] = text
+    if not smoothing.enabled:
+        for field in fields(SmoothingOptions):
+            value = getattr(smoothing, field.name)
+            if value != field.default:
+                name = f"smoothing.{field.name}"
+                text = f"{name} is {value:g} and has no effect, since smoothing.enabled is false"
+                warnings[name] = text
+    return warnings

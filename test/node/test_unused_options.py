@@ -1,0 +1,34 @@
+"""Options that cannot have an effect are warned of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.node.unused_options import unused_options
+
+DEFAULTS = (InputOptions(), LiftingOptions(), SmoothingOptions())
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (InputOptions(image_width=1280), "image_width is 1280 and has no effect without image_h"),
+        (InputOptions(image_height=720), "image_height is 720 and has no effect without image_w"),
+        (SmoothingOptions(beta=2.0), "smoothing.beta is 2 and has no effect, since smoothing.ena"),
+        (LiftingOptions(correction="none", noise=0.1), "noise is 0.1 and has no effect, since cor"),
+    ],
+)
+def test_an_option_without_effect_is_warned_of(options: Any, expected: str) -> None:
+    given: Any = [options if type(options) is type(other) else other for other in DEFAULTS]
+    assert expected in " ".join(unused_options(*given).values())
+
+
+def test_options_with_an_effect_are_not_warned_of() -> None:
+    inputs = InputOptions(image_width=1280, image_height=720)
+    assert not unused_options(inputs, LiftingOptions(noise=0.1), SmoothingOptions(True, beta=2.0))
+    assert not unused_options(*DEFAULTS)
