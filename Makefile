@@ -9,7 +9,8 @@
 # make benchmark-speed     speed against floors and other ways, side by side; DATA=DIR adds time_to_error
 # make audit       known vulnerabilities of the pins in requirements.lock
 # make lock        resolve requirements.lock anew
-# make clean       remove what building and testing left; .venv and downloads stay
+# make clean       remove what building and testing left; .venv, downloads, models and recordings stay
+# make clean-demo  remove what the demos left in demo_output, with the model that they trained
 #
 # The environment .venv is made on first use: make PYTHON3=python3.12 chooses its Python.
 
@@ -44,7 +45,7 @@ READY := .venv/.ready
 # Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
 EXAMPLES_READY := .venv/.ready-examples
 
-.PHONY: demo demo-live test lint sanitize fuzz benchmark benchmark-speed audit lock clean reference
+.PHONY: demo demo-live test lint sanitize fuzz benchmark benchmark-speed audit lock clean clean-demo reference
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo
@@ -130,6 +131,9 @@ lock:
 	mv build/lock/requirements.lock requirements.lock
 
 clean:
-	rm -rf build install log dist demo_output .hypothesis .pytest_cache .ruff_cache .mypy_cache
+	rm -rf build dist .hypothesis .pytest_cache .ruff_cache .mypy_cache
 	rm -rf *.egg-info
 	find deep_nrsfm_ros benchmarks examples test launch -name __pycache__ -type d -prune -exec rm -rf {} +
+
+clean-demo:
+	rm -rf demo_output

@@ -11,7 +11,6 @@ import argparse
 import dataclasses
 import shutil
 import subprocess
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 
 from deep_nrsfm_ros.commands.demo.__main__ import LOG, evaluate, fetch_wheel, launch, say
-from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter, node
+from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Info, Played, lifter, node
 from deep_nrsfm_ros.data.pose2sim import View, extract_videos, read_session
 from deep_nrsfm_ros.layouts.presets import MEDIAPIPE33
 from deep_nrsfm_ros.lifting.observation import Observation
@@ -53,8 +52,8 @@ class Listener(Client):
     def hear(self, detector: subprocess.Popen[bytes]) -> tuple[Played, Observation]:
         """Return how the lifter answered a detector that runs to its end, and what that saw.
 
-        Latencies are those between hearing the keypoints and hearing the lifted points. Raises
-        DemoError if either of the two fails.
+        Latencies are those between the detector's publishing the keypoints and hearing the lifted
+        points. Raises DemoError if either of the two fails.
         """
         self._forget()
         self._heard.clear()
@@ -74,10 +73,10 @@ class Listener(Client):
             lambda: len(self._heard) > count or detector.poll() is not None, "the next keypoints"
         )
 
-    def _take_keypoints(self, message: PointCloud2) -> None:
-        """Note when a detection came, and what it is; all points are missing where nobody is."""
+    def _take_keypoints(self, message: PointCloud2, info: Info) -> None:
+        """Note when a detection was published, and its points, all missing where nobody is."""
         stamp = message.header.stamp
-        self._heard[stamp.sec * 1_000_000_000 + stamp.nanosec] = time.perf_counter()
+        self._heard[stamp.sec * 1_000_000_000 + stamp.nanosec] = 1e-9 * info["source_timestamp"]
         seen = read_observation(message, POINT_CLOUD, len(MEDIAPIPE33))
         q = len(MEDIAPIPE33)
         nobody = Observation(np.zeros((1, q, 2), np.float32), np.zeros((1, q), np.float32))

@@ -14,7 +14,8 @@ from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import HEIGHT_18, TrialSelection, read_split
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
-from deep_nrsfm_ros.model_files.model_file import Model, load_model
+from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
+from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
 
 CONVENTIONS = {
@@ -26,6 +27,8 @@ CONVENTIONS = {
     "unscaled %": "as proper, without rescaling",
 }
 """What each figure of `figures` means."""
+OF_TRAIN = Path("models")
+"""Where `train` writes, unless `--output` says otherwise."""
 ALONE = LiftingOptions(correction="none", test_time_rotations=1, mirror=False)
 LIFTING = {
     "network alone": ALONE,
@@ -45,7 +48,10 @@ def arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program_name("evaluate"), description=__doc__)
     parser.add_argument("models", nargs="+", help="model files, or names of models")
     parser.add_argument(
-        "--models-dir", type=Path, default=Path("models"), help="searched before the package's own"
+        "--models-dir",
+        type=Path,
+        help="folder of models, searched before those of the package (default: ./models, where "
+        f"train writes, and {default_models_dir()}, where the lifter's training writes)",
     )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--cmu", type=Path, help="folder of the CMU database")
@@ -65,6 +71,24 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--stride", type=int, default=1, help="take every n-th frame")
     parser.add_argument("--camera-seed", type=int, default=0, help="cameras as in training: 0")
     return parser
+
+
+def find_models(names: Sequence[str], models_dir: Path | None) -> list[Model]:
+    """Return models by name or path, from `models_dir` or where trainings write.
+
+    Args:
+        names: names of models, or paths of model files.
+        models_dir: searched before the folders of the package; None: ./models and then the
+            lifter's folder.
+
+    Raises:
+        ModelFileError: there is no such model, or its file cannot be used.
+    """
+    if models_dir:
+        folders = model_folders(models_dir.expanduser())
+    else:
+        folders = [OF_TRAIN, *model_folders(default_models_dir())]
+    return [load_model(find_model(name, folders)) for name in names]
 
 
 def reconstruct(lifter: Lifter, dataset: Dataset) -> NDArray[np.float32]:
@@ -100,7 +124,7 @@ def compare_cameras(args: argparse.Namespace) -> None:
         print(f"failed: {error}; install deep_nrsfm_ros[benchmarks]", file=sys.stderr)
         sys.exit(2)
     try:
-        models = [load_model(m, args.models_dir) for m in args.models]
+        models = find_models(args.models, args.models_dir)
         session = read_session(args.pose2sim)
         print(camera_table(models, session), flush=True)
     except (ValueError, OSError) as error:
@@ -117,10 +141,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         compare_cameras(args)
         return
     columns = ("model", "lifted", *CONVENTIONS)
-    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
     try:
-        for name in args.models:
-            model = load_model(name, args.models_dir)
+        models = find_models(args.models, args.models_dir)
+        print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+        for model in models:
             selection = TrialSelection(
                 args.cmu, args.subjects, args.split, args.stride, args.camera_seed
             )

@@ -1,4 +1,4 @@
-"""List the models that the lifter can be args, with their label-free quality and provenance."""
+"""List the models that the lifter can use, with their label-free quality and provenance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ COLUMNS = ("model", "object", "keypoints", "reprojection", "cycle", "date")
 QUALITY = ("reprojection_error", "cycle_error")
 EXPLANATION = (
     "reprojection, cycle: label-free errors on the data of the training, relative, less is better; "
-    "they compare models of the same data"
+    "they compare models of the same data; - = not recorded. A date with ~ is that of the file, "
+    "since the model does not record the day of its training"
 )
 
 

@@ -1,4 +1,4 @@
-"""What all programs have in common: their end when nobody reads on, and their name in usages."""
+"""What all programs have in common: how they end early, and their name in usages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def program(main: Main) -> Callable[..., None]:
 
     When nobody reads its output any more (`models | head`), the program ends silently. Python
     would ignore SIGPIPE and raise BrokenPipeError wherever something is printed, at its own end
-    too.
+    too. Ctrl-C ends it with a word and exit code 130, without a traceback.
     """
 
     @functools.wraps(main)
@@ -26,6 +26,9 @@ def program(main: Main) -> Callable[..., None]:
         handler = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         try:
             main(argv)
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            sys.exit(128 + signal.SIGINT)
         finally:
             sys.stdout.flush()  # output in the buffer is written while SIGPIPE still ends us
             signal.signal(signal.SIGPIPE, handler)

@@ -16,6 +16,7 @@ import pytest
 
 import deep_nrsfm_ros
 from deep_nrsfm_ros.commands.demo.__main__ import WHEEL, fetch_wheel
+from deep_nrsfm_ros.commands.demo.client import Played
 from deep_nrsfm_ros.commands.demo.evaluation import read_points
 from deep_nrsfm_ros.data.cameras import Camera
 from deep_nrsfm_ros.layouts.presets import HUMAN17
@@ -46,6 +47,12 @@ def test_a_download_that_fails_says_what_to_do(
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(OSError, match=f"put {WHEEL} into {tmp_path}"):
         fetch_wheel(tmp_path)
+
+
+def test_a_latency_below_zero_is_no_latency() -> None:
+    assert Played([1, 2], [0.002, 0.004], 30.0, 0.1).latency(50) == pytest.approx(3.0)
+    assert np.isnan(Played([1, 2], [0.002, -0.00026], 30.0, 0.1).latency(99))
+    assert np.isnan(Played([1, 2], [], 30.0, 0.1).latency(50))
 
 
 @pytest.fixture
@@ -93,6 +100,7 @@ def test_demo_from_wheel_to_trained_model(start: Start, tmp_path: Path) -> None:
     output = tmp_path / "output"
     table = [line.split() for line in said.splitlines() if line.lstrip().startswith(("cam", "mea"))]
     assert [row[0] for row in table] == ["camera", "cam01", "cam02", "cam03", "cam04", "mean"]
+    assert all(float(row[4]) > 0 for row in table[1:])
     assert all(row[1] == "30" and 15 <= float(row[2]) <= 30 for row in table[1:])
     assert len(read_points(output / "lifted")) >= 60
     assert (output / "demo.png").read_bytes().startswith(b"\x89PNG")

@@ -129,3 +129,12 @@ def test_the_default_is_the_lifters_folder(
     models.main([])
     lines = capsys.readouterr().out.splitlines()
     assert {"human", "cmu31"} <= {line.split()[0] for line in lines if line}
+
+
+def test_the_date_of_a_file_is_explained(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(folders[0] / "old.safetensors", provenance={"data": "bags"})
+    said = listing(capsys, folders[0])
+    assert said[1].split()[-1].startswith("~")
+    assert "A date with ~ is that of the file" in " ".join(said)

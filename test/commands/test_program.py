@@ -6,9 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+
+from deep_nrsfm_ros.commands.program import program
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
@@ -37,3 +40,14 @@ def test_a_reader_that_leaves_ends_a_program_silently(name: str, tmp_path: Path)
     assert done.stderr.count("\n") <= (name == "evaluate"), done.stderr
     assert "Traceback" not in done.stderr and "BrokenPipe" not in done.stderr
     assert done.returncode == -signal.SIGPIPE
+
+
+def test_ctrl_c_ends_a_program_with_a_word(capsys: pytest.CaptureFixture[str]) -> None:
+    @program
+    def main(_: Sequence[str] | None = None) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as end:
+        main([])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "interrupted\n"

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter
+from deep_nrsfm_ros.commands.demo.client import NO_LATENCY, Client, DemoError, Played, lifter
 from deep_nrsfm_ros.commands.demo.evaluation import read_points, table
 from deep_nrsfm_ros.commands.demo.picture import Panel, draw
 from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
@@ -175,11 +175,9 @@ def train(client: Client, cameras: Sequence[str]) -> None:
         print(f"  {client.training['state']}: {done} of {steps} steps", flush=True)
     if client.training["state"] != "finished":
         raise DemoError(f"training {client.training['state']}: {client.training['message']}")
-    print(
-        f"  lifted during training: {len(latencies)} of {sent} messages, "
-        f"p50 {np.percentile(latencies, 50) * 1e3:.2f} ms, "
-        f"p99 {np.percentile(latencies, 99) * 1e3:.2f} ms"
-    )
+    p50, p99 = (Played([], latencies, 0.0, 0.0).latency(percent) for percent in (50, 99))
+    text = NO_LATENCY if np.isnan(p50) else f"p50 {p50:.2f} ms, p99 {p99:.2f} ms"
+    print(f"  lifted during training: {len(latencies)} of {sent} messages, {text}")
     say(client.training["message"])
     client.wait(lambda: client.health["model"] == TRAINED, "the change of models")
     played = client.play(cameras[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -27,6 +28,14 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+
+Info = Mapping[str, Any]
+"""Of a message: `source_timestamp` and `received_timestamp` in ns of the system's clock."""
+
+NO_LATENCY = (
+    "no latency, since points arrived before their keypoints were sent: the clock was set "
+    "meanwhile, or sender and receiver have different clocks"
+)
 
 _TIMEOUT = 60.0  # seconds
 _LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -81,7 +90,8 @@ class Played(NamedTuple):
 
     Attributes:
         stamps: of the messages sent, ns.
-        latencies: from publishing keypoints to receiving points, of the messages lifted, seconds.
+        latencies: from publishing keypoints to receiving points, of the messages lifted, seconds;
+            negative where two clocks were compared.
         rate: points received per second, Hz.
         error: median of the reprojection errors in the diagnostics.
     """
@@ -92,7 +102,9 @@ class Played(NamedTuple):
     error: float
 
     def latency(self, percent: float) -> float:
-        """Return a percentile (0 to 100) of the latencies in ms."""
+        """Return a percentile (0 to 100) of the latencies in ms; NaN if one is negative."""
+        if not self.latencies or min(self.latencies) < 0:
+            return math.nan
         return float(np.percentile(self.latencies, percent)) * 1e3
 
 
@@ -127,7 +139,7 @@ class Client:
         self._errors: list[float] = []
         self._publisher = self._node.create_publisher(PointCloud2, "keypoints", 10)
         self._record(PointCloud2, "/lifter/points", self._take_points)
-        self._record(QuaternionStamped, "/lifter/camera_rotation", lambda message: None)
+        self._record(QuaternionStamped, "/lifter/camera_rotation", lambda *_: None)
         self._record(DiagnosticArray, "/diagnostics", self._take_report)
         self._record(DiagnosticStatus, "/lifter/training_status", self._take_training, _LATCHED)
 
@@ -166,7 +178,8 @@ class Client:
         begin = time.perf_counter() - messages[0][0] / 1e9
         for stamp, raw in messages:
             self._spin_until(begin + stamp / 1e9)
-            sent[stamp] = time.perf_counter()
+            self._received.pop(stamp, None)  # the answer to an earlier message of this stamp
+            sent[stamp] = time.time()
             self._publisher.publish(raw)
         return self._played(sent)
 
@@ -234,30 +247,37 @@ class Client:
             self._executor.spin_once(timeout_sec=left)
 
     def _record(
-        self, kind: Any, topic: str, take: Callable[[Any], None], qos: QoSProfile | int = 100
+        self, kind: Any, topic: str, take: Callable[[Any, Info], None], qos: QoSProfile | int = 100
     ) -> None:
-        """Record every message of a topic in the bag, and pass it to `take`."""
+        """Record every message of a topic in the bag, and pass it to `take`.
+
+        Its `Info` has the times at which the middleware sent and received it, in ns of the system's
+        clock. The time of a callback is later, and callbacks of two topics may change places.
+        """
         package, name = kind.__module__.split(".")[0], kind.__name__
         connection = self._writer.add_connection(topic, f"{package}/msg/{name}", typestore=_STORE)
 
-        def receive(raw: bytes) -> None:
-            take(deserialize_message(raw, kind))
+        def receive(raw: bytes, info: Info) -> None:
+            take(deserialize_message(raw, kind), info)
             self._writer.write(connection, time.time_ns(), raw)
 
-        self._node.create_subscription(kind, topic, receive, qos, raw=True)
+        callback: Any = receive  # rclpy's types leave out callbacks that take the info
+        self._node.create_subscription(kind, topic, callback, qos, raw=True)
 
-    def _take_points(self, message: PointCloud2) -> None:
+    def _take_points(self, message: PointCloud2, info: Info) -> None:
         """Keep the time at which points were received."""
-        self._received[_stamp(message.header)] = time.perf_counter()
+        self._received[_stamp(message.header)] = 1e-9 * (
+            info["received_timestamp"] or time.time_ns()
+        )
 
-    def _take_report(self, message: DiagnosticArray) -> None:
+    def _take_report(self, message: DiagnosticArray, _: Info) -> None:
         """Keep the values of the latest diagnostics."""
         for status in message.status:
             if status.name == "/lifter: lifting":
                 self.health = {pair.key: pair.value for pair in status.values}
                 self._errors.append(float(self.health["reprojection error"]))
 
-    def _take_training(self, message: DiagnosticStatus) -> None:
+    def _take_training(self, message: DiagnosticStatus, _: Info) -> None:
         """Keep the latest training status."""
         values = {pair.key: pair.value for pair in message.values}
         self.training = values | {"message": message.message}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from deep_nrsfm_ros.commands.demo.client import Played
+from deep_nrsfm_ros.commands.demo.client import NO_LATENCY, Played
 from deep_nrsfm_ros.data.pose2sim import Session
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 
@@ -72,9 +72,13 @@ def table(
     lines = [["camera", *_COLUMNS]]
     for name, row in zip(names, [*rows, np.mean(rows, 0)], strict=True):
         formats = zip(_COLUMNS.values(), row, strict=True)
-        lines.append([name, *(f"{value:{form}}" for form, value in formats)])
+        cells = ("-" if np.isnan(value) else f"{value:{form}}" for form, value in formats)
+        lines.append([name, *cells])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
+    text = [
         "  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True))
         for line in lines
-    )
+    ]
+    if any(np.isnan(run.latency(50)) for run in played):
+        text.append(f"-: {NO_LATENCY}")
+    return "\n".join(text)

@@ -1,0 +1,26 @@
+"""Where `evaluate` looks for models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from deep_nrsfm_ros.commands.evaluate import find_models
+from deep_nrsfm_ros.model_files.model_file import ModelFileError
+from deep_nrsfm_ros.training.config import OutputConfig
+from test.commands.test_models import save
+
+
+def test_models_are_found_where_trainings_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROS_HOME", str(tmp_path / "ros"))
+    save(tmp_path / OutputConfig().folder / "by_command.safetensors")
+    save(tmp_path / "ros" / "deep_nrsfm_ros" / "models" / "by_node.safetensors")
+    save(tmp_path / "runs" / "elsewhere.safetensors")
+    assert len(find_models(["by_command", "by_node", "human"], None)) == 3
+    assert len(find_models(["elsewhere", "human"], Path("runs"))) == 2
+    with pytest.raises(ModelFileError, match="by_command, by_node"):
+        find_models(["absent"], None)
