@@ -113,7 +113,7 @@ def count_keypoints(message: Any, input_type: InputType) -> int:
     """
     mapping = _mapping(input_type)
     if mapping:
-        return mapping.count(message)
+        return mapping.keypoint_count(message)
     if input_type == POINT_CLOUD:
         return int(message.width) if int(message.height) else 0
     if input_type == POLYGON:

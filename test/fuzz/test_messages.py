@@ -26,7 +26,7 @@ from test.fuzz.conftest import Bench, Fuzz, Spoiler
 
 KINDS = (POINT_CLOUD, MULTI_ARRAY, POLYGON)
 BY_NUMBER = FieldMapping(
-    "my_msgs/Thing", keypoints="parts.list", confidence="sure", keypoint_id="which", missing=-1.0
+    "my_msgs/Thing", keypoints="parts.list", confidence="sure", keypoint_id="which", missing=(-1.0,)
 )
 BY_NAME = FieldMapping(
     "my_msgs/Zoo",

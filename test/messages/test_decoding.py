@@ -315,7 +315,7 @@ def test_arbitrary_multi_array_is_read_or_refused(
 
 @pytest.mark.parametrize("input_type", INPUT_TYPES)
 def test_message_of_another_type_is_refused(input_type: str) -> None:
-    with pytest.raises(MessageError, match=f"expected a message of type {input_type}"):
+    with pytest.raises(MessageError, match=f"message of type {input_type}"):
         read_observation(SimpleNamespace(header=None), input_type, 5)
 
 

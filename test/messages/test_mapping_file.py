@@ -18,6 +18,10 @@ y: place.v
 confidence: sure
 keypoint_id: label
 names: [head, tail]
+where: valid
+count: size
+counts: {0: 2}
+max_confidence: 100
 units: normalised
 missing: -1
 first_id:
@@ -38,7 +42,11 @@ def test_every_field_is_read(tmp_path: Path) -> None:
         keypoint_id="label",
         names=("head", "tail"),
         units="normalised",
-        missing=-1,
+        where="valid",
+        count="size",
+        counts=((0, 2),),
+        max_confidence=100,
+        missing=(-1,),
     )
 
 
@@ -64,7 +72,29 @@ def test_the_first_explains_every_field() -> None:
         ("type: a/B\nkeypoints: k\nunits: []", "units is a list"),
         ("type: a/B\nkeypoints: 'k.'", "keypoints is 'k.'; it must be a field"),
         ("type: a/B\nkeypoints: k\nx: _dict__.a", "x is '_dict__.a'"),
-        ("type: a/B\nkeypoints: [k]", "keypoints is a list"),
+        ("type: a/B\nkeypoints: [[k]]", "keypoints is a list; it must be a field"),
+        ("type: a/B\nkeypoints: {a: k}", "keypoints is a mapping; it must be a field"),
+        ("type: a/B\nkeypoints: [a, b]\nkeypoint_id: i", "keypoints names a field for each"),
+        ("type: a/B\nkeypoints: [a, b]\ncount: n", "count is there, but keypoints names a field"),
+        ("type: a/B\nkeypoints: [a, 'b[]']", "keypoints is 'b[]'; it must lead to one value"),
+        ("type: a/B\nkeypoints: /k", "it begins at the object, without /"),
+        ("type: a/B\nobjects: /k\nkeypoints: k", "it begins at the message, without /"),
+        ("type: a/B\nkeypoints: k\nx: kp.0", "an index is in brackets: kp[0]"),
+        ("type: a/B\nkeypoints: k\nx: kp[-1]", "x is 'kp[-1]'; it must be a field"),
+        ("type: a/B\nkeypoints: k\nx: 'kp[0::0]'", "it must be a field"),
+        ("type: a/B\nkeypoints: k\nx: 'xs[]'", "leave out keypoints where x and y are lists"),
+        ("type: a/B\nkeypoints: k\nx: [a, b]", "leave out keypoints where x and y are lists"),
+        ("type: a/B\nkeypoints: k\nkeypoint_id: /names", "leave out keypoints where"),
+        ("type: a/B\nx: xs", "or x and y, the lists of their coordinates"),
+        ("type: a/B\nx: [a, b]\ny: [c]", "x, y and confidence name 2, 1 fields"),
+        ("type: a/B\nx: a\ny: b\nidentity: 'c[]'", "it must lead to one value, without []"),
+        ("type: a/B\nkeypoints: k\ncount: n\ncounts: [18]", "like {0: 18, 1: 34}"),
+        ("type: a/B\nkeypoints: k\ncounts: {0: 18}", "but no count whose values they are"),
+        ("type: a/B\nkeypoints: k\nmissing: none", "a list of numbers, or negative"),
+        ("type: a/B\nkeypoints: k\nmax_confidence: 0", "max_confidence is 0; it must be above"),
+        ("type: a/B\nkeypoints: k\nfirst_id: 1", "there is no keypoint_id that counts from it"),
+        ("type: a/B\nkeypoints: k\nkeypoint_id: i\nnames: [a]\nfirst_id: 1", "have names"),
+        ("type: a/B\nkeypoints: k\nunits: [224]", "like [224, 224]"),
         ("type: a/B\nkeypoints: k\nfirst_id: one", "first_id is 'one'; it must be a number"),
         ("type: a/B\nkeypoints: k\nmissing: true", "missing is True"),
         ("type: a/B\nkeypoints: k\nnames: [a, b]", "no keypoint_id"),
