@@ -1,4 +1,4 @@
-"""Train a model from recorded bags or motion capture: 2D keypoints in, one model file out."""
+"""Train a model from bags and files of 2D keypoints, or motion capture: one model file out."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pathlib import Path
 from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.data.keypoint_files import KINDS
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -33,11 +34,20 @@ def parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=program_name("train"), description=__doc__, argument_default=argparse.SUPPRESS
     )
-    data = parser.add_argument_group("Data (bags or motion capture)")
+    data = parser.add_argument_group("Data (bags and files, or motion capture)")
     data.add_argument("--bag", dest="bags", type=Path, action="append", help="bag; repeatable")
-    data.add_argument("--topic", help="keypoint topic (default: the only one)")
     data.add_argument(
-        "--keypoint-layout", help="order of the keypoints in the bags (default: that of the object)"
+        "--input",
+        dest="inputs",
+        metavar="INPUT",
+        type=Path,
+        action="append",
+        help=f"keypoints beside the bags, of any kind that `lift` reads; repeatable: {KINDS}",
+    )
+    data.add_argument("--topic", help="keypoint topic of the bags (default: the only one)")
+    data.add_argument(
+        "--keypoint-layout",
+        help="order of the keypoints in bags and files (default: that of the object)",
     )
     data.add_argument(
         "--min-confidence",

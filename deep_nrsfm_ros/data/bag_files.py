@@ -27,6 +27,7 @@ SUFFIXES = (".db3", ".mcap", ".bag")
 """Suffixes of the files of bags: SQLite and MCAP of ROS 2, and .bag of ROS 1."""
 
 _METADATA = "metadata.yaml"
+_LARGE = 2**28  # bytes of a bag that take seconds to read
 _ROS1_MAGIC = b"#ROSBAG V"
 _NO_METADATA = "it has no metadata.yaml, as after a recorder that was killed"
 
@@ -197,6 +198,22 @@ def open_bag(path: Path) -> BagFile:
         bag.close()
         raise BagError(f"bag {path} cannot be read: {problem}{_advice(path, not_allowed)}")
     return bag
+
+
+def opens_quickly(path: Path) -> bool:
+    """Return whether `open_bag` takes milliseconds, not the time to read all of the bag.
+
+    It does not where files are compressed as a whole, or large and without a readable index.
+    """
+    files = list(path.iterdir()) if path.is_dir() else [path]
+    if sum(file.stat().st_size for file in files if file.is_file()) < _LARGE:
+        return True
+    with suppress(Exception):
+        if path.is_dir() and "compression_mode: file" in (path / _METADATA).read_text().lower():
+            return False
+        (_Ros1 if is_ros1(path) else _Sound)(path).close()
+        return True
+    return False
 
 
 def _readers_of(file: Path) -> tuple[Callable[[Path], _Storage], ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,6 +42,10 @@ _SAMPLE = 256  # messages of a bag that `keypoint_count` looks at
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
+class TooManyFramesError(BagError):
+    """The bags have more frames than may be read."""
+
+
 class BagReading(NamedTuple):
     """The result of `read_bags`.
 
@@ -50,7 +54,8 @@ class BagReading(NamedTuple):
         messages: number of messages on the topic, readable or not.
         unreadable: number of them that could not be read.
         reason: why the first unreadable message could not be read; "" if all could.
-        warnings: a sentence for each damaged bag that says what is missing.
+        warnings: a sentence for each damaged bag that says what is missing, and for each bag that
+            was left out, since nothing of it can be used.
     """
 
     dataset: Dataset
@@ -77,16 +82,24 @@ def read_bags(
         on_progress: called after every 256 messages.
 
     Raises:
-        BagError: a bag is missing, damaged beyond reading or without such a topic; no message is
-            readable; or there are more frames than `options.max_frames`. It names the bag.
+        BagError: every bag is missing, damaged beyond reading or without such a topic; no message
+            is readable; or there are more frames than `options.max_frames`. It names the bag.
     """
     builder, warnings = DatasetBuilder(KeypointMap(source, target), options.min_confidence), []
     messages, unreadable, reason = 0, 0, ""
     if not paths:
         raise BagError("no bag to read; name at least one")
-    for path in paths:
-        with closing(open_bag(Path(path))) as bag:
-            topics = keypoint_topics(bag, options.topic, options.mapping, len(source))
+    failures: list[BagError] = []
+    read: list[str] = []
+    for path in map(Path, paths):
+        with ExitStack() as stack:
+            try:
+                bag = stack.enter_context(closing(open_bag(path)))
+                topics = keypoint_topics(bag, options.topic, options.mapping, len(source))
+            except BagError as error:
+                failures.append(error)
+                continue
+            read.append(path.name)
             for topic, input_type, decode in topics:
                 before, reader = messages, MessageReader(input_type, decode)
                 for raw in bag.messages(topic):
@@ -97,7 +110,7 @@ def read_bags(
                         unreadable += 1
                         reason = reason or _reason(error)
                     if options.max_frames is not None and builder.count > options.max_frames:
-                        raise BagError(
+                        raise TooManyFramesError(
                             f"bag {path} brings the frames above {options.max_frames}, the most "
                             "that are read (max_frames); name fewer bags, or allow more"
                         )
@@ -105,9 +118,14 @@ def read_bags(
                         on_progress(messages, max(messages, before + topic.total))
                 if warning := bag.warning(topic):
                     warnings.append(warning)
-    names = ", ".join(path.name for path in map(Path, paths))
+    if not read:
+        raise failures[0]
+    warnings += [f"left out: {failure}" for failure in failures]
+    names = ", ".join(read)
     if messages == unreadable:
-        raise BagError(f"no readable message in {names} ({messages} found); {reason or 'empty'}")
+        raise BagError(
+            f"no readable message in {names} ({messages} found); {reason or 'its end is lost'}"
+        )
     if on_progress:
         on_progress(messages, messages)
     dataset = builder.dataset(f"bags {names}")
@@ -141,8 +159,14 @@ def keypoint_count(paths: Sequence[Path], options: ReadOptions = DEFAULT_READ_OP
     counts: Counter[int] = Counter()
     reason, may_omit = "", False
     for path in paths:
-        with closing(open_bag(Path(path))) as bag:
-            for topic, input_type, decode in keypoint_topics(bag, options.topic, options.mapping):
+        with ExitStack() as stack:
+            try:
+                bag = stack.enter_context(closing(open_bag(Path(path))))
+                topics = keypoint_topics(bag, options.topic, options.mapping)
+            except BagError as error:  # the others may do
+                reason = reason or str(error)
+                continue
+            for topic, input_type, decode in topics:
                 may_omit |= may_omit_keypoints(input_type)
                 for raw in islice(bag.messages(topic), _SAMPLE):
                     try:
@@ -156,7 +180,10 @@ def keypoint_count(paths: Sequence[Path], options: ReadOptions = DEFAULT_READ_OP
                         reason = reason or _reason(error)
     if not counts:
         names = ", ".join(path.name for path in map(Path, paths))
-        raise BagError(f"no message in {names} tells how many keypoints there are; {reason}")
+        nobody = f"its first {_SAMPLE} messages have no object"
+        raise BagError(
+            f"no message in {names} tells how many keypoints there are; {reason or nobody}"
+        )
     return max(counts) if may_omit else counts.most_common(1)[0][0]
 
 

@@ -88,7 +88,8 @@ class TrainingService:
             response.success, response.message = False, str(problem)
             return response
         self._name, self._activate_when_finished = config.output.name, request.activate
-        data = f"{config.data.topic} of {', '.join(map(str, config.data.bags))}"
+        topic = config.data.topic or "the keypoint topic"
+        data = f"{topic} of {', '.join(map(str, config.data.bags))}"
         if config.resume:
             data = "the data that it began with"
         response.success = True

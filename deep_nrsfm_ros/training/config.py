@@ -28,17 +28,18 @@ from deep_nrsfm_ros.training.limits import WHOLE, Limits
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Where the frames come from: bags of keypoints, or motion capture.
+    """Where the frames come from: bags and files of keypoints, or motion capture.
 
     Attributes:
-        bags: rosbag2 folders or files (.db3, .mcap); empty for motion capture.
+        bags: bag folders or files (.db3, .mcap, .bag of ROS 1); empty for motion capture.
+        inputs: files or folders of keypoints of any kind that `lift` reads, beside the bags.
         topic: keypoint topic in the bags, `*` allowed; "" is the only one.
-        keypoint_layout: order of the keypoints in the bags, as `find_layout` takes it; "" is the
-            layout of the model.
+        keypoint_layout: order of the keypoints in bags and files, as `find_layout` takes it; "" is
+            the layout of the model.
         min_confidence: keypoints of less confidence count as missing, 0 to 1.
         mapping: field mapping (.yaml) for messages of other types; "" is none.
         image_width, image_height: pixels, for keypoints given as shares of the image; 0 unknown.
-        cmu: folder of the CMU motion capture (NN/NN.asf, NN/*.amc); None for bags.
+        cmu: folder of the CMU motion capture (NN/NN.asf, NN/*.amc); None for keypoints.
         subjects: folders of the CMU subjects.
         all_trials: take all trials of a subject, not only the paper's first floor(0.8 N).
         stride: take every n-th CMU frame.
@@ -46,6 +47,7 @@ class DataConfig:
     """
 
     bags: tuple[Path, ...] = ()
+    inputs: tuple[Path, ...] = ()
     topic: str = ""
     keypoint_layout: str = ""
     min_confidence: float = 0.1
@@ -178,6 +180,7 @@ class TrainingConfig:
             data=dataclasses.replace(
                 data,
                 bags=tuple(map(_absolute, data.bags)),
+                inputs=tuple(map(_absolute, data.inputs)),
                 keypoint_layout=_absolute_file(data.keypoint_layout),
                 mapping=_absolute_file(data.mapping),
                 cmu=data.cmu and _absolute(data.cmu),
@@ -231,9 +234,10 @@ COMMAND_LINE = OptionNames(
     "-",
     {
         "bags": "--bag",
+        "inputs": "--input",
         "folder": "--output",
         "start": "--from",
-        "data": "--bag (repeatable), or --cmu with --subjects",
+        "data": "--bag and --input (both repeatable), or --cmu with --subjects",
     },
 )
 PARAMETERS = OptionNames(

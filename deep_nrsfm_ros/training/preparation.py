@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from deep_nrsfm_ros.data.bags import keypoint_count, read_bags
+import numpy as np
+
+from deep_nrsfm_ros.data.bag_files import BagError
+from deep_nrsfm_ros.data.bags import TooManyFramesError, keypoint_count, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation, curate
-from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.dataset import Dataset, concatenate
+from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.messages.mapping_file import read_mapping
+from deep_nrsfm_ros.lifting.sanity import check
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
-from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
+from deep_nrsfm_ros.training.config import COMMAND_LINE, DataConfig, TrainingConfig
 from deep_nrsfm_ros.training.reporter import Reporter
-from deep_nrsfm_ros.training.validation import find_layouts
+from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
 
 
 @dataclass(frozen=True)
@@ -51,19 +57,93 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
     options = ReadOptions(
         topic=data.topic,
         min_confidence=data.min_confidence,
-        mapping=read_mapping(Path(data.mapping).expanduser()) if data.mapping else None,
+        mapping=read_field_mapping(data.mapping),
         image_size=data.image_size,
         max_frames=config.limits.max_frames,
     )
     if config.object == NUMBERED:
-        source = target = KeypointLayout.numbered(keypoint_count(data.bags, options))
-    reading = read_bags(data.bags, source, target, options, reporter.reading)
+        source = target = _numbered(data, options)
+    parts = []
+    if data.bags:
+        try:
+            parts.append(_read_bags(data, KeypointMap(source, target), options, reporter))
+        except BagError as error:
+            if isinstance(error, TooManyFramesError) or not data.inputs:
+                raise
+            reporter.warn(f"left out: {error}")
+    if data.inputs:
+        parts.append(_read_inputs(data, KeypointMap(source, target), options, reporter))
+    dataset = concatenate(parts)
+    if len(dataset) > config.limits.max_frames:
+        raise ValueError(
+            f"bags and files have {len(dataset)} frames; at most {config.limits.max_frames} are "
+            "read (max_frames); name fewer files, or allow more"
+        )
+    for finding in check(dataset.points, dataset.visible.astype(np.float32), None, data.image_size):
+        reporter.warn(str(finding))
+    return dataset
+
+
+def _numbered(data: DataConfig, options: ReadOptions) -> KeypointLayout:
+    """Return the layout of points without names, as many as the objects in the data have."""
+    if data.bags:
+        return KeypointLayout.numbered(keypoint_count(data.bags, options))
+    first = read_keypoints(data.inputs[0].expanduser(), _options_for(data.inputs[0], options))
+    return KeypointLayout.numbered(first.confidence.shape[1])
+
+
+def _read_bags(
+    data: DataConfig, keypoint_map: KeypointMap, options: ReadOptions, reporter: Reporter
+) -> Dataset:
+    """Return all objects in the bags as one dataset, and report what could not be read."""
+    layouts = keypoint_map.source, keypoint_map.target
+    reading = read_bags(data.bags, *layouts, options, reporter.reading)
     for warning in reading.warnings:
         reporter.warn(warning)
     if reading.unreadable:
         count = f"{reading.unreadable} of {reading.messages}"
         reporter.warn(f"{count} messages could not be read: {reading.reason}")
     return reading.dataset
+
+
+def _read_inputs(
+    data: DataConfig, keypoint_map: KeypointMap, options: ReadOptions, reporter: Reporter
+) -> Dataset:
+    """Return all objects in the files as one dataset, those of one identity one after the other.
+
+    So near-duplicates of one person follow one another, as the curation expects. A file that
+    cannot be read is left out with a warning, unless none is left.
+    """
+    named = keypoint_map.source if data.keypoint_layout else None
+    options = dataclasses.replace(options, layout=named, fallback=keypoint_map.source)
+    parts, failures = [], []
+    for path in map(Path.expanduser, data.inputs):
+        try:
+            detections = read_keypoints(path, _options_for(path, options), reporter.reading)
+            layout = detections.layout or keypoint_map.source
+            to_target = KeypointMap(layout, keypoint_map.target)
+            if not len(detections):
+                raise ValueError(f"{path}: it has no object with keypoints")
+        except ValueError as error:  # of one file: the others may do
+            failures.append(error)
+            continue
+        for warning in detections.warnings:
+            reporter.warn(f"{path.name}: {warning}")
+        order = np.lexsort((detections.frame, detections.identities))
+        points, confidence = to_target(detections.points[order], detections.confidence[order])
+        parts.append(Dataset(points, confidence > 0, keypoint_map.target, f"file {path.name}"))
+    if not parts:
+        raise failures[0]
+    for failure in failures:
+        reporter.warn(f"left out: {failure}")
+    return concatenate(parts)
+
+
+def _options_for(path: Path, options: ReadOptions) -> ReadOptions:
+    """Return the options for a file: only a bag has a topic and a mapping."""
+    if path.exists() and is_bag(path):
+        return options
+    return dataclasses.replace(options, topic="", mapping=None)
 
 
 def prepare(curation: Curation, dataset: Dataset, reporter: Reporter) -> Prepared:

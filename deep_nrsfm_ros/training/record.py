@@ -72,6 +72,7 @@ def _summary(config: TrainingConfig) -> str:
     """Return data, object and steps of a training, e.g. "bags /a /b; topic /k; steps 300"."""
     values = {
         "bags": config.data.bags,
+        "inputs": config.data.inputs,
         "cmu": config.data.cmu,
         "topic": config.data.topic,
         "object": config.object,

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.data.bag_files import open_bag, opens_quickly
+from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
@@ -17,7 +21,7 @@ from deep_nrsfm_ros.training.config import PARAMETERS, DataConfig, OutputConfig,
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.record import checkpoint_file, record_file
 from deep_nrsfm_ros.training.resume import resume_request
-from deep_nrsfm_ros.training.validation import validate
+from deep_nrsfm_ros.training.validation import read_field_mapping, validate
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,11 @@ class TrainingOptions:
     """Data and result of the service ~/train: the parameters `train.*` that no other part has."""
 
     bags: tuple[str, ...] = option((), "rosbag2 folders or files to train on")
-    topic: str = option("", "topic in the bags; empty = the topic that the lifter listens to")
+    topic: str = option(
+        "",
+        "topic in the bags; empty = the topic that the lifter listens to, or where a bag lacks it, "
+        "the only topic with keypoints",
+    )
     object: str = option(
         "",
         "layout of the new model: a preset, the path of a layout file or of a model file, or "
@@ -125,10 +133,11 @@ def training_request(
     """
     options = sandboxed(parameters.options, sandbox)
     source, target = choose_layouts(options, lifter)
+    bags = tuple(Path(bag) for bag in options.bags)
     config = TrainingConfig(
         data=DataConfig(
-            bags=tuple(Path(bag) for bag in options.bags),
-            topic=options.topic or lifter.topic,
+            bags=bags,
+            topic=options.topic or choose_topic(bags, lifter),
             keypoint_layout=source,
             min_confidence=lifter.min_confidence,
             mapping=lifter.mapping,
@@ -146,6 +155,29 @@ def training_request(
     if options.from_:
         config = config.with_start(Path(options.from_))
     return TrainingRequest(config, options.activate)
+
+
+def choose_topic(bags: Sequence[Path], lifter: LifterInput) -> str:
+    """Return the topic that the lifter listens to, or the only one with keypoints in all the bags.
+
+    It is "" where each bag has another one, or where the lifter listens to no single topic. Bags
+    that cannot be used have no say: `validate` refuses them.
+    """
+    if not lifter.topic:
+        return ""
+    topics: set[str] = set()
+    for bag in bags:
+        with suppress(ValueError, OSError):
+            if not opens_quickly(bag):
+                continue
+            with closing(open_bag(bag)) as opened:
+                if any(t.name == lifter.topic for t in opened.topics if opened.has_messages(t)):
+                    return lifter.topic
+                mapping = read_field_mapping(lifter.mapping)
+                topics |= {found.topic.name for found in keypoint_topics(opened, "", mapping)}
+    if not topics:
+        return lifter.topic
+    return topics.pop() if len(topics) == 1 else ""
 
 
 def choose_layouts(options: TrainingOptions, lifter: LifterInput) -> tuple[str, str]:

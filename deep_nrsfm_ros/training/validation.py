@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 from deep_nrsfm_ros.configuration import options
+from deep_nrsfm_ros.data.bag_files import BagError, open_bag, opens_quickly
+from deep_nrsfm_ros.data.bag_topics import keypoint_topics
+from deep_nrsfm_ros.data.keypoint_files import is_bag
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.messages.field_mapping import FieldMapping
+from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
 from deep_nrsfm_ros.model_files.model_file import check_name, load_model
 from deep_nrsfm_ros.training.config import DataConfig, OptionNames, TrainingConfig
@@ -29,7 +35,7 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
         names: the names of the options in the messages.
 
     Returns:
-        A warning about the layout of the model, or "".
+        A warning about bags that cannot be used and the layout of the model, or "".
 
     Raises:
         ValueError: names the first option that is wrong, and says what to do.
@@ -48,7 +54,9 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
         check_fixed_options(start, config.preset, names)
     check_room(names("free_disk"), config.output.folder, config.limits.free_disk)
     require_extra("train", "training")
-    return "" if config.start else target.warning  # a start passes its handedness on
+    left_out = look_into_bags(config, names, source)
+    handedness = "" if config.start else target.warning  # a start passes its handedness on
+    return "; ".join(filter(None, (*left_out, handedness)))
 
 
 def find_layouts(
@@ -86,10 +94,10 @@ def _check_ranges(config: TrainingConfig, names: OptionNames) -> None:
 
 
 def _check_data(config: TrainingConfig, names: OptionNames) -> None:
-    """Raise ValueError unless there is data of exactly one kind, and each bag exists."""
-    if bool(config.data.bags) == bool(config.data.cmu):
-        raise ValueError(f"name what to train on: {names('data')}")
+    """Raise ValueError unless there is data of exactly one kind, and each bag or file exists."""
     data = config.data
+    if bool(data.bags or data.inputs) == bool(data.cmu):
+        raise ValueError(f"name what to train on: {names('data')}")
     if bool(data.image_width) != bool(data.image_height):
         raise ValueError(
             f"{names('image_width')} is {data.image_width} and {names('image_height')} is "
@@ -99,8 +107,48 @@ def _check_data(config: TrainingConfig, names: OptionNames) -> None:
     of_the_other = _OF_BAGS if data.cmu else _OF_CMU
     for name in of_the_other:
         if getattr(data, name) != getattr(default, name):
-            kind = "motion capture" if data.cmu else "bags"
+            kind = "motion capture" if data.cmu else "bags and files"
             raise ValueError(f"{names(name)} has no effect on {kind}: leave it out")
-    for bag in config.data.bags:
-        if not bag.expanduser().exists():
-            raise ValueError(f"{names('bags')} names {bag}, which does not exist")
+    for field in ("bags", "inputs"):
+        for path in getattr(data, field):
+            if not path.expanduser().exists():
+                raise ValueError(f"{names(field)} names {path}, which does not exist")
+    if data.topic and not (data.bags or data.cmu or any(map(is_bag, data.inputs))):
+        raise ValueError(f"{names('topic')} is {data.topic!r}, but there is no bag; leave it out")
+
+
+def look_into_bags(config: TrainingConfig, names: OptionNames, source: KeypointLayout) -> list[str]:
+    """Return a sentence for each bag that cannot be used, if others can.
+
+    It takes milliseconds, as it reads the index of each bag and the definitions of its types, and
+    16 messages at most of topics that may be meant. A damaged bag that is too large for that is
+    taken as it is.
+
+    Args:
+        config: names the bags, topic and mapping.
+        names: the names of the options in the messages.
+        source: layout of the messages; "numbered" where it is unknown.
+
+    Raises:
+        BagError: no bag or file is left.
+    """
+    data, failures = config.data, []
+    mapping = read_field_mapping(data.mapping) if data.bags else None
+    for bag in map(Path.expanduser, data.bags):
+        if not opens_quickly(bag):
+            continue
+        try:
+            with closing(open_bag(bag)) as opened:
+                keypoint_topics(opened, data.topic, mapping, len(source) or None)
+        except BagError as error:
+            failures.append(str(error))
+    if failures and len(failures) == len(data.bags) and not data.inputs:
+        more = f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""
+        named = f"{names('topic')} is {data.topic!r}: " if data.topic else ""
+        raise BagError(f"{named}{failures[0]}{more}")
+    return failures
+
+
+def read_field_mapping(file: str) -> FieldMapping | None:
+    """Return the field mapping in a file, None for ""; raise ValueError where it is damaged."""
+    return read_mapping(Path(file).expanduser()) if file else None

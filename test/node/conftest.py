@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 import deep_nrsfm_ros
+from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
@@ -102,8 +103,14 @@ def write_models(folder: Path) -> Path:
 
 @pytest.fixture
 def models(tmp_path: Path) -> Path:
-    """Return a folder of models: `person` of human17, `joints` of cmu31, a damaged `broken`."""
-    return write_models(tmp_path / "models")
+    """Return a folder of models: `person` of human17, `joints` of cmu31, a damaged `broken`.
+
+    Beside the last two lie bags of their names, which the stand-in of a training learns them from.
+    """
+    folder = write_models(tmp_path / "models")
+    for name in ("joints", "broken"):
+        write_bag(folder / name, "/keypoints", frames(np.ones((2, 17, 2)), np.ones((2, 17))))
+    return folder
 
 
 class LifterProcess:

@@ -92,7 +92,7 @@ def test_a_signal_at_any_moment_of_the_start_ends_it_with_code_0(start_lifter: S
 def test_a_signal_as_a_training_starts_leaves_no_process(
     start_lifter: StartLifter, connect: Connect, models: Path, number: signal.Signals
 ) -> None:
-    bag = str(models / "joints.safetensors")
+    bag = str(models / "joints")
     lifter = start_lifter(STAND_IN, train={"bags": [bag], "name": "wait"})
     client = connect()
     assert client.call("/lifter/train").success
@@ -104,7 +104,7 @@ def test_a_signal_as_a_training_starts_leaves_no_process(
 def test_a_training_that_ended_leaves_no_zombie(
     start_lifter: StartLifter, connect: Connect, models: Path
 ) -> None:
-    bag = str(models / "joints.safetensors")
+    bag = str(models / "joints")
     lifter = start_lifter(STAND_IN, train={"bags": [bag], "name": "crash"})
     client = connect()
     for _ in range(2):

@@ -280,9 +280,12 @@ def test_data_that_cannot_be_trained_on_is_refused_with_advice(
     flat = write(tmp_path / "flat", flat=True)
     start_lifter(train={"name": "fresh", "steps": 5, "seeds": 1, "batch": 8})
     client = connect()
+    client.set_parameters(train__bags=[good], train__topic="/elsewhere")
+    refused = client.call("/lifter/train")  # before the answer, not after it
+    assert not refused.success
+    assert "no topic called /elsewhere; its topics are: /keypoints" in refused.message
     for bag, topic, complaint in [
         (flat, "/keypoints", "a model cannot be learned from this: the views are flat"),
-        (good, "/elsewhere", "0 topics called /elsewhere; name one of: /keypoints"),
         (good, "", ""),
     ]:
         client.set_parameters(train__bags=[bag], train__topic=topic, train__min_change=0.0)

@@ -57,7 +57,7 @@ def test_a_training_from_request_to_use(
     assert not refused.success and "train.bags" in refused.message
     client.set_parameters(train__bags=[str(models / "nowhere")])
     assert "does not exist" in client.call("/lifter/train").message
-    bag = models / "joints.safetensors"
+    bag = models / "joints"
     assert client.set_parameters(train__bags=[str(bag)], train__name="../evil") == ""
     assert "../evil" in client.call("/lifter/train").message
     assert "Min: 1" in client.set_parameters(train__steps=0)
@@ -88,7 +88,7 @@ def test_a_training_that_fails_leaves_the_lifter_as_it_was(
 ) -> None:
     client = connect()
     publisher = client.publisher(Float32MultiArray)
-    client.set_parameters(train__bags=[str(models / "broken.safetensors")])
+    client.set_parameters(train__bags=[str(models / "broken")])
     for name, state, reason in [
         ("crash", "failed", "the dictionary caught fire"),
         ("refuse", "failed", "/nowhere is not in the bag"),
@@ -111,7 +111,7 @@ def test_signals_end_lifter_and_training(
     lifter: LifterProcess, connect: Connect, models: Path, number: signal.Signals, behaviour: str
 ) -> None:
     client = connect()
-    bag = str(models / "joints.safetensors")
+    bag = str(models / "joints")
     client.set_parameters(train__bags=[bag], train__name=behaviour)
     assert client.call("/lifter/train").success
     training = int(values(client.wait_for_training("training"))["session"])
@@ -124,7 +124,7 @@ def test_a_killed_lifter_leaves_no_training_behind(
     lifter: LifterProcess, connect: Connect, models: Path
 ) -> None:
     client = connect()
-    client.set_parameters(train__bags=[str(models / "joints.safetensors")], train__name="wait")
+    client.set_parameters(train__bags=[str(models / "joints")], train__name="wait")
     assert client.call("/lifter/train").success
     training = int(values(client.wait_for_training("training"))["session"])
     os.kill(lifter.process.pid, signal.SIGKILL)

@@ -48,7 +48,7 @@ def test_paths_outside_are_refused_and_the_lifter_goes_on(
         "keypoint_layout": str(outside / "door.yaml"),
         "from": str(stolen),
     }.items():
-        default: object = [str(models / "joints.safetensors")] if name == "bags" else ""
+        default: object = [str(models / "joints")] if name == "bags" else ""
         assert client.set_parameters(**{f"train__{name}": value}) == ""
         refused = client.call("/lifter/train")
         assert not refused.success and f"train.{name} names" in refused.message, refused.message
@@ -64,7 +64,7 @@ def test_paths_outside_are_refused_and_the_lifter_goes_on(
 def test_a_request_beyond_the_owners_limits_is_refused(
     start_lifter: StartLifter, connect: Connect, models: Path
 ) -> None:
-    train = {"bags": [str(models / "joints.safetensors")], "max_minutes": 5, "free_disk": 1e9}
+    train = {"bags": [str(models / "joints")], "max_minutes": 5, "free_disk": 1e9}
     start_lifter(STAND_IN, train=train)
     client = connect()
     refused = client.call("/lifter/train")

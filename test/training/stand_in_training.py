@@ -1,6 +1,6 @@
 """Stands in for the training command: speaks its protocol and behaves as its model is named.
 
-Its model is a copy of the first "bag".
+Its model is a copy of the one beside the first bag.
 """
 
 import argparse
@@ -51,7 +51,11 @@ def main() -> None:
     model = "new.safetensors"
     if config["data"]["bags"]:
         folder = Path(config["output"]["folder"])
-        model = str(shutil.copy(config["data"]["bags"][0], folder / f"{behaviour}.safetensors"))
+        model = str(
+            shutil.copy(
+                f"{config['data']['bags'][0]}.safetensors", folder / f"{behaviour}.safetensors"
+            )
+        )
     say("finished", message="done", model=model, step=2, steps=2)
 
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from deep_nrsfm_ros.commands.train import parser
+from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training.config import TrainingConfig
-from deep_nrsfm_ros.training.preparation import prepare
+from deep_nrsfm_ros.training.preparation import prepare, read_data
 from deep_nrsfm_ros.training.reporter import Reporter
 
 REPORTER = Reporter(as_json=False, should_stop=lambda: False)
@@ -48,3 +52,74 @@ def test_motion_capture_keeps_all_frames_by_default(
 def test_hopeless_data_is_refused() -> None:
     with pytest.raises(ValueError, match=r"cannot be learned from this: .*at least 10"):
         prepare(Curation(), people(3), REPORTER)
+
+
+def pixels(f: int, seed: int = 0) -> np.ndarray:
+    """Return (f, 17, 2) pixels."""
+    random = np.random.default_rng(seed)
+    return random.uniform(10, 900, (f, 17, 2)).astype(np.float32)
+
+
+def write_files(folder: Path) -> None:
+    """Write the same points in a bag, an .npz, COCO JSON with identities and OpenPose JSON."""
+    points, ones = pixels(6), np.ones((6, 17, 1))
+    write_bag(folder / "bag", "/keypoints", frames(points, ones[..., 0]))
+    np.savez(folder / "a.npz", points=points)
+    triples = np.concatenate([points, ones], -1).reshape(6, -1).tolist()
+    rows = [
+        {"image_id": i // 2, "category_id": 1, "track_id": 7 - i % 2, "keypoints": row}
+        for i, row in enumerate(triples)
+    ]
+    (folder / "coco.json").write_text(json.dumps(rows))
+    (folder / "openpose").mkdir()
+    for i, row in enumerate(triples):
+        frame = {"people": [{"pose_keypoints_2d": row}]}
+        (folder / "openpose" / f"{i:03}_keypoints.json").write_text(json.dumps(frame))
+
+
+def read(*words: str) -> Dataset:
+    """Return the data that a command line names."""
+    return read_data(TrainingConfig.from_arguments(parser().parse_args(words)), REPORTER)
+
+
+def test_files_are_trained_on_as_bags_are(tmp_path: Path) -> None:
+    write_files(tmp_path)
+    points, layout = pixels(6), ("--object", "human17")
+    for name in ("a.npz", "openpose", "bag"):
+        np.testing.assert_array_equal(read("--input", f"{tmp_path}/{name}", *layout).points, points)
+    by_identity = read("--input", f"{tmp_path}/coco.json", *layout)
+    np.testing.assert_allclose(by_identity.points, points[[1, 3, 5, 0, 2, 4]], rtol=1e-6)
+    both = read("--bag", f"{tmp_path}/bag", "--input", f"{tmp_path}/a.npz", *layout)
+    np.testing.assert_array_equal(both.points, np.concatenate([points, points]))
+    assert both.source == "bags bag; file a.npz"
+    for named in (("--input", f"{tmp_path}/coco.json"), ("--input", f"{tmp_path}/a.npz")):
+        assert read(*named, "--object", "numbered").layout.keypoints[16] == "point_16"
+
+
+def test_one_bad_file_is_left_out_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_files(tmp_path)
+    (tmp_path / "bad.json").write_text("no JSON")
+    nobody = np.zeros((0, 17, 2)), np.zeros((0, 17))
+    write_bag(tmp_path / "empty", "/keypoints", frames(*nobody))
+    words = [
+        word
+        for pair in (("--input", "bad.json"), ("--input", "a.npz"), ("--bag", "empty"))
+        for word in (pair[0], f"{tmp_path}/{pair[1]}")
+    ]
+    assert len(read(*words)) == 6
+    said = capsys.readouterr().err
+    assert "warning: left out: " in said and "bad.json" in said and "no message on /keypo" in said
+    with pytest.raises(ValueError, match=r"bad\.json"):
+        read("--input", f"{tmp_path}/bad.json")
+    with pytest.raises(ValueError, match="have 12 frames; at most 10"):
+        read("--input", f"{tmp_path}/a.npz", "--bag", f"{tmp_path}/bag", "--max-frames", "10")
+
+
+def test_keypoints_that_cannot_be_pixels_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.savez(tmp_path / "a.npz", points=pixels(50) / 1000)
+    read("--input", f"{tmp_path}/a.npz")
+    assert "warning: " in capsys.readouterr().err

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
@@ -25,6 +26,7 @@ from deep_nrsfm_ros.training.request import (
     TrainingParameters,
     TrainingRequest,
     choose_layouts,
+    choose_topic,
     training_request,
 )
 
@@ -36,7 +38,8 @@ PARTS = TrainingParameters(
     Limits(minutes=2.5, patience=0.25, keep_best=False),
     Curation(min_visible=7, min_change=0.25),
 )
-INPUT = LifterInput("/camera/keypoints", "coco17", MODEL, 0.25, "cats.yaml", 640, 480)
+MAPPING = str(Path(__file__).parents[2] / "config" / "mappings" / "media_pipe_ros2.yaml")
+INPUT = LifterInput("/camera/keypoints", "coco17", MODEL, 0.25, MAPPING, 640, 480)
 
 
 def request(folder: Path, **options: Any) -> TrainingRequest:
@@ -56,7 +59,7 @@ def test_every_parameter_reaches_the_configuration(tmp_path: Path) -> None:
             topic="/camera/keypoints",
             keypoint_layout="coco17",
             min_confidence=0.25,
-            mapping="cats.yaml",
+            mapping=MAPPING,
             image_width=640,
             image_height=480,
         ),
@@ -106,12 +109,38 @@ def test_layouts_are_those_of_the_parameters_or_of_the_lifter(
     assert choose_layouts(TrainingOptions(**options), lifter) == expected
 
 
+def write(folder: Path, *topics: str) -> None:
+    """Write a bag for each topic, called as its last part."""
+    for topic in topics:
+        path = folder / topic.split("/")[-1]
+        write_bag(path, topic, frames(np.ones((2, 17, 2)), np.ones((2, 17))))
+
+
+def test_the_only_topic_that_fits_is_taken_where_the_lifters_is_not_recorded(
+    tmp_path: Path,
+) -> None:
+    write(tmp_path, "/camera/keypoints", "/other", "/third")
+    for bags, expected in (
+        (("keypoints",), "/camera/keypoints"),
+        (("other", "keypoints"), "/camera/keypoints"),
+        (("other",), "/other"),
+        (("other", "third"), ""),
+        (("nowhere",), "/camera/keypoints"),
+    ):
+        lifter = dataclasses.replace(INPUT, mapping="")
+        assert choose_topic([tmp_path / bag for bag in bags], lifter) == expected
+    assert choose_topic([tmp_path / "other"], dataclasses.replace(INPUT, topic="")) == ""
+    with pytest.raises(ValueError, match="train.topic is '/gone': bag .* no topic called /gone"):
+        request(tmp_path, bags=("other",), topic="/gone").accept()
+
+
 def test_a_request_is_validated(tmp_path: Path) -> None:
+    write(tmp_path, "/camera/keypoints")
     with pytest.raises(ValueError, match=r"train\.bags"):
         request(tmp_path).accept()
     with pytest.raises(ValueError, match="nowhere"):
-        request(tmp_path, bags=(".", "nowhere")).accept()
-    asked = request(tmp_path, bags=(".",))
+        request(tmp_path, bags=("keypoints", "nowhere")).accept()
+    asked = request(tmp_path, bags=("keypoints",))
     assert asked.accept() == (asked.config, "")
 
 
@@ -119,9 +148,10 @@ def test_resuming_keeps_to_the_record_and_tells_what_differs(tmp_path: Path) -> 
     asked = request(tmp_path, resume=True, name="mine", threads=2)
     with pytest.raises(ValueError, match=r"no unfinished training of 'mine'.*\(unfinished: none\)"):
         asked.accept()
+    write(tmp_path, "/camera/keypoints")
     recorded = dataclasses.replace(
         asked.config,
-        data=dataclasses.replace(asked.config.data, bags=(tmp_path,)),
+        data=dataclasses.replace(asked.config.data, bags=(tmp_path / "keypoints",)),
         recipe=Recipe(steps=30, noise=0.25),
         output=OutputConfig(tmp_path, "mine", 9),
         resume=False,
@@ -144,5 +174,6 @@ def test_a_checkpoint_without_a_record_goes_on_with_the_parameters(tmp_path: Pat
     (tmp_path / ".mine.checkpoint").touch()
     with pytest.raises(ValueError, match=r"train\.bags"):
         request(tmp_path, resume=True, name="mine").accept()
-    asked = request(tmp_path, resume=True, name="mine", bags=(".",))
+    write(tmp_path, "/camera/keypoints")
+    asked = request(tmp_path, resume=True, name="mine", bags=("keypoints",))
     assert asked.accept() == (asked.config, "") and asked.config.resume

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
@@ -27,7 +28,10 @@ def save(path: Path, layout: KeypointLayout) -> Path:
 
 @pytest.fixture
 def config(tmp_path: Path) -> TrainingConfig:
-    values = {"bags": (tmp_path,), "keypoint_layout": "coco17", "folder": tmp_path / "models"}
+    detections = np.ones((2, 17, 2)), np.ones((2, 17))
+    write_bag(tmp_path / "bag", "/keypoints", frames(*detections))
+    bags = (tmp_path / "bag",)
+    values = {"bags": bags, "keypoint_layout": "coco17", "folder": tmp_path / "models"}
     return TrainingConfig().with_options(values)
 
 
@@ -44,6 +48,16 @@ def test_a_name_that_is_no_plain_file_name_is_refused(config: TrainingConfig, na
         ({"bags": ()}, "train on: --bag .*, or --cmu with", "train on: train.bags"),
         ({"cmu": Path("/")}, "train on: --bag .*, or --cmu with", "train on: train.bags"),
         ({"bags": (Path("/nowhere"),)}, "--bag names /nowhere, which", "train.bags names /nowhere"),
+        (
+            {"topic": "/x"},
+            "--topic is '/x': .* no topic called /x; its topics",
+            "train.topic is '/x'",
+        ),
+        (
+            {"inputs": (Path("/nowhere"),)},
+            "--input names /nowhere, which",
+            "train.inputs names /no",
+        ),
         ({"object": "horse"}, "--object is 'horse'; name a preset", "train.object is 'horse'"),
         (
             {"keypoint_layout": "horse"},
