@@ -156,7 +156,8 @@ def stop_with_parent(stopped: Callable[[], bool]) -> Callable[[], bool]:
 
 def report_end(result: TrainingResult, reporter: Reporter) -> None:
     """Write the page of a training, and report how the training ended."""
-    values: dict[str, object] = dict(result.model.quality)
+    step = result.model.provenance["step"]
+    values: dict[str, object] = {"step": step, "steps": step, **result.model.quality}
     if warning := handedness_warning(result.model, result.prepared.dataset):
         reporter.warn(warning)
         values["warning"] = warning
@@ -176,6 +177,8 @@ def write_page(result: TrainingResult, reporter: Reporter) -> str:
         *(result.model, result.path, prepared.dataset, prepared.curated, prepared.sufficiency),
         progress=reporter.curves,
         warnings=reporter.warnings,
+        detector_layout=result.detector_layout,
+        input_type=result.mapping,
     )
     folders = model_folders(result.path.parent) if result.state == "finished" else []
     try:

@@ -56,6 +56,10 @@ class Training:
         sufficiency: how much the data varies.
         progress: every progress report of the training, in order.
         warnings: further sentences for the user.
+        detector_layout: value of `keypoint_layout` for the detector of the data; "" where its
+            keypoints are those of the model.
+        input_type: value of `input_type` for its messages, e.g. a field mapping; "" where it need
+            not be set.
     """
 
     model: Model
@@ -65,6 +69,8 @@ class Training:
     sufficiency: Sufficiency
     progress: Sequence[Progress]
     warnings: Sequence[str] = ()
+    detector_layout: str = ""
+    input_type: str = ""
 
 
 def write_report(training: Training, folders: Sequence[Path]) -> Path:
@@ -107,6 +113,14 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         model=model,
         name=training.path.stem,
         path=shlex.quote(str(training.path.resolve())),
+        input_parameters=[
+            (name, shlex.quote(value))
+            for name, value in (
+                ("keypoint_layout", training.detector_layout),
+                ("input_type", training.input_type),
+            )
+            if value
+        ],
         warnings=[*training.warnings, *training.curated.warnings, *sufficiency.warnings],
         curves=[_curve(training.progress, field, label) for field, label in _CURVES.items()],
         comparison=_comparison(training, folders),

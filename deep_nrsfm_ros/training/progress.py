@@ -13,7 +13,7 @@ class Progress(NamedTuple):
     """A report on a training."""
 
     step: int
-    steps: int
+    steps: int  # at which the training ends; with a time limit, by its present pace
     seed: int
     loss: float  # relative reprojection error
     cycle_error: float  # relative error of shapes reconstructed again from another camera
@@ -59,7 +59,11 @@ class Clock:
         pace = (self.reported - self.began) / max(trainer.step - self.first, 1)
         loss, cycle = trainer.measure()
         sharpness = coherence(trainer.net.map(lambda w: w.cpu().numpy()))
-        left = 0.0 if trainer.end_reason else pace * (self.steps - trainer.step)
+        step, steps = trainer.step, self.steps
+        left = 0.0 if trainer.end_reason else pace * (steps - step)
         if self.limit:
             left = min(left, max(self.limit - self.seconds(), 0.0))
-        return Progress(trainer.step, self.steps, trainer.seed, loss, cycle, sharpness, left)
+            steps = min(steps, step + round(left / pace)) if pace else steps
+        if trainer.end_reason:
+            steps = step
+        return Progress(step, steps, trainer.seed, loss, cycle, sharpness, left)

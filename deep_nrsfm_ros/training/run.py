@@ -37,6 +37,8 @@ class TrainingResult(NamedTuple):
         prepared: the data it was learned from.
         state: "finished" or "cancelled".
         message: one line for people about the end.
+        detector_layout: layout of the keypoints in the data, where it is not that of the model.
+        mapping: field mapping of the messages in the data; "" for none.
     """
 
     model: Model
@@ -44,6 +46,8 @@ class TrainingResult(NamedTuple):
     prepared: Prepared
     state: str
     message: str
+    detector_layout: str = ""
+    mapping: str = ""
 
 
 def run(
@@ -109,7 +113,10 @@ def _train_and_save(
         model = inherit(model, start)
     path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"
     save_model(path, model)
-    return TrainingResult(model, path, prepared, *_ending(trainer, path, model, checkpoint))
+    ending = _ending(trainer, path, model, checkpoint)
+    named = find_layouts(config, COMMAND_LINE)[0].name
+    detector_layout = config.data.keypoint_layout if named != dataset.layout.name else ""
+    return TrainingResult(model, path, prepared, *ending, detector_layout, config.data.mapping)
 
 
 def _describe(prepared: Prepared, reporter: Reporter, *, starts_anew: bool) -> None:

@@ -208,3 +208,11 @@ def test_shapes_are_drawn_and_turn_in_a_browser(tab: Any, text: str, tmp_path: P
     x, y = tab.middle(still)
     tab.drag((x, y), (x + 50, y))
     assert tab.evaluate(drawn)[5] != before[5]  # the first of the frames, after mean and modes
+
+
+def test_use_it_names_the_layout_of_the_data() -> None:
+    text = page(training_of(detector_layout="body25b", input_type="/maps/my people.yaml"))
+    assert "-p keypoint_layout:=body25b \\\n" in text
+    assert "-p input_type:=&#39;/maps/my people.yaml&#39; \\\n" in text
+    assert "coco17" not in text
+    assert "-p keypoint_layout:=LAYOUT" in page(training_of())

@@ -325,6 +325,7 @@ def test_the_learning_rate_ends_with_the_time(figure: Any, second_a_step: list[f
     cosine = Recipe(steps=30, learning_rate=SMALL.recipe.learning_rate)
     assert second_a_step == pytest.approx([learning_rate(cosine, step) for step in range(30)])
     assert reports[1].seconds_left == 20 and reports[-1].seconds_left == 0
+    assert {report.steps for report in reports} == {30}
 
 
 def test_steps_may_end_before_the_time(figure: Any, second_a_step: list[float]) -> None:

@@ -171,8 +171,9 @@ def train(client: Client, cameras: Sequence[str]) -> None:
         for camera in cameras:
             played = client.play(camera)
             sent, latencies = sent + len(played.stamps), latencies + played.latencies
-        done, steps = (client.training.get(key, "0") for key in ("step", "steps"))
-        print(f"  {client.training['state']}: {done} of {steps} steps", flush=True)
+        done, steps = (client.training.get(key) for key in ("step", "steps"))
+        progress = f": {done} of {steps} steps" if done and steps else ""
+        print(f"  {client.training['state']}{progress}", flush=True)
     if client.training["state"] != "finished":
         raise DemoError(f"training {client.training['state']}: {client.training['message']}")
     p50, p99 = (Played([], latencies, 0.0, 0.0).latency(percent) for percent in (50, 99))
