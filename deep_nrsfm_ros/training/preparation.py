@@ -72,7 +72,7 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
                 raise
             reporter.warn(f"left out: {error}")
     if data.inputs:
-        parts.append(_read_inputs(data, KeypointMap(source, target), options, reporter))
+        parts += _read_inputs(data, KeypointMap(source, target), options, reporter, bool(parts))
     dataset = concatenate(parts)
     if len(dataset) > config.limits.max_frames:
         raise ValueError(
@@ -107,14 +107,20 @@ def _read_bags(
 
 
 def _read_inputs(
-    data: DataConfig, keypoint_map: KeypointMap, options: ReadOptions, reporter: Reporter
-) -> Dataset:
-    """Return all objects in the files as one dataset, those of one identity one after the other.
+    data: DataConfig,
+    keypoint_map: KeypointMap,
+    options: ReadOptions,
+    reporter: Reporter,
+    may_be_none: bool,
+) -> list[Dataset]:
+    """Return the objects in each file as a dataset, those of one identity one after the other.
 
     So near-duplicates of one person follow one another, as the curation expects. A file that
-    cannot be read is left out with a warning, unless none is left.
+    cannot be read is left out with a warning, unless no data is left. Where there are several
+    sources, the names that a file has for its keypoints go before the layout of the configuration.
     """
-    named = keypoint_map.source if data.keypoint_layout else None
+    is_only_source = len(data.inputs) == 1 and not data.bags
+    named = keypoint_map.source if data.keypoint_layout and is_only_source else None
     options = dataclasses.replace(options, layout=named, fallback=keypoint_map.source)
     parts, failures = [], []
     for path in map(Path.expanduser, data.inputs):
@@ -132,11 +138,11 @@ def _read_inputs(
         order = np.lexsort((detections.frame, detections.identities))
         points, confidence = to_target(detections.points[order], detections.confidence[order])
         parts.append(Dataset(points, confidence > 0, keypoint_map.target, f"file {path.name}"))
-    if not parts:
+    if not parts and not may_be_none:
         raise failures[0]
     for failure in failures:
         reporter.warn(f"left out: {failure}")
-    return concatenate(parts)
+    return parts
 
 
 def _options_for(path: Path, options: ReadOptions) -> ReadOptions:
