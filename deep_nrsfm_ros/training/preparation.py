@@ -18,7 +18,6 @@ from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.sanity import check
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
 from deep_nrsfm_ros.training.config import COMMAND_LINE, DataConfig, TrainingConfig
 from deep_nrsfm_ros.training.reporter import Reporter
@@ -79,8 +78,6 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
             f"bags and files have {len(dataset)} frames; at most {config.limits.max_frames} are "
             "read (max_frames); name fewer files, or allow more"
         )
-    for finding in check(dataset.points, dataset.visible.astype(np.float32), None, data.image_size):
-        reporter.warn(str(finding))
     return dataset
 
 

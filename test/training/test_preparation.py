@@ -115,11 +115,3 @@ def test_one_bad_file_is_left_out_and_named(
         read("--input", f"{tmp_path}/bad.json")
     with pytest.raises(ValueError, match="have 12 frames; at most 10"):
         read("--input", f"{tmp_path}/a.npz", "--bag", f"{tmp_path}/bag", "--max-frames", "10")
-
-
-def test_keypoints_that_cannot_be_pixels_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    np.savez(tmp_path / "a.npz", points=pixels(50) / 1000)
-    read("--input", f"{tmp_path}/a.npz")
-    assert "warning: " in capsys.readouterr().err
