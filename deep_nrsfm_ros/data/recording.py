@@ -66,11 +66,17 @@ def lift_recording(
         ValueError: too few keypoints of the layout are keypoints of the model.
     """
     target = lifter.model.layout
-    points, confidence = KeypointMap(source, target)(detections.points, detections.confidence)
+    to_model = KeypointMap(source, target)
     if lifter.layout != source:
         lifter = Lifter(lifter.model, lifter.options, layout=source)
     lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter.lift
-    return Recording(source, target, detections, lift_all(lift, points, confidence, on_progress))
+    lifted = lift_all(
+        lambda points, confidence: lift(*to_model(points, confidence)),
+        detections.points,
+        detections.confidence,
+        on_progress,
+    )
+    return Recording(source, target, detections, lifted)
 
 
 def join_lifted_messages(

@@ -247,11 +247,21 @@ def lift_all(
         confidence: (n, p) as in `Lifter.lift`.
         on_progress: called after each slice with the number of lifted objects and n.
     """
-    parts = []
-    for part in slices(len(points), _BLOCK) or [slice(0)]:
-        parts.append(lift(points[part], confidence[part]))
-        on_progress(part.stop, len(points))
-    return Lifted(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    n = len(points)
+    first, *rest = slices(n, _BLOCK) or [slice(0)]
+    lifted = lift(points[first], confidence[first])
+    on_progress(first.stop, n)
+    if not rest:
+        return lifted
+    # Each slice goes to its place, so that memory holds the objects but once.
+    result = Lifted(*(np.empty((n, *array.shape[1:]), array.dtype) for array in lifted))
+    for part in (first, *rest):
+        if part is not first:
+            lifted = lift(points[part], confidence[part])
+        for array, values in zip(result, lifted, strict=True):
+            array[part] = values
+        on_progress(part.stop, n)
+    return result
 
 
 def mark_not_lifted(lifted: Lifted, not_lifted: NDArray[np.bool_]) -> Lifted:

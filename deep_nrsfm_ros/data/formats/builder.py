@@ -400,7 +400,8 @@ def identities_of(
         identity in a frame; the index in the frame if the input has none at all.
     """
     if not any(identity is not None for identity in given):
-        return index_in_frame(frame).astype(str), ""
+        index = index_in_frame(frame)
+        return index.astype(f"U{len(str(index.max(initial=0)))}"), ""
     identities = np.array([identity or "" for identity in given], str)
     codes = np.unique(identities, return_inverse=True)[1]
     pairs = frame * (int(codes.max()) + 1) + codes
