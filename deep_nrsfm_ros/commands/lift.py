@@ -28,7 +28,7 @@ from deep_nrsfm_ros.data.summary import Summary, resolve_layout, summarise
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
-from deep_nrsfm_ros.lifting.sanity import Size
+from deep_nrsfm_ros.lifting.sanity import Size, is_person
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.messages.pipeline import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.model_files.find_layout import find_layout
@@ -172,6 +172,7 @@ def read_objects(
         mapping=read_mapping(Path(args.mapping).expanduser()) if args.mapping else None,
         image_size=read_camera(args).image_size,
         layout=layout,
+        fallback=None if is_person(model.layout) else model.layout,
     )
     with progress("reading") as on_progress:
         detections = read_keypoints(args.input, options, on_progress)

@@ -26,7 +26,10 @@ from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
 from deep_nrsfm_ros.data.formats.json_items import Readable
 from deep_nrsfm_ros.data.formats.tables import read_csv, read_h5, read_trc
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.sanity import to_pixels
+from deep_nrsfm_ros.messages.decoding import implied_layout
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 from deep_nrsfm_ros.messages.stamps import one_clock
 
@@ -315,7 +318,7 @@ def read_bag(
     """
     observations, stamps, times, reason, camera, count = [], [], [], "", "", 0
     warnings: list[str] = []
-    layout = options.layout or options.fallback
+    layout = options.layout or options.fallback or _implied_by_type(path, options)
     keypoints = len(layout) if layout else keypoint_count([path], options)
     with closing(open_bag(path)) as bag:
         topics = keypoint_topics(bag, options.topic, options.mapping, keypoints)
@@ -349,6 +352,15 @@ def read_bag(
     detections = gather(ordered, on_one_clock[order], keypoints, camera)
     warnings += clock_warnings
     return dataclasses.replace(detections, layout=layout, warnings=tuple(warnings))
+
+
+def _implied_by_type(path: Path, options: ReadOptions) -> KeypointLayout | None:
+    """Return the layout that the type of a bag's keypoints implies; None if it implies none."""
+    with closing(open_bag(path)) as bag:
+        topics = keypoint_topics(bag, options.topic, options.mapping)
+        names = {implied_layout(input_type) for _, input_type, _ in topics}
+    name = names.pop() if len(names) == 1 else ""
+    return LAYOUTS[name] if name else None
 
 
 def stamp_of(message: Any) -> int:

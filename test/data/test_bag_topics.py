@@ -284,3 +284,11 @@ def test_types_of_detectors_in_bags_of_ros_1(tmp_path: Path, recorded: Any) -> N
     bag = write_ros1(tmp_path / "a.bag", recorded, {"/body": (kind, messages)})
     dataset = read_bags([bag], REP155, REP155, ReadOptions(image_size=(640, 480))).dataset
     np.testing.assert_allclose(dataset.points, given[..., :2] * [640, 480], rtol=1e-5)
+
+
+def test_the_type_of_messages_implies_the_layout(tmp_path: Path, recorded: Any) -> None:
+    given = people(4, 17)
+    bag = yolo_bag(tmp_path / "bag", recorded, given)
+    found = read_keypoints(bag)
+    assert found.layout is COCO17 and found.points.shape[1:] == (17, 2)
+    assert read_keypoints(bag, ReadOptions(layout=HUMAN17)).layout is HUMAN17
