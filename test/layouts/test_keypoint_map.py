@@ -9,6 +9,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 
+NOT_OF_HUMAN17 = {"cmu31", "hand21", "ap10k17"}
 every_preset = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 
 
@@ -19,7 +20,7 @@ def detections(source: KeypointLayout, n: int = 5) -> tuple[np.ndarray, np.ndarr
     return points, confidence
 
 
-@pytest.mark.parametrize("name", sorted(set(LAYOUTS) - {"cmu31"}))
+@pytest.mark.parametrize("name", sorted(set(LAYOUTS) - NOT_OF_HUMAN17))
 def test_maps_go_by_name(name: str) -> None:
     source = LAYOUTS[name]
     target = LAYOUTS["human17"]

@@ -39,10 +39,57 @@ PLACES = {
     "30 right_heel 31 left_big_toe 32 right_big_toe",
     "cmu31": "0 root 1 lhipjoint 5 ltoes 6 rhipjoint 10 rtoes 11 lowerback 16 head 17 lclavicle "
     "20 lwrist 23 lthumb 24 rclavicle 27 rwrist 30 rthumb",
+    "halpe26": "0 nose 1 left_eye 5 left_shoulder 10 right_wrist 16 right_ankle 17 head_top "
+    "18 neck 19 mid_hip 20 left_big_toe 21 right_big_toe 22 left_small_toe 24 left_heel "
+    "25 right_heel",
+    "halpe136": "0 nose 19 mid_hip 25 right_heel 26 right_jaw_1 34 chin 42 left_jaw_1 "
+    "56 nose_tip 62 right_eye_outer 71 left_eye_outer 93 right_inner_lower_lip 94 left_hand_wrist "
+    "95 left_thumb_cmc 114 left_pinky_tip 115 right_hand_wrist 119 right_thumb_tip "
+    "135 right_pinky_tip",
+    "coco_wholebody133": "0 nose 16 right_ankle 17 left_big_toe 18 left_small_toe 19 left_heel "
+    "20 right_big_toe 22 right_heel 23 right_jaw_1 31 chin 39 left_jaw_1 40 right_brow_1 "
+    "49 left_brow_1 53 nose_tip 59 right_eye_outer 68 left_eye_outer 71 right_mouth 77 left_mouth "
+    "91 left_hand_wrist 92 left_thumb_cmc 96 left_index_mcp 111 left_pinky_tip "
+    "112 right_hand_wrist 132 right_pinky_tip",
+    "mpii16": "0 right_ankle 2 right_hip 3 left_hip 5 left_ankle 6 pelvis 7 thorax 8 upper_neck "
+    "9 head_top 10 right_wrist 12 right_shoulder 13 left_shoulder 15 left_wrist",
+    "h36m17": "0 pelvis 1 right_hip 3 right_ankle 4 left_hip 6 left_ankle 7 spine 8 thorax "
+    "9 neck_base 10 head 11 left_shoulder 13 left_wrist 14 right_shoulder 16 right_wrist",
+    "crowdpose14": "0 left_shoulder 1 right_shoulder 4 left_wrist 6 left_hip 11 right_ankle "
+    "12 head_top 13 neck",
+    "openpose135": "0 nose 9 left_wrist 17 upper_neck 18 head_top 24 right_heel 25 left_thumb_cmc "
+    "44 left_pinky_tip 45 right_thumb_cmc 64 right_pinky_tip 65 right_jaw_1 73 chin "
+    "132 right_inner_lower_lip 133 right_pupil 134 left_pupil",
+    "hand21": "0 wrist 1 thumb_cmc 4 thumb_tip 5 index_mcp 8 index_tip 12 middle_tip 16 ring_tip "
+    "17 pinky_mcp 20 pinky_tip",
+    "ap10k17": "0 left_eye 1 right_eye 2 nose 3 neck 4 tail_root 5 left_front_shoulder "
+    "7 left_front_paw 8 right_front_shoulder 10 right_front_paw 11 left_back_hip 13 left_back_paw "
+    "14 right_back_hip 16 right_back_paw",
+    "posetrack15": "0 right_ankle 2 right_hip 3 left_hip 5 left_ankle 6 right_wrist "
+    "8 right_shoulder 9 left_shoulder 11 left_wrist 12 upper_neck 13 nose 14 head_top",
+    "posetrack18_17": "0 nose 1 upper_neck 2 head_top 3 left_ear 5 left_shoulder 16 right_ankle",
+    "zed18": "0 nose 1 neck 2 right_shoulder 5 left_shoulder 8 right_hip 13 left_ankle "
+    "14 right_eye 15 left_eye 17 left_ear",
+    "zed34": "0 pelvis 3 neck 4 left_clavicle 5 left_shoulder 7 left_wrist 10 left_thumb "
+    "11 right_clavicle 17 right_thumb 18 left_hip 21 left_foot 22 right_hip 25 right_foot 26 head "
+    "27 nose 28 left_eye 29 left_ear 30 right_eye 31 right_ear 32 left_heel 33 right_heel",
+    "zed38": "0 pelvis 3 spine_3 4 neck 5 nose 6 left_eye 9 right_ear 10 left_clavicle "
+    "12 left_shoulder 17 right_wrist 18 left_hip 23 right_ankle 24 left_big_toe 29 right_heel "
+    "30 left_thumb_tip 32 left_index_mcp 34 left_middle_tip 37 right_pinky_mcp",
     "human17": "0 left_shoulder 1 right_shoulder 12 neck 13 mid_hip 14 nose 15 left_big_toe",
 }
 COUNTS = {"human17": 17, "cmu31": 31, "coco17": 17, "body25": 25, "body25b": 25}
 COUNTS |= {"openpose18": 18, "rep155": 18, "mediapipe33": 33}
+COUNTS |= {"halpe26": 26, "halpe136": 136, "coco_wholebody133": 133, "mpii16": 16, "h36m17": 17}
+COUNTS |= {"crowdpose14": 14, "openpose135": 135, "hand21": 21, "ap10k17": 17, "posetrack15": 15}
+COUNTS |= {"posetrack18_17": 17, "zed18": 18, "zed34": 34, "zed38": 38}
+
+# Pairs of the 68 points of a face that change places in a mirror, as MMPose documents them.
+FACE_PAIRS = {i: 16 - i for i in range(17)} | {i: 43 - i for i in range(17, 27)}
+FACE_PAIRS |= {i: i for i in range(27, 31)} | {i: 66 - i for i in range(31, 36)}
+FACE_PAIRS |= {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
+FACE_PAIRS |= {i: 102 - i for i in range(48, 55)} | {i: 114 - i for i in range(55, 60)}
+FACE_PAIRS |= {i: 124 - i for i in range(60, 65)} | {i: 132 - i for i in range(65, 68)}
 
 
 @every_preset
@@ -68,12 +115,44 @@ def test_presets_have_both_sides_of_everything(layout: KeypointLayout) -> None:
         return name
 
     swapped = [other_side(name) for name in layout.keypoints]
-    assert sorted(swapped) == sorted(layout.keypoints) and swapped != list(layout.keypoints)
+    assert sorted(swapped) == sorted(layout.keypoints)
+    assert (swapped != list(layout.keypoints)) == (layout.name != "hand21")  # of either side
     edges = {frozenset(edge) for edge in layout.edges}
     assert edges == {frozenset(map(other_side, edge)) for edge in edges}
     for left, right, _, _ in layout.handedness:
         assert other_side(left) == right
     assert all(first[0].startswith("l") for first in layout.handedness[:1])
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("halpe136", 26), ("coco_wholebody133", 23), ("openpose135", 65)]
+)
+def test_faces_are_in_the_order_of_68_points(name: str, start: int) -> None:
+    face = preset(name).keypoints[start : start + 68]
+    for i, j in FACE_PAIRS.items():
+        mirrored = {"left": "right", "right": "left"}.get(face[i].split("_")[0], "")
+        assert face[j] == (f"{mirrored}_{face[i].partition('_')[2]}" if mirrored else face[i])
+    assert all(face[i].startswith("right_") for i in (*range(8), *range(17, 22), *range(36, 42)))
+
+
+def test_layouts_that_contain_others() -> None:
+    assert preset("halpe136").keypoints[:26] == preset("halpe26").keypoints
+    assert preset("coco_wholebody133").keypoints[:17] == preset("coco17").keypoints
+    assert preset("halpe26").keypoints[:17] == preset("coco17").keypoints
+    assert preset("openpose135").keypoints[:25] == preset("body25b").keypoints
+    assert preset("zed18").keypoints == preset("openpose18").keypoints
+    hand = preset("hand21").keypoints[1:]
+    for name, starts in {"halpe136": (95, 116), "coco_wholebody133": (92, 113)}.items():
+        for side, start in zip(("left", "right"), starts, strict=True):
+            fingers = tuple(f"{side}_{keypoint}" for keypoint in hand)
+            assert preset(name).keypoints[start : start + 20] == fingers
+
+
+def test_the_example_of_a_layout_file_is_the_preset_of_a_hand() -> None:
+    example = read_layout(Path(__file__).parents[2] / "config" / "layouts" / "hand.yaml")
+    assert example.keypoints == preset("hand21").keypoints
+    assert example.edges == preset("hand21").edges
+    assert example.handedness and example.reference_length
 
 
 @every_preset

@@ -19,7 +19,7 @@ _DATASETS = {
     "h36m": "h36m17",
     "crowdpose": "crowdpose14",
     "ap10k": "ap10k17",
-    "posetrack18": "posetrack15",
+    "posetrack18": "posetrack18_17",
     "coco_wholebody_hand": "hand21",
 }
 """Datasets of MMPose -> presets."""

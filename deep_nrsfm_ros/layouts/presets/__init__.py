@@ -13,7 +13,12 @@ from pathlib import Path
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import read_layout
 
-NAMES = ["human17", "cmu31", "coco17", "body25", "body25b", "openpose18", "rep155", "mediapipe33"]
+NAMES = [
+    *("human17", "cmu31", "coco17", "body25", "body25b", "openpose18", "rep155", "mediapipe33"),
+    *("halpe26", "halpe136", "coco_wholebody133", "mpii16", "h36m17", "crowdpose14"),
+    *("openpose135", "hand21", "ap10k17", "posetrack15", "posetrack18_17"),
+    *("zed18", "zed34", "zed38"),
+]
 _FOLDER = Path(__file__).parent
 
 # Without values, so that `__getattr__` reads the file of a layout at its first use.
@@ -25,6 +30,20 @@ BODY25B: KeypointLayout
 OPENPOSE18: KeypointLayout
 REP155: KeypointLayout
 MEDIAPIPE33: KeypointLayout
+HALPE26: KeypointLayout
+HALPE136: KeypointLayout
+COCO_WHOLEBODY133: KeypointLayout
+MPII16: KeypointLayout
+H36M17: KeypointLayout
+CROWDPOSE14: KeypointLayout
+OPENPOSE135: KeypointLayout
+HAND21: KeypointLayout
+AP10K17: KeypointLayout
+POSETRACK15: KeypointLayout
+POSETRACK18_17: KeypointLayout
+ZED18: KeypointLayout
+ZED34: KeypointLayout
+ZED38: KeypointLayout
 
 
 @cache
