@@ -224,7 +224,8 @@ def _sentinel(spot: Floats, times: int, total: int) -> Finding:
     return Finding(
         "sentinel",
         f"{times} of {total} visible keypoints lie at exactly ({x:g}, {y:g}), which detectors "
-        "write for a missing keypoint: give them confidence 0, NaN or (0, 0)",
+        f"write for a missing keypoint: give them confidence 0, NaN or (0, 0), or name the value "
+        f"(--missing-value={x:g} for files, `missing` in a field mapping)",
     )
 
 
