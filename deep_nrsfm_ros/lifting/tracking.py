@@ -10,6 +10,7 @@ Source: COCO, "Keypoint Evaluation": the similarity and its constants.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import lap
@@ -76,6 +77,17 @@ class _Tracks(NamedTuple):
     time: NDArray[Any]  # (m,) float64, of the last detection, seconds
 
 
+class _Lone(NamedTuple):
+    """The only track, whose keypoints are visible or never were: one object takes no arrays."""
+
+    points: _Complex  # (q,)
+    visible: bytes  # of the booleans (q,)
+    centre: complex  # of the visible keypoints
+    velocity: complex
+    size: float
+    time: float
+
+
 class _Pairs(NamedTuple):
     """The k pairs of a detection and a track that may be the same object."""
 
@@ -119,6 +131,7 @@ class Tracker:
         self._topic = topic
         self._identities: list[str] = []
         self._tracks: _Tracks | None = None
+        self._lone: _Lone | None = None  # instead of `_tracks`, which is older
         self._now = -np.inf
         self._count = 0
 
@@ -145,7 +158,12 @@ class Tracker:
         if now < self._now - memory:
             self.restart()
         self._now = max(now, self._now)
-        identities = self._identify(detections, now, memory, tolerances)
+        if self._lone and self._continue_lone(self._lone, detections, now, memory):
+            identities = list(self._identities)
+        else:
+            self._to_arrays()
+            identities = self._identify(detections, now, memory, tolerances)
+            self._to_lone(len(identities))
         if self._topic:
             return tuple(identity and f"{self._topic}/{identity}" for identity in identities)
         return tuple(identities)
@@ -153,11 +171,61 @@ class Tracker:
     @property
     def track_count(self) -> int:
         """The number of tracks, those without a recent detection too."""
-        return 0 if self._tracks is None else len(self._tracks.size)
+        return 0 if self._tracks is None else len(self._identities)
 
     def restart(self) -> None:
         """Delete all tracks, as when the stamps begin anew; no identity is given a second time."""
-        self._tracks, self._now = None, -np.inf
+        self._tracks = self._lone = None
+        self._now = -np.inf
+
+    def _continue_lone(
+        self, lone: _Lone, observation: Observation, now: float, memory: float
+    ) -> bool:
+        """Update the only track by the only detection; return whether that is possible."""
+        if len(observation.confidence) != 1 or any(observation.identities):
+            return False
+        mask: NDArray[np.bool_] = observation.confidence[0] > 0
+        passed = max(now - lone.time, 0.0)
+        if mask.tobytes() != lone.visible or passed > memory:
+            return False
+        points = _to_complex(observation.points)[0].copy()
+        visible = points[mask]
+        centre = complex(visible.sum()) / len(visible)
+        offset = visible - np.complex64(centre)
+        decay = math.exp(-passed / _DECAY)
+        size = math.sqrt(np.vdot(offset, offset).real / len(visible))
+        size = max(size, lone.size * math.exp(-passed / _SIZE_DECAY), 1e-9)
+        shift = centre - lone.centre - lone.velocity * (_DECAY * (1 - decay))
+        if abs(shift) >= (_MAX_MOTION + _MOTION_GROWTH * passed) * size:
+            return False
+        velocity = lone.velocity * decay + shift * (_VELOCITY_GAIN / max(passed, 1e-3))
+        self._lone = _Lone(points, lone.visible, centre, velocity, size, now)
+        return True
+
+    def _to_arrays(self) -> None:
+        """Write the only track to the arrays."""
+        if lone := self._lone:
+            visible = np.frombuffer(lone.visible, bool)
+            self._tracks = _Tracks(
+                np.where(visible, lone.points, np.complex64(0))[None],
+                np.where(visible, np.float32(0), np.float32(np.inf))[None],
+                np.array([lone.velocity], np.complex64),
+                np.array([lone.size], np.float32),
+                np.array([lone.time]),
+            )
+            self._lone = None
+
+    def _to_lone(self, count: int) -> None:
+        """Take the only track out of the arrays if none of its keypoints is hidden."""
+        tracks = self._tracks
+        if tracks is None or count != 1 or len(self._identities) != 1:
+            return
+        points, age = tracks.points[0], tracks.age[0]
+        visible = age == 0
+        if (visible | (age == np.inf)).all() and float(tracks.time[0]) == self._now:
+            centre, velocity = complex(points[visible].mean()), complex(tracks.velocity[0])
+            state = (centre, velocity, float(tracks.size[0]), float(tracks.time[0]))
+            self._lone = _Lone(points, visible.tobytes(), *state)
 
     def _identify(
         self, observation: Observation, now: float, memory: float, tolerances: _Floats | None
@@ -263,9 +331,15 @@ def _unique(observation: Observation) -> list[str]:
     return identities
 
 
+def _to_complex(points: NDArray[np.float32]) -> _Complex:
+    """Return points (n, q, 2) as complex numbers (n, q)."""
+    z: _Complex = np.ascontiguousarray(points, np.float32).view(np.complex64)[..., 0]
+    return z
+
+
 def _detections(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> _Detections:
     """Return objects with points (n, q, 2), each with a visible keypoint."""
-    z = np.ascontiguousarray(points, np.float32).view(np.complex64)[..., 0]
+    z = _to_complex(points)
     mask = visible.astype(np.float32)
     weight = mask / mask.sum(1, keepdims=True)
     centre = (z * weight).sum(1)

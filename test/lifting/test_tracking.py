@@ -202,3 +202,22 @@ def test_identities_differ_whatever_comes(frames: list[list[tuple[int, str | Non
             seen(*places, identities=tuple(identity for _, identity in frame)), time / 10
         )
         assert len(set(identities)) == len(frame) and all(identities)
+
+
+def test_a_lone_object_is_followed_as_among_others() -> None:
+    rng = np.random.default_rng(0)
+    alone, among = Tracker(), Tracker()
+    x = 0.0
+    for frame in range(200):
+        x += float(rng.choice([3.0, 3.0, 3.0, 55.0, 120.0]))
+        body = seen((x, 100))
+        if rng.random() < 0.3:
+            body = hide(body, slice(0, 3))
+        other = Observation(
+            np.concatenate([body.points, seen((-1e5, 0)).points]),
+            np.concatenate([body.confidence, np.ones((1, 8), np.float32)]),
+        )
+        (first,) = alone(body, frame / 30)
+        second, _ = among(other, frame / 30)
+        number = int(second.removeprefix("object"))
+        assert int(first.removeprefix("object")) == max(1, number - 1)
