@@ -28,6 +28,7 @@ from deep_nrsfm_ros.data.formats.tables import read_csv, read_h5, read_trc
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.lifting.observation import Observation, without_border
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.messages.decoding import implied_layout
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
@@ -125,9 +126,29 @@ def _finish(detections: Detections, options: ReadOptions) -> Detections:
     pixels = to_pixels(points, confidence, options.image_size)
     if pixels is not points:
         detections = dataclasses.replace(detections, points=pixels)
+    if options.image_size:
+        detections = _without_border(detections, options.image_size)
     if warning := _likely_mark(detections):
         return dataclasses.replace(detections, warnings=(*detections.warnings, warning))
     return detections
+
+
+def _without_border(detections: Detections, size: tuple[int, int]) -> Detections:
+    """Return detections in which keypoints at the image's border are missing; say how many."""
+    inner = without_border(Observation(detections.points, detections.confidence), size)
+    count = int((detections.confidence > 0).sum() - (inner.confidence > 0).sum())
+    if not count:
+        return detections
+    warning = (
+        f"{count} of {(detections.confidence > 0).sum()} keypoints are at the border of the image "
+        f"of {size[0]} x {size[1]} pixels or outside, and count as missing"
+    )
+    return dataclasses.replace(
+        detections,
+        points=inner.points,
+        confidence=inner.confidence,
+        warnings=(*detections.warnings, warning),
+    )
 
 
 def _likely_mark(detections: Detections) -> str:

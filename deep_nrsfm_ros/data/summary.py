@@ -20,6 +20,7 @@ from deep_nrsfm_ros.lifting.sanity import (
     is_person,
     orientation,
 )
+from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import Model
 
 _FEW_LIFTED = 0.5  # fraction of the objects below which the answer is doubtful
@@ -150,7 +151,7 @@ def _left_out(recording: Recording, min_visible: int, *, with_camera: bool) -> d
         return {}
     to_model = KeypointMap(recording.source, recording.target)
     _, mapped = to_model(detections.points[rows], detections.confidence[rows])
-    few = int((to_model.detected_count(mapped > 0) < min_visible).sum())
+    few = int((to_model.detected_count(trusted(keypoint_weight(mapped))) < min_visible).sum())
     camera = ", or come out behind the camera" if with_camera else ""
     counts = {
         f"have fewer than {min_visible} detected keypoints of the model (min_visible)": few,

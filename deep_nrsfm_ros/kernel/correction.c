@@ -3,6 +3,7 @@
    The errors of a shape are normal, with the covariance Sigma of the model. Their mean given the keypoints, and
    then the bone lengths, solves A x = b with A the covariance of these observations. In this file p is filled up
    to a multiple of DOUBLES. */
+#include <math.h>
 #include <string.h>
 
 #include "plan.h"
@@ -134,10 +135,11 @@ void correct(Plan *k, Object *o, double noise) {
                 continue;
             }
             for (int j = i; j < k->p; j++) row[j] += unknown;
-            row[i] += o->visible[i] ? noise * noise + 1e-12 * unknown : unknown;
+            double weight = o->weight[i];
+            row[i] += weight > 0 ? fmin(noise * noise / weight + 1e-12 * unknown, unknown) : unknown;
             double difference = o->W[2 * i + a];
             for (int r = 0; r < 3; r++) difference -= o->S[r * k->stride + i] * m[(2 * r + a) * p + i];
-            k->difference[a * p + i] = b[0] = o->visible[i] ? difference : 0;
+            k->difference[a * p + i] = b[0] = weight > 0 ? difference : 0;
         }
     }
     solve(n, 0, stride, A);

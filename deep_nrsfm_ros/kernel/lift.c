@@ -89,8 +89,11 @@ static void fit_block(Plan *k, int n, Object *const *objects, int perspective) {
         rotation_from_camera(o->M, o->R);
         if (!k->corrected) continue;
         for (int i = 0; i < p; i++) {
+            int doubtful = o->weight[i] > 0 && !o->visible[i];
             for (int c = 0; c < 2; c++) {
-                double along = perspective ? o->input[2 * i + c] : 0, w = o->W[2 * i + c];
+                const float *image = doubtful ? o->image_points : o->input;
+                if (doubtful) o->W[2 * i + c] = (float)((image[2 * i + c] - o->origin[c]) / o->unit);
+                double along = perspective ? image[2 * i + c] : 0, w = o->W[2 * i + c];
                 for (int r = 0; r < 3; r++)
                     k->point_cameras[(2 * r + c) * apart + i] = o->M[r][c] - o->R[2][r] * along;
                 square += o->visible[i] * w * w;
@@ -125,7 +128,7 @@ static void set_confidence(Plan *k, const Object *o, double radius, float *confi
                     by[3] * log(fmax(o->visible_count, 1) / k->p);
     for (int i = 0; i < k->p; i++) {
         double odds = exp(-common - by[1] * log(k->error_std[i] / fmax(radius, 1e-9)));
-        double detected = fmin(o->confidence[i], 1);
+        double detected = o->visible[i] ? fmin(o->confidence[i], 1) : 0;
         confidence[i] = (float)(detected / (1 + odds) + (1 - detected) / (1 + odds * exp(-by[4])));
     }
 }
@@ -175,6 +178,22 @@ static int write_lifted(Plan *k, Object *o, ptrdiff_t i, float *const outputs[6]
     return on_one_line(m) || detected_count(k, o) < k->min_visible;
 }
 
+/* Set the weight, visible, input_mask and visible_count: lifting/weights.py. */
+static void set_weights(const Plan *k, Object *o) {
+    double sum = 0, square = 0;
+    for (int i = 0; i < k->p; i++) {
+        double c = fmin(o->confidence[i], 1);
+        sum += c, square += c * c;
+    }
+    double usual = fmax(k->full_ratio * square / fmax(sum, 1e-30), 1e-30);
+    o->visible_count = 0;
+    for (int i = 0; i < k->p; i++) {
+        double ratio = fmin(fmin(o->confidence[i], 1) / usual, 1), r = ratio * ratio;
+        o->weight[i] = r * r * r;
+        o->visible_count += o->input_mask[i] = o->visible[i] = o->weight[i] >= k->trusted_weight;
+    }
+}
+
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
           float *const outputs[6], char *not_lifted) {
     int p = k->p;
@@ -184,9 +203,7 @@ void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, in
             Object *o = k->incomplete[i] = k->objects + i;
             o->image_points = points + 2 * p * (start + i), o->confidence = confidence + p * (start + i);
             memcpy(o->input, o->image_points, 2 * p * sizeof(float));
-            o->visible_count = 0;
-            for (int j = 0; j < p; j++)
-                o->visible_count += o->input_mask[j] = o->visible[j] = o->confidence[j] > 0;
+            set_weights(k, o);
         }
         fit_block(k, block, k->incomplete, perspective);
         for (int i = 0; i < block; i++)

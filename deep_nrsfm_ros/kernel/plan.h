@@ -20,7 +20,8 @@
 typedef struct {
     const float *image_points, *confidence; /* (p, 2), (p): the arguments of `lift` */
     float *input, *input_mask;              /* (p, 2), (p): what the network reads, refilled round by round */
-    float *visible;                         /* (p), 1 or 0 */
+    float *visible;                         /* (p), 1 or 0: whether the network reads the keypoint */
+    double *weight;                         /* (p) in the correction; 0 = missing */
     float *W, *S;                           /* (p, 2), (3, stride) in camera axes */
     double gain;                            /* p / number of keypoints in the input */
     double unit, origin[2];                 /* image = unit W + origin */
@@ -39,7 +40,8 @@ typedef struct {
     const float *error_std, *covariance;                                 /* (p), (p, 3, 3, p) in DOUBLES */
     const double *completion, *image_rotations, *object_frame;           /* (p, p), (rotations, 2, 2), (3, 3) */
     const double *calibration, *bone_lengths;                            /* (5), (bones, 2) length and deviation */
-    double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, residual_offset;
+    double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, residual_offset,
+        trusted_weight, full_ratio;
     void *constants, *scratch; /* the memory of all above, and of all below */
     int busy;                  /* whether a lift computes in the scratch memory */
     /* Scratch memory, for `block` objects at a time. Rows of doubles are filled up to multiples of DOUBLES. */

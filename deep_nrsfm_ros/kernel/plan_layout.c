@@ -96,15 +96,15 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     k->object_frame = d, d += take(&d_items, 9, 1);
     k->calibration = d, d += take(&d_items, 5, 1);
     k->bone_lengths = d, d += take(&d_items, k->bones, 2);
-    take(&d_items, 6, 1);
+    take(&d_items, 8, 1);
     if (f_items.exceeded || f_items.left) return "the array of float32 has another length";
     if (d_items.exceeded || d_items.left) return "the array of float64 has another length";
     k->noise = *d++, k->reference_length = *d++, k->unknown_variance = *d++, k->min_relative_depth = *d++;
-    k->residual_scale = *d++, k->residual_offset = *d++;
-    const double *scalars = &d[-6];
-    for (int i = 0; i < 6; i++)
+    k->residual_scale = *d++, k->residual_offset = *d++, k->trusted_weight = *d++, k->full_ratio = *d++;
+    const double *scalars = &d[-8];
+    for (int i = 0; i < 8; i++)
         if (!(scalars[i] >= 0 && scalars[i] < INFINITY)) return "a variance or length is negative or not finite";
-    if (!k->min_relative_depth || !k->residual_scale || !k->residual_offset) return "a divisor is zero";
+    if (!k->min_relative_depth || !k->residual_scale || !k->residual_offset || !k->trusted_weight) return "a divisor is zero";
     for (int i = 0; i < 2 * k->bones; i++)
         if (!(k->bone_lengths[i] > 0 && k->bone_lengths[i] < INFINITY)) return "the length of a bone is not positive and finite";
     return NULL;
@@ -159,6 +159,7 @@ int lay_out_scratch(Plan *k, char *memory, size_t *size) {
         o->input = room(a, sizeof(float), p, 2);
         o->input_mask = room(a, sizeof(float), p, 1);
         o->visible = room(a, sizeof(float), p, 1);
+        o->weight = room(a, sizeof(double), p, 1);
         o->W = room(a, sizeof(float), p, 2);
         o->S = room(a, sizeof(float), 3, stride);
     }

@@ -15,6 +15,7 @@ from deep_nrsfm_ros.kernel import _kernel
 from deep_nrsfm_ros.lifting.confidence import CALIBRATED, RESIDUAL_OFFSET
 from deep_nrsfm_ros.lifting.correction import UNKNOWN_VARIANCE
 from deep_nrsfm_ros.lifting.numpy_backend import MIN_RELATIVE_DEPTH, RESIDUAL_SCALE, LifterConstants
+from deep_nrsfm_ros.lifting.weights import FULL_RATIO, TRUSTED_RATIO
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.network import completion_matrix
 
@@ -67,7 +68,7 @@ class CompiledBackend:
             MIN_RELATIVE_DEPTH,
             RESIDUAL_SCALE,
         ]
-        doubles += [RESIDUAL_OFFSET]
+        doubles += [RESIDUAL_OFFSET, TRUSTED_RATIO**6, FULL_RATIO]
         self._plan = _kernel.plan(
             np.array(header, np.int32), _joined(floats, np.float32), _joined(doubles, np.float64)
         )

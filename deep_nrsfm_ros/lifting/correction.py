@@ -65,7 +65,7 @@ def correct(
     S: Floats,
     M: Floats,
     W: Floats,
-    visible: NDArray[np.bool_],
+    weight: Floats,
     errors: ErrorModel,
     noise: Floats | float = 0.0,
 ) -> Floats:
@@ -77,15 +77,16 @@ def correct(
         S: (n, p, 3) shapes.
         M: (n, 3, 2) cameras, or (n, p, 3, 2), one for each point.
         W: (n, p, 2) keypoints in units of S; the translation is free.
-        visible: (n, p).
+        weight: (n, p) in [0, 1] of the keypoints, by which the variance of their noise is divided;
+            0 = missing.
         errors: prior of the errors of S.
-        noise: standard deviation (n,) of the coordinates of W, in units of S. 0: the shape meets
-            the keypoints exactly.
+        noise: standard deviation (n,) of the coordinates of W of weight 1, in units of S. 0: the
+            shape meets the keypoints exactly.
     """
     n, p, _ = S.shape
     noise = np.broadcast_to(noise, n)
     if n > _BLOCK:
-        parts = [correct(S[b], M[b], W[b], visible[b], errors, noise[b]) for b in slices(n, _BLOCK)]
+        parts = [correct(S[b], M[b], W[b], weight[b], errors, noise[b]) for b in slices(n, _BLOCK)]
         return np.concatenate(parts)
     covariance, bones = errors
     M = (M if M.ndim == 4 else M[:, None]).astype(np.float64)
@@ -94,13 +95,15 @@ def correct(
     H = H.reshape(n, 2 * p, 3 * p)
     unknown = UNKNOWN_VARIANCE * np.trace(covariance) / (3 * p)
     least = 1e-12 * unknown  # above zero, so that the system is regular even where M is no camera
-    variance = np.where(visible, np.square(noise)[:, None] + least, unknown)  # (n, p)
+    shown = weight > 0
+    variance = np.square(noise)[:, None] / np.where(shown, weight, 1) + least  # (n, p)
+    variance = np.where(shown, np.minimum(variance, unknown), unknown)
     R: Floats = np.zeros((n, p, 2, p, 2))
     for axis in range(2):
         R[:, :, axis, :, axis] = unknown  # of the translation, which all points share
         R[:, range(p), axis, range(p), axis] += variance
     R = R.reshape(n, 2 * p, 2 * p)
-    r = ((W - (S[..., None, :] @ M)[..., 0, :]) * visible[..., None]).reshape(n, 2 * p)
+    r = ((W - (S[..., None, :] @ M)[..., 0, :]) * shown[..., None]).reshape(n, 2 * p)
     E = _posterior_mean(covariance, H, R, r)
     if bones is not None:
         G, missing_length, length_covariance = bones.length_constraint(S + E.reshape(S.shape))
@@ -129,7 +132,7 @@ def error_covariance(lift: Lift, W: Floats, rng: np.random.Generator) -> NDArray
         rng: draws the random cameras.
     """
     _, p, _ = W.shape
-    all_visible = np.ones(W.shape[:2], bool)
+    all_visible = np.ones(W.shape[:2])
     covariance = np.eye(3 * p)
     for _ in range(_ROUNDS):
         T = centre(correct(*lift(W), all_visible, ErrorModel(covariance)))
@@ -165,7 +168,7 @@ def bone_lengths(
     """
     if not pairs:
         return np.zeros((0, 2), np.float32)
-    all_visible = np.ones(W.shape[:2], bool)
+    all_visible = np.ones(W.shape[:2])
     errors = ErrorModel(covariance)
     T = centre(correct(*lift(W), all_visible, errors))
     T_again = correct(*lift(T @ random_cameras(len(T), rng)), all_visible, errors)

@@ -17,6 +17,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
 from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.lifting.observation import from_arrays
+from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model
 
@@ -66,7 +67,8 @@ class LiftingOptions:
     min_visible: int = option(
         4,
         "fewest detected keypoints with which an object is lifted; a keypoint that follows from "
-        "others does not count, as a neck between two visible shoulders; 4 typical",
+        "others does not count, as a neck between two visible shoulders, nor does one whose "
+        "confidence is far below that of the others; 4 typical",
         low=3,
         high=1000,
     )
@@ -176,12 +178,13 @@ class Lifter:
         Args:
             confidence: (n, p) as in `lift`.
         """
-        return self._to_model.detected_count(confidence > 0)
+        return self._to_model.detected_count(trusted(keypoint_weight(confidence)))
 
     def lift(self, points: Float32, confidence: Float32, *, perspective: bool = False) -> Lifted:
         """Lift an observation in the model's layout, without the checks of a call.
 
         Keypoints that a map from this lifter's layout derives do not count for `min_visible`.
+        A confidence is a weight: see `lifting.weights`.
 
         Args:
             points: (n, p, 2) float32, finite.

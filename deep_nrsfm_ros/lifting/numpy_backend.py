@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.layouts.keypoint_map import detected_count
 from deep_nrsfm_ros.lifting.confidence import keypoint_confidence
 from deep_nrsfm_ros.lifting.correction import ErrorModel, correct
+from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.geometry import (
     centre,
@@ -76,6 +77,20 @@ class LifterConstants(NamedTuple):
     derivations: NDArray[np.int32]
 
 
+class Keypoints(NamedTuple):
+    """Keypoints as the detector gives them.
+
+    Attributes:
+        points: (n, p, 2).
+        weight: (n, p) in [0, 1]; 0 = missing.
+        trusted: (n, p) whether the network reads the keypoint.
+    """
+
+    points: Float32
+    weight: NDArray[np.float64]
+    trusted: NDArray[np.bool_]
+
+
 class NumpyBackend:
     """Lifts keypoints with NumPy.
 
@@ -98,10 +113,12 @@ class NumpyBackend:
             confidence: (n, p) in [0, 1], 0 = missing.
             perspective: as in `Lifter.lift`.
         """
-        visible = confidence > 0
+        weight = keypoint_weight(confidence)
+        visible = trusted(weight)
+        seen = Keypoints(points, weight, visible)
         mask = visible[..., None].astype(np.float32)
         complete = np.ones_like(mask)
-        solution = self._solve(points, mask, visible, perspective)
+        solution = self._solve(points, mask, seen, perspective)
         if not visible.all():
             for _ in range(self.constants.refill):
                 S, _, _, unit, origin = solution
@@ -109,10 +126,11 @@ class NumpyBackend:
                 if perspective:
                     reprojected /= np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
                 filled = np.where(visible[..., None], points, reprojected)
-                solution = self._solve(filled, complete, visible, perspective)
+                solution = self._solve(filled, complete, seen, perspective)
         S, R, residual, _, _ = solution
         S = centre(S)
-        probability = self.keypoint_confidence(confidence, residual, S)
+        believed = np.where(visible, confidence, np.float32(0))
+        probability = self.keypoint_confidence(believed, residual, S)
         S *= self.constants.reference_length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
         not_lifted = on_one_line(points, visible)
@@ -142,13 +160,13 @@ class NumpyBackend:
         return relative
 
     def _solve(
-        self, points: Float32, mask: Float32, visible: NDArray[np.bool_], perspective: bool
+        self, points: Float32, mask: Float32, seen: Keypoints, perspective: bool
     ) -> tuple[Float32, Float32, Float32, Float32, Float32]:
         """Return S in camera axes, R, residual (n,), and unit and origin of S in the image.
 
-        The network reads all points of mask (n, p, 1); the correction only the visible ones.
+        The network reads all points of mask (n, p, 1); the correction those of positive weight.
         """
-        constants = self.constants
+        constants, visible = self.constants, seen.trusted
         W, gain, unit, origin = normalise(constants.network, constants.normaliser, points, mask)
         S, M, residual = self._average(gain * W, W, visible, unit if perspective else None)
         R = rotation_from_camera(M)
@@ -156,8 +174,11 @@ class NumpyBackend:
             shown = visible[..., None]
             size = np.sqrt((W * W * shown).sum((1, 2)) / np.maximum(2 * shown.sum((1, 2)), 1))
             errors = ErrorModel(constants.covariance, constants.bones)
+            doubtful = ((seen.weight > 0) & ~visible)[..., None]
+            W = np.where(doubtful, (seen.points - origin) / unit, W)
+            points = np.where(doubtful, seen.points, points)
             cameras = M[:, None] - R[:, None, 2, :, None] * points[:, :, None] if perspective else M
-            S = correct(S @ R, cameras, W, visible, errors, constants.noise * size)
+            S = correct(S @ R, cameras, W, seen.weight, errors, constants.noise * size)
             S = S @ R.swapaxes(1, 2)
         return S, R, residual, unit, origin
 

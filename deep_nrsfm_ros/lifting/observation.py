@@ -16,6 +16,9 @@ No image is this large, and sums of squares of such numbers stay far below the l
 """
 MIN_POSITIVE = np.nextafter(np.float32(0), np.float32(1))
 """The smallest positive float32: a keypoint of confidence 0 is missing at any threshold."""
+_BORDER = 0.002  # of the image's side
+_FAR = 0.05  # fraction of keypoints half an image outside that is too many
+_HALF_PIXEL = np.float32(0.5)  # the last pixel is at size - 1
 _CERTAIN, _MISSING = np.float32(1), np.float32(0)
 
 Identities = tuple[str | None, ...]
@@ -70,6 +73,31 @@ def to_observation(
     points = np.zeros((*visible.shape, 2), np.float32)
     np.copyto(points, values[..., :2], where=visible[..., None])
     return Observation(points, confidence, identities)
+
+
+def without_border(observation: Observation, size: tuple[int, int]) -> Observation:
+    """Return the observation with keypoints at the image's border, or outside, as missing.
+
+    A detector puts there what it does not see: the legs of a person whom the image cuts off. The
+    border is 1 pixel wide, or 0.2 % of the image's side if that is more. Where many keypoints are far
+    outside, the size is not that of their image, and nothing is left out.
+
+    Args:
+        observation: n objects in pixels.
+        size: width and height of the image in pixels.
+    """
+    points, confidence, identities = observation
+    half = np.array(size, np.float32) / 2
+    inner = half - np.maximum(np.float32(1), np.float32(2 * _BORDER) * half)
+    outside = (np.abs(points - half + _HALF_PIXEL) >= inner).any(-1)
+    visible = confidence > 0
+    if not (outside & visible).any():
+        return observation
+    far = (np.abs(points - half) > 2 * half).any(-1) & visible
+    if far.sum() > _FAR * visible.sum():
+        return observation
+    points = np.where(outside[..., None], _MISSING, points)
+    return Observation(points, np.where(outside, _MISSING, confidence), identities)
 
 
 def from_arrays(

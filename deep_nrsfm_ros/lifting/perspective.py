@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, mark_not_lifted
 from deep_nrsfm_ros.lifting.numpy_backend import Float32
+from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.nrsfm.geometry import Floats, weak_perspective
 
 _MIN_COSINE = 0.1  # of the angle between the rays of a point and of its object
@@ -40,7 +41,7 @@ class VirtualViews(NamedTuple):
 
 
 def virtual_views(intrinsics: Intrinsics, points: Float32, confidence: Float32) -> VirtualViews:
-    """Return the view of a virtual camera towards the mean ray of each object.
+    """Return the view of a virtual camera towards the mean trusted ray of each object.
 
     Args:
         intrinsics: of the camera.
@@ -51,7 +52,8 @@ def virtual_views(intrinsics: Intrinsics, points: Float32, confidence: Float32) 
     visible = (confidence > 0) & ~np.isnan(rays[..., 0])
     rays[~visible] = 0
     axis = np.ones((len(rays), 3))
-    axis[:, :2] = rays.sum(1) / np.maximum(visible.sum(1), 1)[:, None]
+    aimed = visible & trusted(keypoint_weight(confidence))
+    axis[:, :2] = (rays * aimed[..., None]).sum(1) / np.maximum(aimed.sum(1), 1)[:, None]
     rotations = _rotations_to_z(axis / np.linalg.norm(axis, axis=1, keepdims=True))
     rotated = rays @ rotations[:, :, :2].swapaxes(1, 2) + rotations[:, None, :, 2]
     depth = rotated[..., 2:]
@@ -82,7 +84,7 @@ def lift_perspective(
     """
     views = virtual_views(intrinsics, points, confidence)
     lifted = lifter.lift(views.points, views.confidence, perspective=True)
-    visible = views.confidence > 0
+    visible = trusted(keypoint_weight(views.confidence))
     position = solve_translation(lifted.shapes, views.points, visible)
     not_lifted = ~(position[:, 2] > 0)
     to_virtual = views.rotations.astype(np.float32)

@@ -11,7 +11,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
-from deep_nrsfm_ros.lifting.observation import MessageError, Observation
+from deep_nrsfm_ros.lifting.observation import MessageError, Observation, without_border
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
@@ -172,6 +172,8 @@ class Pipeline:
                 f"{self._max_objects} (max_objects)"
             )
         points = to_pixels(points, confidence, size)
+        if size:
+            points, confidence, _ = without_border(Observation(points, confidence), size)
         return header, Observation(*self._map(points, confidence), identities)
 
     @property
@@ -224,7 +226,8 @@ class Pipeline:
                 )
             raise MessageError(
                 f"message has at most {detected} detected keypoints of the model's "
-                f"{len(self.model.layout)} in an object, without those that follow from others; "
+                f"{len(self.model.layout)} in an object, without those at the image's border, of "
+                "low confidence, or that follow from others; "
                 f"min_visible is {self._min_visible}"
             )
         return lifted, identities
