@@ -77,7 +77,8 @@ static int lengths_match(int count, const Py_buffer *arrays, const Py_ssize_t *s
    not_lifted): fill the last seven: the arrays of `lifting.Lifted`, float32, and not_lifted (n,) of bool.
 
    The GIL is held: a lift takes less than waiting for the GIL does, and the scratch memory of a plan serves one
-   lift at a time. The flag makes keypoint_confidence of that also where an object's buffer method lifts with the same plan. */
+   lift at a time. The busy flag also rejects a nested lift with the same plan, which the buffer method of an
+   argument could start. */
 static PyObject *lift_entry(PyObject *Py_UNUSED(module), PyObject *args) {
     static const ArrayArgument expected[9] = {
         {"points", FLOAT32, 0},    {"confidence", FLOAT32, 0}, {"shapes", FLOAT32, 1},

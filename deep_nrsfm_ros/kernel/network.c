@@ -1,11 +1,12 @@
 /* The forward pass of nrsfm/network.py for the default variant of an architecture and a block of objects.
 
-   A layer is one product for all objects, since reading the weights costs more than a few rows. */
+   Each layer is one matrix product for all objects of the block, so that its weights are read once. */
 #include <string.h>
 
 #include "plan.h"
 
-/* The missing keypoints solve (m, m) equations: their rows and columns of the completion matrix. */
+/* Fill in the m missing keypoints: solve P_mm x = -P_mv w, with P (p, p) the completion matrix and v the keypoints of
+   the input. */
 void complete_points(Plan *k, const Object *o, float *filled) {
     int p = k->p, m = 0, *missing = k->missing;
     for (int i = 0; i < p; i++)

@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, status
-from deep_nrsfm_ros.training.job import Progress, TrainingJob
+from deep_nrsfm_ros.training.job import JobStatus, TrainingJob
 from deep_nrsfm_ros.training.record import find_records, read_record
 from deep_nrsfm_ros.training.request import TrainingRequest
 
@@ -46,7 +46,7 @@ class TrainingService:
         self._job: TrainingJob | None = None
         self._name, self._activate_when_finished = "", True
         self._state, self._last_failure = "idle", "none"
-        self._progress: SimpleQueue[Progress] = SimpleQueue()
+        self._progress: SimpleQueue[JobStatus] = SimpleQueue()
         self._wake = node.create_guard_condition(self._report)
         self._publisher = node.create_publisher(
             DiagnosticStatus,
@@ -72,7 +72,7 @@ class TrainingService:
             self._node.get_logger().warning(text)
             message += f"; {text}"
         names = {"unfinished": ", ".join(record.name for record in records)} if records else {}
-        self._publish(Progress("idle", message, {**names}))
+        self._publish(JobStatus("idle", message, {**names}))
 
     def _train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start a training and answer at once."""
@@ -97,7 +97,7 @@ class TrainingService:
         if warning:
             response.message += f"; {warning}"
             self._node.get_logger().warning(warning)
-        self._publish(Progress("starting", f"starting on {data}", {}))
+        self._publish(JobStatus("starting", f"starting on {data}", {}))
         return response
 
     def _cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -109,7 +109,7 @@ class TrainingService:
             response.message = f"cancelling the training of {self._name!r}"
         return response
 
-    def _enqueue(self, progress: Progress) -> None:
+    def _enqueue(self, progress: JobStatus) -> None:
         """Pass progress from the job's thread to the executor's."""
         self._progress.put(progress)
         self._wake.trigger()
@@ -129,14 +129,14 @@ class TrainingService:
                 progress = self._switch(progress)
             self._publish(progress)
 
-    def _with_advice(self, progress: Progress) -> Progress:
+    def _with_advice(self, progress: JobStatus) -> JobStatus:
         """Return the end of a training with how to continue it, if it can be continued."""
         record = read_record(self._folder, self._name)
         if not record:
             return progress
         return progress._replace(message=f"{progress.message}\n{record}: {record.advice}")
 
-    def _switch(self, progress: Progress) -> Progress:
+    def _switch(self, progress: JobStatus) -> JobStatus:
         """Activate the model of a finished training and say so."""
         try:
             self._activate(str(progress.values.get("model", "")))
@@ -144,7 +144,7 @@ class TrainingService:
             return progress._replace(message=f"{progress.message}; not in use: {problem}")
         return progress._replace(message=f"{progress.message}; in use from now on")
 
-    def _publish(self, progress: Progress) -> None:
+    def _publish(self, progress: JobStatus) -> None:
         """Publish progress, and log it where the state changes or there is a message."""
         failed = progress.state == "failed"
         news = f"training of {self._name!r}: {progress.message}"

@@ -22,14 +22,14 @@ ACTIVE = ("starting", "reading", "training")
 ENDED = ("finished", "failed", "cancelled")
 TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
 
-_LAST_WORDS = 10
-_DYING = 0.5  # seconds that a process has to die of SIGKILL
-_NICENESS = 10  # a tenth of the share of others; at 19 it gets nothing on a busy machine
+_OUTPUT_TAIL = 10  # lines
+_KILL_TIMEOUT = 0.5  # s, from SIGKILL to the end of the process
+_NICENESS = 10  # about a tenth of the CPU time of a process at 0; 19 gets almost none
 _LINE_LIMIT = 65536
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
-class Progress(NamedTuple):
+class JobStatus(NamedTuple):
     """One step of a training run: its state, a line for people, and named figures."""
 
     state: str
@@ -38,23 +38,24 @@ class Progress(NamedTuple):
 
     @property
     def ended(self) -> bool:
-        """Tell whether nothing will follow."""
+        """Whether this is the last status."""
         return self.state in ENDED
 
 
 class TrainingJob:
     """One run of the training command, from its start to its end.
 
-    The process runs at a low priority in a session of its own, so that neither Ctrl-C nor its load
-    reaches the lifter. It reads its configuration from a file in memory (`--config`). It prints
-    one JSON object a line, {"state": ..., ...}; the last other lines are kept as its last words.
-    Its standard input is a pipe: end of file means that the lifter is gone, and the process ends.
+    The process has a session of its own, so that Ctrl-C in the lifter's terminal does not reach it,
+    and a low priority, so that it does not slow the lifter. It reads its configuration from a file
+    in memory (`--config`). It prints one JSON object a line, {"state": ..., ...}; the last other
+    lines are kept for the report of a failure. Its standard input is a pipe: end of file means that
+    the lifter is gone, and the process ends.
     """
 
     def __init__(
         self,
         config: TrainingConfig,
-        on_progress: Callable[[Progress], None],
+        on_progress: Callable[[JobStatus], None],
         *,
         grace: float = 20.0,
         command: Sequence[str] = TRAIN_COMMAND,
@@ -71,8 +72,8 @@ class TrainingJob:
         self._on_progress = on_progress
         self._grace = grace
         self._cancelled = False
-        self._said: Progress | None = None
-        self._last_words: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._last_status: JobStatus | None = None
+        self._output_tail: deque[str] = deque(maxlen=_OUTPUT_TAIL)
         threads = str(config.output.threads or os.cpu_count() or 1)
         with _file_in_memory(config.to_json()) as file:
             self._process = subprocess.Popen(
@@ -95,7 +96,7 @@ class TrainingJob:
 
     @property
     def running(self) -> bool:
-        """Tell whether the end has yet to be reported."""
+        """Whether the last status is still to come."""
         return self._watcher.is_alive()
 
     def cancel(self) -> None:
@@ -109,13 +110,14 @@ class TrainingJob:
     def close(self, timeout: float) -> None:
         """Cancel and return when the process is gone; kill it after `timeout` seconds.
 
-        One that a disk or a driver holds dies when that lets go of it: nobody waits for it here.
+        A process in uninterruptible I/O ends only when the I/O returns: after SIGKILL this waits at
+        most 0.5 s.
         """
         self.cancel()
         self._watcher.join(timeout)
         if self.running:
             self._signal(signal.SIGKILL)
-            self._watcher.join(_DYING)
+            self._watcher.join(_KILL_TIMEOUT)
 
     def _kill_late(self) -> None:
         """Kill a process that outlives its grace."""
@@ -146,22 +148,25 @@ class TrainingJob:
         """Report a line of progress; remember any other line."""
         progress = parse_progress(line)
         if progress is None:
-            self._last_words.append(line)
+            self._output_tail.append(line)
             return
-        self._said = progress
+        self._last_status = progress
         if not progress.ended:
             self._on_progress(progress)
 
-    def _ending(self, code: int) -> Progress:
+    def _ending(self, code: int) -> JobStatus:
         """Return the last progress of a process that ended with `code`."""
-        said, values = self._said, self._said.values if self._said else {}
-        if said and said.ended and (code == 0 or said.state == "failed"):
-            return said
+        last = self._last_status
+        values = last.values if last else {}
+        if last and last.ended and (code == 0 or last.state == "failed"):
+            return last
         if self._cancelled:
-            return Progress("cancelled", "stopped before there was a model to keep", values)
+            return JobStatus("cancelled", "stopped before there was a model to keep", values)
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
-        words = "\n".join(self._last_words) or "it said nothing"
-        return Progress("failed", f"the training process ended {how}; its last words:\n{words}", {})
+        words = "\n".join(self._output_tail) or "it printed nothing"
+        return JobStatus(
+            "failed", f"the training process ended {how}; its last output:\n{words}", {}
+        )
 
 
 def _file_in_memory(text: str) -> BinaryIO:
@@ -173,10 +178,10 @@ def _file_in_memory(text: str) -> BinaryIO:
 
 
 def _yield_to_others(pid: int) -> None:
-    """Give a process that leads a session a low priority, and let it go first for memory.
+    """Give a process a low priority, and make it the first one killed when memory runs out.
 
-    Where Linux groups processes by session, as on a desktop, priorities count within a session
-    only, and the session has one of its own.
+    With the autogroup scheduling of Linux a nice value counts only within its session, so that the
+    nice value of the session is set too.
     """
     with suppress(OSError):  # it ended already, or there are no such groups
         os.setpriority(os.PRIO_PROCESS, pid, _NICENESS)
@@ -184,7 +189,7 @@ def _yield_to_others(pid: int) -> None:
         Path(f"/proc/{pid}/autogroup").write_text(str(_NICENESS))
 
 
-def parse_progress(line: str) -> Progress | None:
+def parse_progress(line: str) -> JobStatus | None:
     """Return the progress that a line of output reports; None if it reports none."""
     try:
         report = json.loads(line)
@@ -199,7 +204,7 @@ def parse_progress(line: str) -> Progress | None:
         for key, value in report.items()
         if value is None or isinstance(value, (str, int, float))
     }
-    return Progress(state, str(message), values)
+    return JobStatus(state, str(message), values)
 
 
 def _in_words(state: str, report: dict[str, Any]) -> str:

@@ -15,7 +15,7 @@ from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.losses import Batch, Objective
 from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
-from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
+from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.adam import Adam
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.frames import FrameStore
@@ -24,6 +24,7 @@ from deep_nrsfm_ros.training.gradient_function import (
     weight_vector,
     with_weights,
 )
+from deep_nrsfm_ros.training.schedule import learning_rate
 
 
 class Trainer:
@@ -212,18 +213,3 @@ def second_moment(
     group.sum_in_place(total, count)
     moment = (total / count.clamp(min=1)).cpu().numpy()
     return np.asarray(moment, np.float64)
-
-
-def learning_rate(recipe: Recipe, step: float, time_fraction: float = 0.0) -> float:
-    """Return the learning rate of a step.
-
-    Args:
-        recipe: gives the schedule.
-        step: steps taken.
-        time_fraction: elapsed fraction of the time limit; the schedule is at least that far, so
-            that it ends with the time.
-    """
-    step = max(step, min(time_fraction, 1.0) * recipe.steps)
-    if recipe.schedule == "exponential":
-        return recipe.learning_rate * float(0.95 ** (step / 10000))
-    return recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * step / recipe.steps))

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deep_nrsfm_ros.training.config import TrainingConfig
-from deep_nrsfm_ros.training.job import ENDED, Progress, TrainingJob, parse_progress
+from deep_nrsfm_ros.training.job import ENDED, JobStatus, TrainingJob, parse_progress
 
 STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in_training.py")))
 AUTOGROUP = Path("/proc/self/autogroup")
@@ -28,15 +28,15 @@ class Listener:
     """Collects the progress of a job."""
 
     def __init__(self) -> None:
-        self._heard: SimpleQueue[Progress] = SimpleQueue()
+        self._heard: SimpleQueue[JobStatus] = SimpleQueue()
 
-    def __call__(self, progress: Progress) -> None:
+    def __call__(self, progress: JobStatus) -> None:
         self._heard.put(progress)
 
-    def next(self) -> Progress:
+    def next(self) -> JobStatus:
         return self._heard.get(timeout=DEADLINE)
 
-    def until_end(self) -> list[Progress]:
+    def until_end(self) -> list[JobStatus]:
         """Return all progress up to the end, which must be the last."""
         heard = [self.next()]
         while not heard[-1].ended:
@@ -91,7 +91,7 @@ def test_cancel_keeps_what_there_is() -> None:
     listener.next()
     job.cancel()
     job.cancel()
-    assert listener.until_end()[-1] == Progress(
+    assert listener.until_end()[-1] == JobStatus(
         "cancelled", "kept the best of 1 step", {"model": "best.safetensors"}
     )
     assert_gone(job.pid)

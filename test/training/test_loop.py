@@ -24,7 +24,8 @@ from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.loop import Callbacks, train
 from deep_nrsfm_ros.training.progress import Progress
-from deep_nrsfm_ros.training.trainer import Trainer, learning_rate
+from deep_nrsfm_ros.training.schedule import learning_rate
+from deep_nrsfm_ros.training.trainer import Trainer
 from test.fixtures.training_options import by_dataclass
 
 SMALL = Preset(

@@ -10,7 +10,8 @@ import pytest
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.trainer import learning_rate, second_moment
+from deep_nrsfm_ros.training.schedule import learning_rate
+from deep_nrsfm_ros.training.trainer import second_moment
 
 
 @pytest.mark.parametrize("scale", ["rms", "none"])
