@@ -47,6 +47,7 @@ from deep_nrsfm_ros.messages.pipeline import AUTO, MODEL_ORDER, InputOptions, Pi
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
+from deep_nrsfm_ros.messages.unused_options import unused_options
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
@@ -57,7 +58,6 @@ from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions,
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
 from deep_nrsfm_ros.node.training_service import TrainingService
 from deep_nrsfm_ros.node.transforms import TransformBroadcaster
-from deep_nrsfm_ros.node.unused_options import unused_options
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.request import (

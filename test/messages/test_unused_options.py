@@ -9,7 +9,7 @@ import pytest
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.pipeline import InputOptions
-from deep_nrsfm_ros.node.unused_options import unused_options
+from deep_nrsfm_ros.messages.unused_options import unused_options
 
 DEFAULTS = (InputOptions(), LiftingOptions(), SmoothingOptions())
 
