@@ -191,18 +191,32 @@ def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:
     if shape and math.prod(shape) != len(data):
         sizes = " x ".join(map(str, shape))
         raise MessageError(f"layout says {sizes} numbers; data has {len(data)} after its offset")
+    if not len(data):
+        return np.empty((0, keypoints, 2))  # nobody is there
     if len(shape) < 2:
         if len(data) not in (2 * keypoints, 3 * keypoints):
             raise MessageError(
                 f"data has {len(data)} numbers and no layout; {keypoints} keypoints need "
                 f"{2 * keypoints} (x, y) or {3 * keypoints} (x, y, confidence)"
+                + _remedy(len(data), keypoints)
             )
         shape = [keypoints, len(data) // keypoints]
     *objects, count, size = shape
     if size not in (2, 3):
-        raise MessageError(f"last dimension is {size}; expected 2 (x, y) or 3 (x, y, confidence)")
+        turned = f": the dimensions are {count} x {size}, send them as {size} x {count}"
+        raise MessageError(
+            f"last dimension is {size}; expected 2 (x, y) or 3 (x, y, confidence)"
+            + turned * (size == keypoints and count in (2, 3))
+        )
     check_keypoints(count, keypoints, "next to last dimension")
     return data.reshape(*(objects or [1]), count, size)
+
+
+def _remedy(numbers: int, keypoints: int) -> str:
+    """Return what to do about another count of numbers than the layout has, for error texts."""
+    if numbers and (numbers % (2 * keypoints) == 0 or numbers % (3 * keypoints) == 0):
+        return ": give the data of several objects dimensions, objects x keypoints x 2 or 3"
+    return ": name the layout in which the detector gives them"
 
 
 def _polygon(message: Any, keypoints: int) -> NDArray[np.floating]:
@@ -211,6 +225,8 @@ def _polygon(message: Any, keypoints: int) -> NDArray[np.floating]:
     If z is 0 for all points, the detector gives no confidence, and all points have confidence 1.
     """
     points = message.polygon.points
+    if not len(points):
+        return np.empty((0, keypoints, 2))  # nobody is there
     check_keypoints(len(points), keypoints, "number of points")
     values = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(1, keypoints, 3)
     return values if values[..., 2].any() else values[..., :2]

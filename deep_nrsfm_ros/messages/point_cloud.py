@@ -73,6 +73,14 @@ def point_cloud_format(message: Any, keypoints: int) -> PointCloudFormat:
         MessageError: another number of keypoints, a missing field, or too little data.
     """
     height, width, step = int(message.height), int(message.width), int(message.point_step)
+    if not width:  # nobody is there: an empty cloud may have any height
+        height, width = 0, keypoints
+    if width != keypoints and (height == keypoints or height == 1 and not width % keypoints):
+        raise MessageError(
+            f"width is {width} and height {height}; width is the number of keypoints, which is "
+            f"{keypoints}, and height that of objects: send {width * height // keypoints or 1} x "
+            f"{keypoints}"
+        )
     check_keypoints(width, keypoints, "width")
     names = ["x", "y"] + ["confidence"] * any(f.name == "confidence" for f in message.fields)
     formats, offsets = zip(*(_field(message.fields, name, step) for name in names), strict=True)

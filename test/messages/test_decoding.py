@@ -253,6 +253,7 @@ def test_malformed_point_cloud(mend: dict[str, Any], expected: str) -> None:
     ("sizes", "expected"),
     [
         ((5, 4), "last dimension is 4"),
+        ((10, 2), "10 keypoints .* layout has 5: name the layout"),
         ((2, 2, 5, 1), "4 dimensions"),
         ((3, 5, 3), "3 x 5 x 3 numbers; data has 20"),
         ((2**32 - 1, 2**32 - 1, 2**32 - 1), "numbers; data has 20"),
@@ -358,3 +359,38 @@ def test_plain_numbers_that_fit_twice_or_never_tell_nothing(numbers: int) -> Non
     message = Float32MultiArray(data=array("f", range(numbers)))
     with pytest.raises(MessageError, match=f"{numbers} numbers and no layout; give it one"):
         count_keypoints(message, MULTI_ARRAY)
+
+
+def test_the_layout_is_not_blamed_for_what_is_turned_or_in_one_row() -> None:
+    message = cloud(keypoints(2, 5))
+    message.height, message.width = 5, 2
+    with pytest.raises(MessageError, match="width is 2 and height 5; .*: send 2 x 5"):
+        read_observation(message, POINT_CLOUD, 5)
+    message.height, message.width = 1, 10
+    with pytest.raises(MessageError, match="width is 10 and height 1; .*: send 2 x 5"):
+        read_observation(message, POINT_CLOUD, 5)
+    message.height, message.width = 1, 7
+    with pytest.raises(MessageError, match="7 keypoints .*: name the layout"):
+        read_observation(message, POINT_CLOUD, 5)
+    for sizes, count, reason in (
+        ((2, 5), 10, "2 x 5, send them as 5 x 2"),
+        ((), 30, "give the data of several objects dimensions"),
+        ((), 34, "name the layout in which the detector gives them"),
+    ):
+        dim = [SimpleNamespace(size=size) for size in sizes]
+        layout = SimpleNamespace(data_offset=0, dim=dim)
+        with pytest.raises(MessageError, match=reason):
+            read_observation(SimpleNamespace(layout=layout, data=[1.0] * count), MULTI_ARRAY, 5)
+
+
+def test_a_message_of_nobody_has_no_objects() -> None:
+    nobody = cloud(keypoints(1, 5))
+    nobody.width, nobody.data = 0, array("B")
+    for sizes in ((), (0,), (0, 3), (0, 5, 3)):
+        dim = [SimpleNamespace(size=size) for size in sizes]
+        layout = SimpleNamespace(data_offset=0, dim=dim)
+        array_of = SimpleNamespace(layout=layout, data=[])
+        assert read_observation(array_of, MULTI_ARRAY, 5).points.shape == (0, 5, 2)
+    polygon_of = SimpleNamespace(polygon=SimpleNamespace(points=[]))
+    assert read_observation(polygon_of, POLYGON, 5).points.shape == (0, 5, 2)
+    assert read_observation(nobody, POINT_CLOUD, 5).points.shape == (0, 5, 2)

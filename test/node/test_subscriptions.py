@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, Point32, PolygonStamped, Pose, PoseArray
-from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
+from sensor_msgs.msg import JointState, MultiDOFJointState, PointCloud2, PointField
 from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -145,6 +145,30 @@ def test_several_people_of_any_message_with_the_detectors_names(
     assert objects.joint_names == ["object1", "bert"] and len(objects.transforms) == 2
     reference = unpack(client.exchange(publisher, figures(seen[1:], "", "bert")))
     np.testing.assert_array_equal(xyzc, reference)
+
+
+def test_parallel_lists_in_any_order_are_read_live_as_from_bags(
+    start_lifter: StartLifter, connect: Connect, tmp_path: Path
+) -> None:
+    joints = "\n".join(
+        ["type: sensor_msgs/JointState", "x: position", "y: velocity", "confidence: effort"]
+        + ["max_confidence: 100", "keypoint_id: name", f"names: [{', '.join(HUMAN17.keypoints)}]"]
+    )
+    start_lifter(input_type=mapping(tmp_path, joints))
+    client = connect()
+    seen = pixels(0)[0].astype(float)
+    order = np.random.default_rng(0).permutation(P)
+    message = JointState(
+        name=[HUMAN17.keypoints[i] for i in order],
+        position=seen[order, 0].tolist(),
+        velocity=seen[order, 1].tolist(),
+        effort=[100.0] * P,
+    )
+    read = unpack(client.exchange(client.publisher(JointState), message)).copy()
+    assert read.shape == (1, P, 4) and np.isfinite(read).all()
+    spread = read[0, :, :2] - read[0, :, :2].mean(0)
+    shown = seen - seen.mean(0)
+    assert np.corrcoef(spread.ravel(), shown.ravel())[0, 1] > 0.9
 
 
 def test_normalised_keypoints_wait_for_the_size_of_the_image(
