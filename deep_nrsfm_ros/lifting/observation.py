@@ -79,8 +79,8 @@ def without_border(observation: Observation, size: tuple[int, int]) -> Observati
     """Return the observation with keypoints at the image's border, or outside, as missing.
 
     A detector puts there what it does not see: the legs of a person whom the image cuts off. The
-    border is 1 pixel wide, or 0.2 % of the image's side if that is more. Where many keypoints are far
-    outside, the size is not that of their image, and nothing is left out.
+    border is 1 pixel wide, or 0.2 % of the image's side if that is more. Where many keypoints are
+    far outside, the size is not that of their image, and nothing is left out.
 
     Args:
         observation: n objects in pixels.

@@ -127,3 +127,8 @@ def test_keypoints_at_the_border_are_missing(size: tuple[int, int]) -> None:
     assert found.identities == ("a",) and points[0, 3, 0] == w + 50
     inside = Observation(points[:, :1], confidence[:, :1])
     assert without_border(inside, size) is inside
+
+
+def test_the_size_of_another_image_leaves_nothing_out() -> None:
+    observation = Observation(people(2), np.ones((2, 17), np.float32))
+    assert without_border(observation, (160, 90)) is observation
