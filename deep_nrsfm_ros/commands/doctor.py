@@ -25,6 +25,7 @@ CORE = ("numpy", "safetensors", "yaml", "rosbags", "jinja2", "tqdm")
 TO_TRAIN = ("torch",)
 FOR_ROS = ("rclpy", "sensor_msgs", "diagnostic_msgs")
 RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+SHIPPED = "human"
 HIGHEST_DOMAIN = 101  # above it, DDS takes ports that Linux gives to others
 LEAST_SHM = 8e6  # bytes: each participant of Fast DDS takes a segment of about half a MB
 
@@ -128,8 +129,12 @@ def check_model(name: str, models_dir: Path) -> Finding:
     from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 
     mend = "install the package anew; its models belong in share/deep_nrsfm_ros/models"
+    if name != SHIPPED:
+        mend = f"name another with --model; {SHIPPED} comes with the package"
     try:
         path = find_model(name, model_folders(models_dir))
+        if path.parent == models_dir:
+            mend = f"remove or replace {path}, or name another with --model"
         model = load_model(path)
     except ValueError as error:
         return Finding(str(error), mend)
@@ -177,11 +182,12 @@ def check_dds(name: str, models_dir: Path, seconds: float) -> Finding:
     try:
         took = time_to_first_points(str(path), points, seconds)
     except SelfTestError as error:
-        mend = (
-            "let the firewall pass UDP 7400-7500 and multicast on this machine, or set "
-            "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; on a busy machine raise --timeout"
-        )
-        return Finding(str(error), mend)
+        if error.ended:
+            return Finding(str(error), "mend what its output names")
+        mend = "let the firewall pass UDP 7400-7500 and multicast on this machine"
+        if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") != "LOCALHOST":
+            mend += ", or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
+        return Finding(str(error), f"{mend}; on a busy machine raise --timeout")
     return Finding(f"a lifter in another process answered {took:.1f} s after its start")
 
 
@@ -200,7 +206,8 @@ def examine(args: argparse.Namespace) -> bool:
         try:
             finding = check()
         except Exception as error:  # whatever is broken, the other checks tell more
-            finding = Finding(f"{type(error).__name__}: {error}", "mend what is wrong above first")
+            mend = "report it with this line" if well else "mend what is wrong above first"
+            finding = Finding(f"{type(error).__name__}: {error}", mend)
         well &= finding.word != "FAIL"
         print(f"{finding.word:4}  {name}: {finding.seen}", flush=True)
         if finding.mend:
@@ -214,7 +221,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     from deep_nrsfm_ros.model_files.folders import default_models_dir
 
     parser = argparse.ArgumentParser(prog=program_name("doctor"), description=__doc__)
-    parser.add_argument("--model", default="human", help="model to lift with (default: human)")
+    parser.add_argument("--model", default=SHIPPED, help="model to lift with (default: human)")
     parser.add_argument("--models-dir", type=Path, default=default_models_dir())
     parser.add_argument("--timeout", type=float, default=30.0, help="seconds for an answer")
     args = parser.parse_args(argv)

@@ -55,7 +55,7 @@ def find_files(folders: Sequence[Path]) -> list[Path]:
 
 
 def list_models(folders: Sequence[Path]) -> list[Listed]:
-    """Return a row and notes for every model file, damaged ones included."""
+    """Return a row and notes for every model file, unusable ones included."""
     listed: list[Listed] = []
     for path in find_files(folders):
         hidden = any(path.stem == other.row[0] for other in listed)
@@ -63,7 +63,7 @@ def list_models(folders: Sequence[Path]) -> list[Listed]:
         try:
             model = load_model(path)
         except ModelFileError as error:
-            listed.append(Listed((path.stem, "damaged"), (str(error), *note)))
+            listed.append(Listed((path.stem, "unusable"), (str(error), *note)))
             continue
         row = (path.stem, model.layout.name, str(len(model.layout)), *_quality(model))
         listed.append(Listed((*row, _date(model, path)), (str(path), _origin(model), *note)))

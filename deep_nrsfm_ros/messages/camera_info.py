@@ -33,6 +33,11 @@ def read_camera_info(message: Any, *, rectified: bool = False) -> Intrinsics:
     if len(matrix) != 3 * columns:
         raise MessageError(f"{name} has {len(matrix)} numbers; expected {3 * columns}")
     if not matrix[0]:
+        if rectified and message.k[0]:
+            raise MessageError(
+                "p is zero, though k is not: the camera is calibrated, and not for a rectified "
+                "image; leave rectified out, or have the driver fill p"
+            )
         raise MessageError(f"{name} is zero: the camera is not calibrated; calibrate it")
     if rectified or (lens != EQUIDISTANT and not any(distortion)):
         lens, distortion = PLUMB_BOB, []

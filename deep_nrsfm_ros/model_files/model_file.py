@@ -24,6 +24,15 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 MODEL_SUFFIX = ".safetensors"
 _FORMAT = "deep_nrsfm_ros model 2"
+_FAMILY = "deep_nrsfm_ros model "
+_FOREIGN = {
+    b"version https://git-lfs": "is a pointer of Git LFS; fetch the file with `git lfs pull`",
+    b"PK": "is a zip archive (or weights of PyTorch), not a safetensors file; unpack it, or train "
+    "a model",
+    b"\x80": "is a pickle, which is never read; train a model",
+    b"<": "is a web page, not a model; download the file itself",
+}
+"""What a file is that begins with these bytes."""
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _MAX_BYTES = 64 * 2**20
 _MAX_HEADER = 2**20
@@ -127,12 +136,29 @@ def load_model(model: str | Path, models_dir: Path | None = None) -> Model:
     try:
         metadata, weights = _metadata(content), load(content)
     except Exception as error:  # safetensors raises many kinds for a damaged file
-        raise ModelFileError(f"{path} is damaged or no safetensors file: {error}") from error
-    if metadata.get("format") != _FORMAT:
-        raise ModelFileError(f"{path} is not a {_FORMAT!r} file; train or download one")
+        reason = _foreign(content) or f"is damaged or no safetensors file: {error}"
+        raise ModelFileError(f"{path} {reason}") from error
+    written = metadata.get("format")
+    if written != _FORMAT:
+        reason = (
+            f"was written by another version of this package: its format is {str(written)[:60]!r}, "
+            f"and this version reads {_FORMAT!r}"
+            if str(written).startswith(_FAMILY)
+            else f"is a safetensors file of another program, not a {_FORMAT!r} file; train one, "
+            "or take one that `models` lists"
+        )
+        raise ModelFileError(f"{path} {reason}")
     try:
         return _build(json.loads(metadata["model"]), weights)
-    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as e:
+    except KeyError as error:
+        raise ModelFileError(f"{path} has a damaged header or weights: it lacks {error}") from error
+    except (TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as e:
+        if "unexpected keyword argument" in str(e):
+            field_name = str(e).rpartition("argument ")[2]
+            raise ModelFileError(
+                f"{path} was written by another version of this package: its field {field_name} is "
+                "not known here; install that version, or train the model anew"
+            ) from e
         raise ModelFileError(f"{path} has a damaged header or weights: {e}") from e
 
 
@@ -150,6 +176,16 @@ def _read(path: Path) -> bytes:
     except OSError as error:
         raise ModelFileError(f"cannot read model {path}: {error.strerror or error}") from error
     raise ModelFileError(f"{path} is larger than {_MAX_BYTES >> 20} MiB: not a model")
+
+
+def _foreign(content: bytes) -> str:
+    """Return what a file that is no safetensors file is instead; "" if that is not known."""
+    if not content:
+        return "is empty; copy or download it anew"
+    for start, reason in _FOREIGN.items():
+        if content.startswith(start):
+            return reason
+    return ""
 
 
 def _metadata(content: bytes) -> dict[str, Any]:
@@ -268,8 +304,12 @@ def find_model(name_or_path: str, folders: Sequence[Path]) -> Path:
         candidate = folder / f"{name_or_path}{MODEL_SUFFIX}"
         if candidate.is_file():
             return candidate
+    reason = f"no model {name_or_path!r}"
+    if len(path.parts) > 1:
+        kind = "folder" if path.is_dir() else "file"
+        wrong = f"is a {kind}, not a model file ({MODEL_SUFFIX})"
+        reason = f"model {name_or_path!r} {wrong if path.exists() else 'does not exist'}"
     names = sorted({f.stem for folder in folders for f in folder.glob(f"*{MODEL_SUFFIX}")})
     raise ModelFileError(
-        f"no model {name_or_path!r}; there are {', '.join(names) or 'none'} in "
-        f"{', '.join(map(str, folders))}"
+        f"{reason}; there are {', '.join(names) or 'none'} in {', '.join(map(str, folders))}"
     )

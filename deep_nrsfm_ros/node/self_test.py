@@ -20,7 +20,16 @@ _GRACE = 10.0  # seconds in which the process must end
 
 
 class SelfTestError(RuntimeError):
-    """No points were received; the text says how far the test got."""
+    """No points were received; the text says how far the test got.
+
+    Attributes:
+        ended: whether the lifter ended by itself.
+    """
+
+    def __init__(self, text: str, *, ended: bool) -> None:
+        """Keep the text and whether the lifter ended by itself."""
+        super().__init__(text)
+        self.ended = ended
 
 
 def time_to_first_points(model: str, keypoints: np.ndarray[Any, Any], seconds: float) -> float:
@@ -60,6 +69,7 @@ def time_to_first_points(model: str, keypoints: np.ndarray[Any, Any], seconds: f
                 publisher.publish(message)
                 executor.spin_once(timeout_sec=0.1)
             duration = time.monotonic() - start
+            code = process.poll()
         finally:
             _end(process)
             executor.shutdown()
@@ -69,8 +79,13 @@ def time_to_first_points(model: str, keypoints: np.ndarray[Any, Any], seconds: f
             return duration
         log.seek(0)
         output = log.read().decode(errors="replace").strip()[-500:] or "nothing"
-    outcome = "did not answer" if connected else "was not found"
-    raise SelfTestError(f"the lifter {outcome} within {duration:.0f} s; its output: {output}")
+    if code is not None:
+        outcome = f"ended with exit code {code} after {duration:.0f} s"
+    elif connected:
+        outcome = f"was found and did not answer within {duration:.0f} s"
+    else:
+        outcome = f"was not found within {duration:.0f} s"
+    raise SelfTestError(f"the lifter {outcome}; its output: {output}", ended=code is not None)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

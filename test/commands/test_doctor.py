@@ -60,7 +60,9 @@ def test_what_is_missing_is_named_with_the_mend(
     (tmp_path / "mine.safetensors").write_bytes(b"x" * 100)
     for name in ("mine", "nobody"):
         found = doctor.check_model(name, tmp_path)
-        assert found.word == "FAIL" and name in found.seen and "install" in found.mend
+        assert found.word == "FAIL" and name in found.seen and "--model" in found.mend
+    assert "remove or replace" in doctor.check_model("mine", tmp_path).mend
+    assert "human comes with the package" in doctor.check_model("nobody", tmp_path).mend
 
 
 def test_one_failure_makes_the_exit_code_1_and_the_others_are_still_told(

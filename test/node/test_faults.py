@@ -139,7 +139,7 @@ def test_what_becomes_of_the_model_file_does_not_matter(
     other = (models / "joints.safetensors").read_bytes()
     for content, refusal in [
         (whole[:1000], "damaged"),
-        (b"", "damaged"),
+        (b"", "is empty"),
         (None, "no model 'person'"),
         (other, ""),
         (whole, ""),

@@ -16,5 +16,5 @@ def test_a_lifter_answers(domain: int, models: Path) -> None:
 
 
 def test_a_lifter_that_does_not_start_is_quoted(domain: int, models: Path) -> None:
-    with pytest.raises(SelfTestError, match="was not found.*damaged"):
+    with pytest.raises(SelfTestError, match="ended with exit code 1.*damaged"):
         time_to_first_points(str(models / "broken.safetensors"), np.ones((17, 2)), 60)
