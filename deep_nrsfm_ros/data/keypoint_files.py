@@ -6,7 +6,6 @@ import dataclasses
 import gzip
 import io
 import zlib
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
@@ -35,10 +34,6 @@ from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 from deep_nrsfm_ros.messages.stamps import one_clock
 
 __all__ = ["KINDS", "KeypointFileError", "is_bag", "read_bag", "read_keypoints", "stamp_of"]
-
-_MANY = 3
-_SHARE = 0.02
-"""As many objects, and this share of them, with a keypoint at one negative place are a mark."""
 
 
 class Format(NamedTuple):
@@ -116,7 +111,7 @@ def _refuse(options: ReadOptions, names: tuple[str, ...], kind: str) -> None:
 
 
 def _finish(detections: Detections, options: ReadOptions) -> Detections:
-    """Return detections in pixels, without marks of missing keypoints; warn of likely ones."""
+    """Return detections in pixels, without marks of missing keypoints."""
     points, confidence = detections.points, detections.confidence
     if options.missing_value is not None:
         marked = (points == np.float32(options.missing_value)).any(-1) & (confidence > 0)
@@ -128,8 +123,6 @@ def _finish(detections: Detections, options: ReadOptions) -> Detections:
         detections = dataclasses.replace(detections, points=pixels)
     if options.image_size:
         detections = _without_border(detections, options.image_size)
-    if warning := _likely_mark(detections):
-        return dataclasses.replace(detections, warnings=(*detections.warnings, warning))
     return detections
 
 
@@ -148,28 +141,6 @@ def _without_border(detections: Detections, size: tuple[int, int]) -> Detections
         points=inner.points,
         confidence=inner.confidence,
         warnings=(*detections.warnings, warning),
-    )
-
-
-def _likely_mark(detections: Detections) -> str:
-    """Return a warning if many objects have a keypoint at the same negative place; "" if not."""
-    points = detections.points
-    negative = np.argwhere((points < 0).all(-1) & (detections.confidence > 0))
-    if not len(negative):
-        return ""
-    places = points[negative[:, 0], negative[:, 1]]
-    unique, which = np.unique(places, axis=0, return_inverse=True)
-    which = which.ravel()
-    counts = Counter(zip(which.tolist(), negative[:, 0].tolist(), strict=True))
-    objects = np.bincount([place for place, _ in counts])
-    most = int(objects.argmax())
-    if objects[most] < max(_MANY, _SHARE * len(points)):
-        return ""
-    x, y = unique[most].tolist()
-    option = f"--missing-value {x:g}" if x == y else "--missing-value with one of them"
-    return (
-        f"{objects[most]} of {len(points)} objects have keypoints at ({x:g}, {y:g}), which is "
-        f"likely a mark of missing ones: {option} leaves them out"
     )
 
 
