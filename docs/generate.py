@@ -57,14 +57,17 @@ def parameters_page() -> str:
 
 def layouts_page() -> str:
     """Return the page of all keypoint layouts, in Markdown."""
-    rows = ["| layout | keypoints | in order |", "|---|---|---|"]
+    rows = ["| layout | keypoints | picture | in order |", "|---|---|---|---|"]
     rows += [
-        f"| `{preset.name}` | {len(preset)} | {', '.join(preset.keypoints)} |"
+        f"| `{preset.name}` | {len(preset)} | [picture](layouts/{preset.name}.png) | "
+        f"{', '.join(preset.keypoints)} |"
         for preset in LAYOUTS.values()
     ]
     return (
         "# Keypoint layouts\n\nThe presets, each with its keypoints in the order in which they "
-        "come. Made by `make reference`; do not edit.\n\n" + "\n".join(rows) + "\n"
+        "come. Made by `make reference`; do not edit. A picture has the index "
+        "of each keypoint: left is green, right is orange. `python -m docs.draw_layouts` draws "
+        "them.\n\n" + "\n".join(rows) + "\n"
     )
 
 
