@@ -17,6 +17,7 @@ MAX_LATE = 1.0
 """Seconds by which a stamp may be before an earlier message's; more: the stamps begin anew."""
 
 _SECOND = 1_000_000_000  # ns
+_ZERO_FITS = _SECOND // 50  # a stamp of 0 this near to the clock is the start of the clock
 _OTHER_CLOCK = 1_000_000 * _SECOND  # two clocks that differ by more are not the same, 11 days
 _ADOPTED = 10  # messages of another clock in sequence after which it is the topic's clock
 _INTERVALS = 15  # of which the median is the period
@@ -66,7 +67,7 @@ class TopicClock:
         if interval > 0:
             self._intervals.append(interval)
         period = self._period()
-        restarted = interval < -_SECOND * MAX_LATE and interval < -3 * _SECOND * period
+        restarted = interval < -int(_SECOND * MAX_LATE) and interval < -3 * _SECOND * period
         # A late message does not set the clock back.
         if self._last is None or restarted or interval > 0:
             self._last = now
@@ -124,6 +125,7 @@ def one_clock(
     clock = int(np.median(offset[has_stamp]))
     # The median of an even number may be between two clocks.
     clock = int(offset[has_stamp][np.abs(offset[has_stamp] - clock).argmin()])
+    has_stamp |= np.abs(offset - clock) <= _ZERO_FITS
     other = has_stamp & (np.abs(offset - clock) > _OTHER_CLOCK)
     valid = np.flatnonzero(has_stamp & ~other)
     replaced = np.flatnonzero(~has_stamp | other)
@@ -149,12 +151,12 @@ def _unrolled(
 ) -> tuple[NDArray[np.int64], int]:
     """Return stamps that do not go back, by the times of receipt, and how often they did."""
     latest = np.maximum.accumulate(stamps)
-    if not (stamps < latest - _SECOND * MAX_LATE).any():
+    if not (stamps < latest - int(_SECOND * MAX_LATE)).any():
         return stamps, 0
     result, shift, last, loops = stamps.copy(), 0, int(stamps[0]), 0
     for i in range(1, len(stamps)):
         stamp = int(stamps[i]) + shift
-        if stamp < last - _SECOND * MAX_LATE:
+        if stamp < last - int(_SECOND * MAX_LATE):
             follows = last + max(int(arrived[i] - arrived[i - 1]), 1)
             shift, stamp, loops = shift + follows - stamp, follows, loops + 1
         result[i], last = stamp, max(last, stamp)

@@ -42,6 +42,7 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
     """
     check_name(names("name"), config.output.name)
     _check_ranges(config, names)
+    require_extra("train", "training")
     _check_data(config, names)
     source, target = find_layouts(config, names)
     if target != _NUMBERED_LAYOUT:
@@ -53,7 +54,6 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
             start_from(start, target)
         check_fixed_options(start, config.preset, names)
     check_room(names("free_disk"), config.output.folder, config.limits.free_disk)
-    require_extra("train", "training")
     left_out = look_into_bags(config, names, source)
     handedness = "" if config.start else target.warning  # a start passes its handedness on
     return "; ".join(filter(None, (*left_out, handedness)))

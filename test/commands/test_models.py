@@ -104,9 +104,9 @@ def test_damaged_files_are_listed_with_the_reason(
     (own / "lost.safetensors").symlink_to(own / "nowhere")
     (own / "notes.txt").write_text("no model")
     lines = listing(capsys, own)
-    assert [line.split() for line in lines if "damaged" in line and line[0] != " "] == [
-        ["broken", "damaged"],
-        ["lost", "damaged"],
+    assert [line.split() for line in lines if "unusable" in line and line[0] != " "] == [
+        ["broken", "unusable"],
+        ["lost", "unusable"],
     ]
     text = " ".join(" ".join(lines).split())
     assert f"{own / 'broken.safetensors'} is damaged or no safetensors file" in text

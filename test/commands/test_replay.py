@@ -89,7 +89,7 @@ def test_answers_are_shown_as_they_were_recorded(
         (["--html", "page.html"], "--html needs a BAG"),
         (["nowhere", "--html", "page.html"], "nowhere does not exist"),
         (["keypoints", "--html", "no/page.html"], "no/page.html"),
-        (["keypoints", "--html", "page.html", "--model", "cmu31"], "have 17 keypoints"),
+        (["keypoints", "--html", "page.html", "--model", "cmu31"], "has 17 keypoints"),
         (
             ["answered", "--html", "page.html", "--model", "cmu31", "--keypoint-layout", "human17"],
             "name the model that lifted",

@@ -133,7 +133,7 @@ def test_the_gradient_is_that_of_small_changes() -> None:
 def test_a_layout_must_have_what_is_asked_for() -> None:
     bare = KeypointLayout.numbered(5)
     with pytest.raises(
-        ValueError, match="bone_length_weight is 2, but layout 'points5' has no edges; give it"
+        ValueError, match="bone_length_weight is 2, but layout 'points5' has no edges; add some"
     ):
         LayoutLoss(LayoutLossWeights(bone_length_weight=2.0), bare)
     with pytest.raises(

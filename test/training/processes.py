@@ -32,9 +32,16 @@ def first_step(points: torch.Tensor, group: ProcessGroup) -> dict[str, torch.Ten
     pool = dataclasses.replace(pool, usable=group.shard(pool.usable))
     trainer = Trainer(pool, PRESET, 0, group=group)
     batch = trainer.sample(trainer.batch, 0).points
+    gradients: list[torch.Tensor] = []
+    update = trainer.optimiser.update
+
+    def record(gradient: torch.Tensor, learning_rate: float) -> None:
+        gradients.append(gradient.clone())
+        update(gradient, learning_rate)
+
+    trainer.optimiser.update = record  # type: ignore[method-assign]
     trainer.advance()
-    gradient = trainer.weights.grad
-    assert gradient is not None
+    (gradient,) = gradients
     return {"batch": batch, "gradient": gradient, "L": trainer.initial.L}
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +61,8 @@ def read_npz(path: Path, options: ReadOptions) -> Detections:
                 if name == "points":
                     raise KeypointFileError(text) from None
                 warnings.append(text)
+            except (BadZipFile, EOFError, OSError, zlib.error) as error:
+                raise KeypointFileError(f"array `{name}` is damaged: {error}") from error
     return _detections(arrays, options, warnings)
 
 
