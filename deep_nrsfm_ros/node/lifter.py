@@ -501,14 +501,23 @@ def _run() -> None:
     except (ParameterException, ValueError, OSError) as problem:
         rclpy.logging.get_logger("lifter").fatal(f"cannot start: {problem}")
         sys.exit(1)
+    try:
+        # rclpy prints a traceback for an executor whose context a signal has shut down already.
+        if rclpy.ok():
+            _spin(node)
+    finally:
+        node.close()
+        node.destroy_node()
+
+
+def _spin(node: LifterNode) -> None:
+    """Serve the node until the context is shut down."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
         executor.spin()
     finally:
-        node.close()
         executor.shutdown()
-        node.destroy_node()
 
 
 if __name__ == "__main__":
