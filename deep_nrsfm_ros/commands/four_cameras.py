@@ -51,7 +51,7 @@ def camera_table(models: Sequence[Model], session: Session) -> str:
 def figures(model: Model, view: View, session: Session, *, intrinsics: bool) -> list[float]:
     """Return the figures of one camera, in the order of `CAMERA_CONVENTIONS`; NaN for none.
 
-    intrinsics: whether the lifter is told them.
+    intrinsics: whether the lifter uses the camera's intrinsics.
     """
     values = np.concatenate((view.points, view.confidence[..., None]), -1)
     seen = to_observation(values, InputOptions().min_confidence)

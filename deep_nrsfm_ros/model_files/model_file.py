@@ -165,7 +165,7 @@ def load_model(model: str | Path, models_dir: Path | None = None) -> Model:
 def _read(path: Path) -> bytes:
     """Return what a file holds, its size bounded; raise ModelFileError.
 
-    Read, not mapped: a mapped file that somebody cuts off meanwhile kills whoever looks at it.
+    The file is read, not memory-mapped: truncating a mapped file ends the process that uses it.
     """
     try:
         if path.exists() and not path.is_file():  # reading a pipe would wait for ever
