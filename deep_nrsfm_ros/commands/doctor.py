@@ -30,7 +30,7 @@ HIGHEST_DOMAIN = 101  # above it, DDS takes ports that Linux gives to others
 LEAST_SHM = 8e6  # bytes: each participant of Fast DDS takes a segment of about half a MB
 
 
-class Finding(NamedTuple):
+class Result(NamedTuple):
     """The result of a check.
 
     Attributes:
@@ -45,11 +45,11 @@ class Finding(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Return "ok", "FAIL" or, for a finding that is not fatal, "warn"."""
+        """Return "ok", "FAIL" or, for a result that is not fatal, "warn"."""
         return "ok" if not self.mend else "FAIL" if self.fatal else "warn"
 
 
-def check_imports() -> Finding:
+def check_imports() -> Result:
     """Return the versions of the packages that the programs import."""
     versions = [f"Python {sys.version.split()[0]}"]
     missing: list[str] = []
@@ -63,45 +63,45 @@ def check_imports() -> Finding:
                 importlib.import_module(name)
             except Exception as error:  # a library of the wrong kind fails in many ways
                 mend = "install it anew; are two ROS installations mixed?"
-                return Finding(f"{name} does not import: {error}", mend)
+                return Result(f"{name} does not import: {error}", mend)
         versions.extend(
             f"{distribution} {importlib.metadata.version(distribution)}"
             for distribution in distributions.get(name, ())[:1]  # none where apt has installed it
         )
     seen = ", ".join(dict.fromkeys(versions))
     if not missing:
-        return Finding(seen)
+        return Result(seen)
     seen = f"{', '.join(missing)} not found ({seen})"
     mends = [f"pip install {name}" for name in missing if name in CORE]
     mends += [how_to_install("ros")] if set(missing) & set(FOR_ROS) else []
     if not mends:
-        return Finding(seen, f"{how_to_install('train')}, if you want to train", fatal=False)
-    return Finding(seen, "; ".join(mends))
+        return Result(seen, f"{how_to_install('train')}, if you want to train", fatal=False)
+    return Result(seen, "; ".join(mends))
 
 
-def check_environment() -> Finding:
+def check_environment() -> Result:
     """Return the variables that decide which ROS nodes find each other."""
     said = os.environ.get
     domain, reach = said("ROS_DOMAIN_ID", "0"), said("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     seen = f"ROS_DOMAIN_ID {domain}, discovery range {reach}"
     if not domain.isdecimal() or int(domain) > HIGHEST_DOMAIN:
-        return Finding(seen, f"set ROS_DOMAIN_ID to a number from 0 to {HIGHEST_DOMAIN}")
+        return Result(seen, f"set ROS_DOMAIN_ID to a number from 0 to {HIGHEST_DOMAIN}")
     if reach not in RANGES:
-        return Finding(seen, f"set ROS_AUTOMATIC_DISCOVERY_RANGE to one of {', '.join(RANGES)}")
+        return Result(seen, f"set ROS_AUTOMATIC_DISCOVERY_RANGE to one of {', '.join(RANGES)}")
     if reach == "OFF" and not said("ROS_STATIC_PEERS"):
-        return Finding(seen, "with discovery OFF nothing is found: set it to LOCALHOST or SUBNET")
+        return Result(seen, "with discovery OFF nothing is found: set it to LOCALHOST or SUBNET")
     if said("ROS_LOCALHOST_ONLY", "0") == "1":
         mend = "unset ROS_LOCALHOST_ONLY, which overrides it; LOCALHOST as range does the same"
-        return Finding(f"{seen}, ROS_LOCALHOST_ONLY 1", mend, fatal=False)
+        return Result(f"{seen}, ROS_LOCALHOST_ONLY 1", mend, fatal=False)
     if said("ROS_SECURITY_ENABLE", "").lower() == "true":
         keystore = said("ROS_SECURITY_KEYSTORE", "")
         seen += f", security on with keystore {keystore or 'none'}"
         if not (Path(keystore) / "enclaves").is_dir():
-            return Finding(seen, "set ROS_SECURITY_KEYSTORE to a keystore; see docs/security.md")
-    return Finding(seen)
+            return Result(seen, "set ROS_SECURITY_KEYSTORE to a keystore; see docs/security.md")
+    return Result(seen)
 
 
-def check_room(models_dir: Path) -> Finding:
+def check_room(models_dir: Path) -> Result:
     """Return whether models can be written, and whether DDS has shared memory."""
     place = models_dir
     while not place.exists():
@@ -109,17 +109,17 @@ def check_room(models_dir: Path) -> Finding:
     free = shutil.disk_usage(place).free
     seen = f"{models_dir}: {free / 1e9:.1f} GB free"
     if not os.access(place, os.W_OK):
-        return Finding(seen, f"make {place} writable, or set models_dir, to train", fatal=False)
+        return Result(seen, f"make {place} writable, or set models_dir, to train", fatal=False)
     if free < 1e6 * Limits().free_disk:
-        return Finding(seen, "make room on its disk, to train", fatal=False)
+        return Result(seen, "make room on its disk, to train", fatal=False)
     shared = Path("/dev/shm")
     if not os.access(shared, os.W_OK) or shutil.disk_usage(shared).free < LEAST_SHM:
         mend = "give /dev/shm room (docker run --shm-size or --ipc host), or DDS is slow or deaf"
-        return Finding(f"{seen}; no shared memory", mend)
-    return Finding(seen)
+        return Result(f"{seen}; no shared memory", mend)
+    return Result(seen)
 
 
-def check_model(name: str, models_dir: Path) -> Finding:
+def check_model(name: str, models_dir: Path) -> Result:
     """Load a model and lift with it."""
     import numpy as np
 
@@ -137,20 +137,20 @@ def check_model(name: str, models_dir: Path) -> Finding:
             mend = f"remove or replace {path}, or name another with --model"
         model = load_model(path)
     except ValueError as error:
-        return Finding(str(error), mend)
+        return Result(str(error), mend)
     p = len(model.layout)
     points = np.random.default_rng(0).uniform(50, 600, (1, p, 2)).astype(np.float32)
     lifted = Lifter(model)(points, np.ones((1, p), np.float32))
     if not np.isfinite(lifted.shapes).all():
-        return Finding(f"{path} lifts to what is no number", mend)
+        return Result(f"{path} lifts to what is no number", mend)
     seen = f"{path} of {p} keypoints lifts"
     if not kernel.AVAILABLE:
         mend = "install a C compiler (apt-get install gcc python3-dev), then the package anew"
-        return Finding(f"{seen}, but in NumPy: ten times slower", mend, fatal=False)
-    return Finding(f"{seen}, compiled")
+        return Result(f"{seen}, but in NumPy: ten times slower", mend, fatal=False)
+    return Result(f"{seen}, compiled")
 
 
-def check_bags() -> Finding:
+def check_bags() -> Result:
     """Write and read a bag in both storages."""
     import numpy as np
 
@@ -165,11 +165,11 @@ def check_bags() -> Finding:
             read = read_bags([bag], HUMAN17, HUMAN17, ReadOptions("/keypoints")).dataset
             if not np.allclose(read.points, points, rtol=1e-4):
                 mend = "pip install --force-reinstall rosbags"
-                return Finding(f"{storage}: what was read is not what was written", mend)
-    return Finding(f"written and read: {', '.join(STORAGES)}")
+                return Result(f"{storage}: what was read is not what was written", mend)
+    return Result(f"written and read: {', '.join(STORAGES)}")
 
 
-def check_dds(name: str, models_dir: Path, seconds: float) -> Finding:
+def check_dds(name: str, models_dir: Path, seconds: float) -> Result:
     """Start a lifter in another process and wait for its answer over DDS."""
     import numpy as np
 
@@ -183,17 +183,17 @@ def check_dds(name: str, models_dir: Path, seconds: float) -> Finding:
         took = time_to_first_points(str(path), points, seconds)
     except SelfTestError as error:
         if error.ended:
-            return Finding(str(error), "mend what its output names")
+            return Result(str(error), "mend what its output names")
         mend = "let the firewall pass UDP 7400-7500 and multicast on this machine"
         if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") != "LOCALHOST":
             mend += ", or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
-        return Finding(str(error), f"{mend}; on a busy machine raise --timeout")
-    return Finding(f"a lifter in another process answered {took:.1f} s after its start")
+        return Result(str(error), f"{mend}; on a busy machine raise --timeout")
+    return Result(f"a lifter in another process answered {took:.1f} s after its start")
 
 
 def examine(args: argparse.Namespace) -> bool:
     """Run every check and print what it found; return whether lifting works."""
-    checks: dict[str, Callable[[], Finding]] = {
+    checks: dict[str, Callable[[], Result]] = {
         "imports": check_imports,
         "environment": check_environment,
         "room": lambda: check_room(args.models_dir),
@@ -204,14 +204,14 @@ def examine(args: argparse.Namespace) -> bool:
     well = True
     for name, check in checks.items():
         try:
-            finding = check()
+            result = check()
         except Exception as error:  # whatever is broken, the other checks tell more
             mend = "report it with this line" if well else "mend what is wrong above first"
-            finding = Finding(f"{type(error).__name__}: {error}", mend)
-        well &= finding.word != "FAIL"
-        print(f"{finding.word:4}  {name}: {finding.seen}", flush=True)
-        if finding.mend:
-            print(f"      -> {finding.mend}", flush=True)
+            result = Result(f"{type(error).__name__}: {error}", mend)
+        well &= result.word != "FAIL"
+        print(f"{result.word:4}  {name}: {result.seen}", flush=True)
+        if result.mend:
+            print(f"      -> {result.mend}", flush=True)
     return well
 
 

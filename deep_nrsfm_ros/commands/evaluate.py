@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,10 @@ LIFTING = {
 default without bones, the default, and the default for keypoints without noise."""
 
 
+_DEFAULTS: dict[str, Any] = {"subjects": ["01"], "split": "train", "stride": 1, "camera_seed": 0}
+"""Options that choose trials of CMU."""
+
+
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(prog=program_name("evaluate"), description=__doc__)
@@ -61,16 +66,35 @@ def arguments() -> argparse.ArgumentParser:
         help="wheel of pose2sim 0.6.0, with real detections of a person by four cameras: compares "
         "lifting with and without intrinsics, and measures the error of the position",
     )
-    parser.add_argument("--subjects", nargs="+", default=["01"])
-    parser.add_argument(
+    cmu = parser.add_argument_group("CMU")
+    cmu.add_argument("--subjects", nargs="+", help="subjects (default: 01)")
+    cmu.add_argument(
         "--split",
-        default="train",
         choices=("train", "held-out", "all"),
-        help="the paper's training trials, the last 20 %% of the trials, or all of a subject",
+        help="the paper's training trials, the last 20 %% of the trials, or all of a subject "
+        "(default: train)",
     )
-    parser.add_argument("--stride", type=int, default=1, help="take every n-th frame")
-    parser.add_argument("--camera-seed", type=int, default=0, help="cameras as in training: 0")
+    cmu.add_argument("--stride", type=int, help="take every n-th frame (default: 1)")
+    cmu.add_argument("--camera-seed", type=int, help="cameras as in training: 0 (default: 0)")
     return parser
+
+
+def selection_of(args: argparse.Namespace) -> TrialSelection | None:
+    """Return the trials of CMU that the command line chooses; None where it chooses pose2sim.
+
+    Raises:
+        ValueError: an option has no effect.
+    """
+    chosen = {name: getattr(args, name) for name in _DEFAULTS}
+    if args.cmu:
+        values = {n: _DEFAULTS[n] if v is None else v for n, v in chosen.items()}
+        return TrialSelection(args.cmu, **values)
+    if unused := ["--" + n.replace("_", "-") for n, v in chosen.items() if v is not None]:
+        raise ValueError(
+            f"{', '.join(unused)} has no effect on --pose2sim: it chooses trials and cameras of "
+            "--cmu; leave it out"
+        )
+    return None
 
 
 def find_models(names: Sequence[str], models_dir: Path | None) -> list[Model]:
@@ -137,17 +161,15 @@ def compare_cameras(args: argparse.Namespace) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per model and way of lifting; exit code 2 says the input was at fault."""
     args = arguments().parse_args(argv)
-    if args.pose2sim:
-        compare_cameras(args)
-        return
     columns = ("model", "lifted", *CONVENTIONS)
     try:
+        selection = selection_of(args)
+        if selection is None:
+            compare_cameras(args)
+            return
         models = find_models(args.models, args.models_dir)
         print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
         for model in models:
-            selection = TrialSelection(
-                args.cmu, args.subjects, args.split, args.stride, args.camera_seed
-            )
             dataset = read_split(selection, model.layout)
             for word, lifting in LIFTING.items():
                 errors = evaluate(model, dataset, lifting)

@@ -24,9 +24,11 @@ from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import KINDS, is_bag
 from deep_nrsfm_ros.data.lifted_bags import has_lifted_messages, read_lifted_messages
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.lifter import LiftingOptions
 from deep_nrsfm_ros.messages.pipeline import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -41,6 +43,7 @@ from deep_nrsfm_ros.reporting.serving import HOST, Broadcast, in_real_time, serv
 
 _PORT = 8765
 _LIFTER = "/lifter"
+_DIAGNOSTICS_WAIT = 5.0  # seconds; a lifter sends them once a second
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -99,7 +102,13 @@ def check_output_options(args: argparse.Namespace) -> None:
     ):
         if value is not None and not has_effect:
             raise ValueError(f"{name} has no effect here: it needs {needs}")
-    if live and (unused := given_options(args, LiftingOptions)):
+    if not live:
+        return
+    unused = [option for option in given_options(args, ReadOptions) if option != "--topic"]
+    unused += ["--objects"] * (args.objects != "all") + ["--rectified"] * args.rectified
+    if unused:
+        raise ValueError(f"{', '.join(unused)} has no effect here: it needs a recording")
+    if unused := given_options(args, LiftingOptions):
         raise ValueError(
             f"{', '.join(unused)} has no effect on a running lifter: set its parameters instead"
         )
@@ -166,14 +175,34 @@ def serve(page: str, port: int | None, work: Callable[[Broadcast, threading.Even
             made.shutdown()
 
 
-def watch(args: argparse.Namespace, model: Model, source: KeypointLayout) -> None:
+def live_layout(lifter: str, said: str, model: Model) -> KeypointLayout:
+    """Return the layout of the keypoints of a running lifter, and warn where it is not known.
+
+    Args:
+        lifter: name of the node.
+        said: name of the layout as the lifter's diagnostics give it; "" if there were none.
+        model: whose layout is taken where the lifter's is not known.
+    """
+    if layout := {**LAYOUTS, model.layout.name: model.layout}.get(said):
+        return layout
+    reason = f"uses the layout {said!r}, which is no preset" if said else "has sent no diagnostics"
+    warn(
+        f"{lifter} {reason}: its keypoints are drawn in the order of {model.layout.name}; name "
+        "their order with --keypoint-layout if they look wrong"
+    )
+    return model.layout
+
+
+def watch(args: argparse.Namespace, model: Model, layout: KeypointLayout | None) -> None:
     """Serve the frames of the running lifter; needs ROS."""
     require_extra("ros", "replay without a BAG")
     import rclpy  # imported here because recordings need no ROS
     from rclpy.executors import ExternalShutdownException
 
-    from deep_nrsfm_ros.node.lifter_client import LifterClient, LifterTopics
+    from deep_nrsfm_ros.node.lifter_client import LifterClient, LifterTopics, running_layout
 
+    lifter = args.lifter or _LIFTER
+    source = layout or live_layout(lifter, running_layout(lifter, _DIAGNOSTICS_WAIT), model)
     inputs, transform = override(InputOptions(), args), SceneTransform()
 
     def work(broadcast: Broadcast, stop: threading.Event) -> None:
@@ -186,7 +215,7 @@ def watch(args: argparse.Namespace, model: Model, source: KeypointLayout) -> Non
             topic = args.topic or "/keypoints"
             layouts = (source, model.layout)
             limits = (inputs.min_confidence, inputs.image_size)
-            topics = LifterTopics(args.lifter or _LIFTER, topic, *layouts, *limits)
+            topics = LifterTopics(lifter, topic, *layouts, *limits)
             rclpy.spin(LifterClient(topics, show))
         except ExternalShutdownException:
             raise KeyboardInterrupt from None
@@ -194,7 +223,7 @@ def watch(args: argparse.Namespace, model: Model, source: KeypointLayout) -> Non
             rclpy.try_shutdown()
 
     serve(
-        live_page(source, model.layout, f"live: {args.lifter or _LIFTER}"),
+        live_page(source, model.layout, f"live: {lifter}"),
         _PORT if args.port is None else args.port,
         work,
     )
@@ -228,7 +257,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 raise ValueError(
                     "--html needs a BAG: record one, or show the running lifter with --serve"
                 )
-            watch(args, model, layout or model.layout)
+            watch(args, model, layout)
             return
         recording, origin = read_recording(args, model, layout)
         if args.html:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 
 _MIN_SHARED = 4  # a shape is unique from four points on
+_SHOWN = 6  # names of keypoints in an error text
 
 
 def detected_count(visible: NDArray[np.bool_], derivations: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -22,6 +25,11 @@ def detected_count(visible: NDArray[np.bool_], derivations: NDArray[np.int32]) -
         parts = derivations[derivations[:, 0] == t, 1]
         count -= visible[:, t] & visible[:, parts].all(1)
     return count
+
+
+def _shown(names: Sequence[str]) -> str:
+    """Return the first names of a list, for error texts."""
+    return ", ".join(names[:_SHOWN]) + ", ..." * (len(names) > _SHOWN)
 
 
 class KeypointMap:
@@ -61,8 +69,9 @@ class KeypointMap:
         shared = len(direct) + len(self._derived)
         if shared < _MIN_SHARED:
             raise ValueError(
-                f"layouts {source.name!r} and {target.name!r} share {shared} keypoints; "
-                f"at least {_MIN_SHARED} are needed"
+                f"layouts {source.name!r} and {target.name!r} share {shared} keypoints by name; "
+                f"at least {_MIN_SHARED} are needed. {source.name!r} has "
+                f"{_shown(source.keypoints)}; {target.name!r} has {_shown(target.keypoints)}"
             )
         self.derivations = self._find_derivations()
 

@@ -34,6 +34,7 @@ _FOREIGN = {
 }
 """What a file is that begins with these bytes."""
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_NUMPY_TYPES = ("BOOL", "U8", "I8", "U16", "I16", "U32", "I32", "U64", "I64", "F16", "F32", "F64")
 _MAX_BYTES = 64 * 2**20
 _MAX_HEADER = 2**20
 _SMALLEST = 1e-9  # length of a bone, or its spread, that can be divided by
@@ -134,20 +135,17 @@ def load_model(model: str | Path, models_dir: Path | None = None) -> Model:
         path = find_model(path, model_folders(models_dir or default_models_dir()))
     content = _read(path)
     try:
-        metadata, weights = _metadata(content), load(content)
+        metadata = _metadata(content)
+        if "format" in metadata:
+            _check_format(metadata["format"])
+        _check_weight_types(content)
+        weights = load(content)
+        _check_format(metadata.get("format"))
+    except ModelFileError as error:
+        raise ModelFileError(f"{path} {error}") from None
     except Exception as error:  # safetensors raises many kinds for a damaged file
         reason = _foreign(content) or f"is damaged or no safetensors file: {error}"
         raise ModelFileError(f"{path} {reason}") from error
-    written = metadata.get("format")
-    if written != _FORMAT:
-        reason = (
-            f"was written by another version of this package: its format is {str(written)[:60]!r}, "
-            f"and this version reads {_FORMAT!r}"
-            if str(written).startswith(_FAMILY)
-            else f"is a safetensors file of another program, not a {_FORMAT!r} file; train one, "
-            "or take one that `models` lists"
-        )
-        raise ModelFileError(f"{path} {reason}")
     try:
         return _build(json.loads(metadata["model"]), weights)
     except KeyError as error:
@@ -194,6 +192,36 @@ def _metadata(content: bytes) -> dict[str, Any]:
     if length > _MAX_HEADER:
         raise ValueError(f"its header claims {length} bytes; at most {_MAX_HEADER} are allowed")
     return dict(json.loads(content[8 : 8 + length]).get("__metadata__", {}))
+
+
+def _check_format(written: object) -> None:
+    """Raise ModelFileError for a file of another version or another program."""
+    if written == _FORMAT:
+        return
+    if str(written).startswith(_FAMILY):
+        raise ModelFileError(
+            f"was written by another version of this package: its format is {str(written)[:60]!r}, "
+            f"and this version reads {_FORMAT!r}"
+        )
+    raise ModelFileError(
+        f"is a safetensors file of another program, not a {_FORMAT!r} file; train one, or take one "
+        "that `models` lists"
+    )
+
+
+def _check_weight_types(content: bytes) -> None:
+    """Raise ModelFileError for weights of a type that NumPy lacks: bfloat16, float8.
+
+    `safetensors.numpy` raises an error about an attribute of NumPy there.
+    """
+    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+    for name, entry in header.items():
+        kind = entry.get("dtype") if name != "__metadata__" and isinstance(entry, dict) else "F32"
+        if kind not in _NUMPY_TYPES:
+            raise ModelFileError(
+                f"has weights `{name}` of type {str(kind)[:20]}, which NumPy cannot read: write "
+                "the file with float32 weights (F32), as `train` does"
+            )
 
 
 def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> Model:

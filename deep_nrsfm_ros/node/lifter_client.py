@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
 from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
@@ -29,6 +33,44 @@ from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 _MAX_WAITING = 100  # observations that are kept until their points arrive
 _SEARCH_PERIOD = 0.5  # seconds between two searches for the keypoints' topic
 _QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def running_layout(lifter: str, seconds: float, domain: int | None = None) -> str:
+    """Return the name of the keypoint layout with which a running lifter lifts.
+
+    Args:
+        lifter: name of the node.
+        seconds: to wait for its diagnostics.
+        domain: of DDS; None: that of ROS_DOMAIN_ID.
+
+    Returns:
+        The name as its diagnostics give it; "" if none were received.
+    """
+    found: list[str] = []
+    name = f"/{lifter.strip('/')}: lifting"
+
+    def receive(message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == name:
+                found.extend(v.value for v in status.values if v.key == "keypoint layout")
+
+    context = Context()
+    rclpy.init(context=context, domain_id=domain)
+    executor = SingleThreadedExecutor(context=context)
+    node = Node("layout_client", context=context)
+    node.create_subscription(DiagnosticArray, "/diagnostics", receive, 10)
+    executor.add_node(node)
+    try:
+        end = time.monotonic() + seconds
+        while not found and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.1)
+    except ExternalShutdownException:
+        pass
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+    return found[0].split(" (")[0] if found else ""
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,8 @@ def start_from(model: Model, layout: KeypointLayout) -> Network:
     pairs = [(i, new[name]) for i, name in enumerate(model.layout.keypoints) if name in new]
     if len(pairs) < _FEWEST:
         raise ValueError(
-            f"model {model.name!r} knows {len(pairs)} of the {len(new)} keypoints of "
-            f"{layout.name!r}; at least {_FEWEST} are needed to start from it"
+            f"model {model.name!r} and layout {layout.name!r} share {len(pairs)} keypoints by "
+            f"name; at least {_FEWEST} are needed to start from it"
         )
     old, to = (np.array(places) for places in zip(*pairs, strict=True))
     net, p = model.network, len(layout)

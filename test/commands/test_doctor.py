@@ -70,11 +70,11 @@ def test_one_failure_makes_the_exit_code_1_and_the_others_are_still_told(
 ) -> None:
     asked: list[str] = []
 
-    def answer(name: str, *_: object) -> doctor.Finding:
+    def answer(name: str, *_: object) -> doctor.Result:
         asked.append(name)
-        return doctor.Finding("answered")
+        return doctor.Result("answered")
 
-    def break_down() -> doctor.Finding:
+    def break_down() -> doctor.Result:
         raise RuntimeError("the bag is on fire")
 
     monkeypatch.setattr(doctor, "check_dds", answer)

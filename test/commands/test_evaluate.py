@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from deep_nrsfm_ros.commands.evaluate import find_models
+from deep_nrsfm_ros.commands.evaluate import find_models, main
 from deep_nrsfm_ros.model_files.model_file import ModelFileError
 from deep_nrsfm_ros.training.config import OutputConfig
 from test.commands.test_models import save
@@ -24,3 +24,13 @@ def test_models_are_found_where_trainings_write(
     assert len(find_models(["elsewhere", "human"], Path("runs"))) == 2
     with pytest.raises(ModelFileError, match="by_command, by_node"):
         find_models(["absent"], None)
+
+
+def test_options_that_choose_trials_of_cmu_mean_nothing_for_pose2sim(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for options in (["--stride", "1"], ["--split", "all"], ["--subjects", "01"]):
+        with pytest.raises(SystemExit) as end:
+            main(["human", "--pose2sim", "absent.whl", *options])
+        assert end.value.code == 2
+        assert f"{options[0]} has no effect on --pose2sim" in capsys.readouterr().err

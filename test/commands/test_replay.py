@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 
 import deep_nrsfm_ros
-from deep_nrsfm_ros.commands.replay import main
+from deep_nrsfm_ros.commands.replay import live_layout, main
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.detections import Detections, stamps_at
 from deep_nrsfm_ros.data.lifted_bags import write_lifted_bag
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 
 
@@ -87,6 +88,8 @@ def test_answers_are_shown_as_they_were_recorded(
     [
         (["keypoints"], "--html FILE, --serve, or both"),
         (["--html", "page.html"], "--html needs a BAG"),
+        (["--serve", "--rate", "25"], "--rate has no effect here: it needs a recording"),
+        (["--serve", "--objects", "largest"], "--objects has no effect here: it needs a rec"),
         (["nowhere", "--html", "page.html"], "nowhere does not exist"),
         (["keypoints", "--html", "no/page.html"], "no/page.html"),
         (["keypoints", "--html", "page.html", "--model", "cmu31"], "has 17 keypoints"),
@@ -109,6 +112,16 @@ def test_what_is_wrong_is_said(
         main(words)
     said = capsys.readouterr().err
     assert end.value.code == 2 and "failed: " in said and expected in said
+
+
+def test_the_layout_of_a_running_lifter(capsys: pytest.CaptureFixture[str]) -> None:
+    model = load_model("human")
+    assert live_layout("/lifter", "coco17", model) is COCO17
+    assert not capsys.readouterr().err
+    assert live_layout("/lifter", "mine", model) is model.layout
+    assert "uses the layout 'mine', which is no preset" in capsys.readouterr().err
+    assert live_layout("/lifter", "", model) is model.layout
+    assert "/lifter has sent no diagnostics" in capsys.readouterr().err
 
 
 def test_a_recording_is_served_until_ctrl_c(answered: Path) -> None:

@@ -302,7 +302,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     ),
     "start of another object": (
         ["--bag", "BAG", "--from", "cmu31", "--object", "coco17"],
-        "model 'cmu31' knows 0 of the 17 keypoints",
+        "share 0 keypoints by name",
     ),
     "out of range": (["--bag", "BAG", "--learning-rate", "7"], "--learning-rate is 7.0"),
     "no dictionary": (["--bag", "BAG", "--widths"], "widths"),

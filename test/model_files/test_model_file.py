@@ -255,8 +255,12 @@ def test_metadata_are_checked(file: Path) -> None:
 
 
 def test_tensors_of_a_type_that_numpy_lacks_are_refused(file: Path) -> None:
-    save_tensors({"D.0": torch.ones(17, 3, 8, dtype=torch.bfloat16)}, file)
-    assert "damaged" in refused(file)
+    for kind, name in ((torch.bfloat16, "BF16"), (torch.float8_e4m3fn, "F8_E4M3")):
+        tensors = {"D.0": torch.ones(17, 3, 8).to(kind)}
+        save_tensors(tensors, file, {"format": "deep_nrsfm_ros model 2"})
+        text = refused(file)
+        assert f"weights `D.0` of type {name}, which NumPy cannot read" in text
+        assert "damaged" not in text
 
 
 def test_what_is_no_file_is_refused(tmp_path: Path) -> None:

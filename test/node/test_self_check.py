@@ -12,6 +12,7 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
+from deep_nrsfm_ros.node.lifter_client import running_layout
 from test.fixtures.walking import IMAGE, in_layout
 from test.node.conftest import Client, Connect, StartLifter
 from test.node.test_lifter import cloud, unpack
@@ -40,13 +41,16 @@ def stream(client: Client, points: np.ndarray, confidence: np.ndarray) -> Iterat
 
 
 @pytest.mark.parametrize("layout", ["coco17", "human17", "mediapipe33"])
-def test_the_layout_is_found(start_lifter: StartLifter, connect: Connect, layout: str) -> None:
+def test_the_layout_is_found(
+    start_lifter: StartLifter, connect: Connect, domain: int, layout: str
+) -> None:
     lifter = start_lifter(listens=False, **AUTO)
     client = connect()
     with stream(client, *in_layout(LAYOUTS[layout])):
         status = client.wait_for_health(
             lambda _, v: int(v["messages lifted"]) > 20 and v["keypoint layout"].startswith(layout)
         )
+        assert running_layout("lifter", 30, domain) == layout
     assert status.level == b"\x00", status.message
     assert f"keypoint_layout auto: {layout}" in lifter.log
 

@@ -92,7 +92,7 @@ def test_a_start_is_checked(config: TrainingConfig, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"train\.widths is \(8,\); model 'm'"):
         validate(coco.with_options({"widths": (8,)}), PARAMETERS)
     points = config.with_start(save(tmp_path / "points.safetensors", KeypointLayout.numbered(5)))
-    with pytest.raises(ValueError, match="knows 0 of the 17 keypoints"):
+    with pytest.raises(ValueError, match="and layout 'human17' share 0 keypoints"):
         validate(dataclasses.replace(points, object="human17"), PARAMETERS)
 
 
