@@ -21,7 +21,7 @@ from deep_nrsfm_ros.commands.evaluate import evaluate, figures
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.layouts.presets import CMU31
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish

@@ -31,7 +31,8 @@ __all__ = [
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.layouts.layout import KeypointLayout
-    from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
+    from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
+    from deep_nrsfm_ros.lifting.options import LiftingOptions
     from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
     from deep_nrsfm_ros.nrsfm.recipe import Recipe
     from deep_nrsfm_ros.training.from_arrays import train
@@ -40,7 +41,7 @@ _HOMES = {
     "KeypointLayout": "layouts.layout",
     "Lifted": "lifting.lifter",
     "Lifter": "lifting.lifter",
-    "LiftingOptions": "lifting.lifter",
+    "LiftingOptions": "lifting.options",
     "Model": "model_files.model_file",
     "Recipe": "nrsfm.recipe",
     "load_model": "model_files.model_file",

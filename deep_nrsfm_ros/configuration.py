@@ -1,7 +1,7 @@
 """Options: fields of frozen dataclasses with a description and a range.
 
 Each option is declared once. It is a Python default, a command-line option (`add_arguments`) and,
-in the node, a ROS parameter with a descriptor (`node.parameters`).
+in the node, a ROS parameter with a descriptor (`node/parameter_bridge.py`).
 """
 
 from __future__ import annotations

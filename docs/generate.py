@@ -11,11 +11,11 @@ from typing import Any
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
-from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
-from deep_nrsfm_ros.node.parameters import parameter_name
+from deep_nrsfm_ros.node.parameter_bridge import parameter_name
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.request import TrainingOptions

@@ -15,8 +15,8 @@ import yaml
 
 import deep_nrsfm_ros
 from deep_nrsfm_ros.configuration import options
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
-from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.messages.options import InputOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = "deep_nrsfm_ros"

@@ -10,7 +10,7 @@ from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, LIFTING, evaluate, figures
 from deep_nrsfm_ros.data.mocap import HEIGHT_18
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 
 SUBJECTS = ("01", "05", "127")
 # Kong and Lucey, "Deep Interpretable Non-Rigid Structure from Motion", arXiv 1902.10840, Table 1.

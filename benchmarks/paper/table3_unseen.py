@@ -10,7 +10,8 @@ from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, figures, reconstruct
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.metrics import procrustes_distances, shape_errors

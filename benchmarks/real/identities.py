@@ -20,7 +20,7 @@ from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 from deep_nrsfm_ros.lifting.observation import Observation
-from deep_nrsfm_ros.lifting.tracking import MAX_AGE, Tracker, keypoint_tolerances
+from deep_nrsfm_ros.lifting.tracking import MAX_TRACK_AGE, Tracker, keypoint_tolerances
 
 Floats = NDArray[Any]
 Identify = Callable[[Observation, float], tuple[str, ...]]
@@ -36,7 +36,7 @@ LEGEND = {
     "15 and 7.5 Hz",
     "lost": "share of the detections that are left out, at random",
     "nearest": "identity switches with the nearest pair first, by mean motion: a person seen "
-    f"within the last {MAX_AGE:g} s has another identity",
+    f"within the last {MAX_TRACK_AGE:g} s has another identity",
     "similarity": "the same with the package's tracker",
     "nearest swaps, similarity swaps": "those in which the new identity was another's",
 }
@@ -64,7 +64,7 @@ class Nearest:
 
     def __call__(self, observation: Observation, now: float) -> tuple[str, ...]:
         """Return the identities of the objects."""
-        self._tracks = {k: t for k, t in self._tracks.items() if now - t[3] <= MAX_AGE}
+        self._tracks = {k: t for k, t in self._tracks.items() if now - t[3] <= MAX_TRACK_AGE}
         new = []
         for points, confidence in zip(observation.points, observation.confidence, strict=True):
             visible = confidence > 0
@@ -176,7 +176,7 @@ def _switches(clip: Clip, identify: Identify, rate: float, lost: float) -> tuple
         for person, identity in zip(people, identify(observation, now), strict=True):
             detections += 1
             before, then = last.get(person, (identity, now))
-            if before != identity and now - then <= MAX_AGE:
+            if before != identity and now - then <= MAX_TRACK_AGE:
                 changed += 1
                 swapped += owner.get(identity, person) != person
             last[person], owner[identity] = (identity, now), person

@@ -26,7 +26,7 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import to_observation
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
-from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre

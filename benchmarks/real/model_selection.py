@@ -24,7 +24,8 @@ from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model

@@ -12,7 +12,7 @@ from benchmarks.harness import Session, errors_by_column, run_program, with_prop
 from benchmarks.table import Table, lines
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, figures
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.network import reconstruct

@@ -12,7 +12,7 @@ from benchmarks.harness import LIFTING_LEGEND, Session, errors_by_column, run_pr
 from benchmarks.table import Table, lines
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 
 SUBJECTS = ("01",)
 RATIOS = {"0 %": 0.0, "5 %": 0.05, "10 %": 0.1, "15 %": 0.15, "20 %": 0.2}

@@ -14,7 +14,8 @@ from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model

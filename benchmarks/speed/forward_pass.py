@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from benchmarks.speed.plain_torch import PlainNetwork
 from benchmarks.speed.timing import interleaved, print_and_write, require_one_thread, speed_parser
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.network import Network, forward, initialise

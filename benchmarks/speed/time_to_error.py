@@ -24,7 +24,7 @@ from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, evaluate, figur
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.layouts.presets import CMU31
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.loop import Callbacks, train

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import HEIGHT_18, TrialSelection, read_split
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors

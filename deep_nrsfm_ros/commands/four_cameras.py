@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.data.pose2sim import JOINTS, Session, View
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25B
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import to_observation
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
-from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
+from deep_nrsfm_ros.commands.lift_summary import Summary, summarise
 from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.camera_file import read_camera_file, read_image_size
@@ -24,19 +25,20 @@ from deep_nrsfm_ros.data.keypoint_files import KINDS, read_keypoints
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, lift_recording
-from deep_nrsfm_ros.data.summary import Summary, resolve_layout, summarise
+from deep_nrsfm_ros.data.resolve_layout import resolve_layout
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import Size, is_person
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
-from deep_nrsfm_ros.messages.pipeline import AUTO, MODEL_ORDER, InputOptions
+from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 
-_OF_THE_NODE = ("input_type", "topics", "bags_dir", "max_objects")
+_NODE_ONLY_OPTIONS = ("input_type", "topics", "bags_dir", "max_objects")
 """Options of the node's input that mean nothing for a file."""
-_DOUBTFUL = 3
+_EXIT_DOUBTFUL = 3
 """Exit code of an answer that looks wrong."""
 
 
@@ -98,7 +100,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         help="the keypoints are those of the rectified image, to which CameraInfo's P belongs",
     )
     add_arguments(parser, ReadOptions)
-    add_arguments(parser, InputOptions, without=_OF_THE_NODE)
+    add_arguments(parser, InputOptions, without=_NODE_ONLY_OPTIONS)
     add_arguments(parser, LiftingOptions)
 
 
@@ -204,7 +206,9 @@ def summary_of(args: argparse.Namespace, model: Model, recording: Recording) -> 
         raise ValueError(f"{args.input} has no object in its {summary.frames} frames")
     if not summary.lifted:
         findings = "".join(f"; {finding}" for finding in summary.findings)
-        raise ValueError(f"none of {summary.total} objects is lifted: {summary.reasons}{findings}")
+        raise ValueError(
+            f"none of {summary.total} objects is lifted: {summary.left_out_text}{findings}"
+        )
     return summary
 
 
@@ -244,14 +248,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)
-    print(f"{args.output}: {summary.figures}")
-    if summary.reasons:
-        print(f"left out: {summary.reasons}")
+    print(f"{args.output}: {summary.figures_text}")
+    if summary.left_out_text:
+        print(f"left out: {summary.left_out_text}")
     for finding in summary.findings:
         warn(str(finding))
     if summary.findings and not args.force:
-        warn(f"the answer is doubtful: exit code {_DOUBTFUL} (--force: 0)")
-        sys.exit(_DOUBTFUL)
+        warn(f"the answer is doubtful: exit code {_EXIT_DOUBTFUL} (--force: 0)")
+        sys.exit(_EXIT_DOUBTFUL)
 
 
 if __name__ == "__main__":

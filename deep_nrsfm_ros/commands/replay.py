@@ -29,8 +29,8 @@ from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
-from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.reporting.player import (
     MOST_FRAMES,

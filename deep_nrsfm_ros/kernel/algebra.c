@@ -41,4 +41,4 @@ void accumulate(int n, int k, const float *X, int stride, int wide, const float 
     CHOSEN(accumulate)(n, k, X, stride, wide, Y, out, apart);
 }
 
-void solve(int n, int done, int stride, double *A) { CHOSEN(solve)(n, done, stride, A); }
+void solve(int n, int factored, int stride, double *A) { CHOSEN(solve)(n, factored, stride, A); }

@@ -60,8 +60,8 @@ void accumulate(int n, int k, const float *X, int stride, int wide, const float 
 /* Solve A x = b for a symmetric positive definite A (n, n), of which the upper half is read and spoilt.
 
    n is a multiple of DOUBLES. b (n, DOUBLES) stands beside A, as columns n, n + 1 ... of its rows, which
-   are `stride` apart, and x takes its place; Cholesky's U takes that of A. Of an A whose upper left (done, done)
-   is already U, as an earlier call left it, the other columns and rows are read alone. */
-void solve(int n, int done, int stride, double *A);
+   are `stride` apart, and x takes its place; Cholesky's U takes that of A. The first `factored` rows and columns may hold
+   U from an earlier call; then only the rest is factorised. */
+void solve(int n, int factored, int stride, double *A);
 
 #endif

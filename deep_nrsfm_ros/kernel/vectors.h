@@ -1,7 +1,7 @@
 /* `product`, `accumulate` and `solve` for processors with vectors of BYTES; `algebra.c` includes it once for each.
 
-   FOR(name) is what `name` is called there, TARGET what the compiler needs to know. What is four doubles
-   wide takes vectors of 32 bytes at most: FOUR(name).
+   FOR(name) is the name of that version of `name`; TARGET tells the compiler its processor. Functions on rows
+   of four doubles use vectors of at most 32 bytes; FOUR(name) selects that version.
 */
 #define HERE TARGET static inline __attribute__((always_inline))
 #define A_PANEL (4 * FLOATS / BYTES) /* vectors of a panel's row */
@@ -173,12 +173,12 @@ HERE void FOR(substitute)(int n, int stride, double *A) {
 #endif
 
 /* By Cholesky's U^T U = A, four rows at a time; y of U^T y = b comes out beside U. */
-TARGET static void FOR(solve)(int n, int done, int stride, double *A) {
+TARGET static void FOR(solve)(int n, int factored, int stride, double *A) {
     int wide = n + DOUBLES;
     for (int k = 0; k < n; k += 4) {
-        int j = k < done ? done : k + 4;
+        int j = k < factored ? factored : k + 4;
         double scale[4];
-        if (k < done)
+        if (k < factored)
             for (int r = 0; r < 4; r++) scale[r] = 1 / A[(size_t)(k + r) * stride + k + r];
         else
             FOUR(factor)(k, stride, A, scale);

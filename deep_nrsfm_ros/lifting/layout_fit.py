@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, find_sentinel
 from deep_nrsfm_ros.model_files.model_file import Model
 
 MAX_OBJECTS = 200
 """Objects of a sample: they take 2 to 10 ms a layout."""
 
-_CLEARLY = 0.6  # a residual below this fraction of another is clearly better
+_CLEAR_RATIO = 0.6  # a residual below this fraction of another is clearly better
 _MIN_MAPPED = 10  # keypoints of the model, or half of them; fewer fit any shape in any order
-_QUICK = LiftingOptions(correction="none", test_time_rotations=1, refill=0)
+_FAST_OPTIONS = LiftingOptions(correction="none", test_time_rotations=1, refill=0)
 
 
 class LayoutFit(NamedTuple):
@@ -63,7 +64,7 @@ def fit_layouts(
     points, confidence = points[chosen], confidence[chosen]
     if sentinel := find_sentinel(points, confidence > 0):
         confidence = np.where((points == sentinel[0]).all(-1), np.float32(0), confidence)
-    lifter = Lifter(model, _QUICK)
+    lifter = Lifter(model, _FAST_OPTIONS)
     fits = []
     for layout in _candidates(confidence.shape[1], model, layouts):
         mapped = KeypointMap(layout, model.layout)(points, confidence)
@@ -86,35 +87,35 @@ def choose_layout(fits: list[LayoutFit], preferred: KeypointLayout) -> LayoutFit
     if not fits:
         return None
     best = fits[0]
-    present = next((fit for fit in fits if fit.layout.keypoints == preferred.keypoints), None)
-    return best if present is None or _is_clearly_better(best, present.residual) else present
+    current = next((fit for fit in fits if fit.layout.keypoints == preferred.keypoints), None)
+    return best if current is None or _is_clearly_better(best, current.residual) else current
 
 
 def better_layout(
-    fits: list[LayoutFit], present: KeypointLayout, residual: float
+    fits: list[LayoutFit], current: KeypointLayout, residual: float
 ) -> Finding | None:
-    """Return the finding that another layout fits clearly better than the present one.
+    """Return the finding that another layout fits clearly better than the current one.
 
     Args:
         fits: as `fit_layouts` returns them.
-        present: layout with which the objects were lifted.
+        current: layout with which the objects were lifted.
         residual: their median residual.
     """
     if not fits:
         return None
     best = fits[0]
-    if best.layout.keypoints == present.keypoints or not _is_clearly_better(best, residual):
+    if best.layout.keypoints == current.keypoints or not _is_clearly_better(best, residual):
         return None
     return Finding(
         "layout",
-        f"poor fit as {present.name}: is it {best.layout.name}? It fits {best.residual:.2f} "
+        f"poor fit as {current.name}: is it {best.layout.name}? It fits {best.residual:.2f} "
         f"instead of {residual:.2f}; set the keypoint layout to {best.layout.name}",
     )
 
 
 def _is_clearly_better(fit: LayoutFit, residual: float) -> bool:
     """Return whether a fit is sound and clearly better than another residual."""
-    return fit.residual < POOR_RESIDUAL and fit.residual < _CLEARLY * residual
+    return fit.residual < POOR_RESIDUAL and fit.residual < _CLEAR_RATIO * residual
 
 
 def _candidates(

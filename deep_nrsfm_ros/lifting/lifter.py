@@ -3,83 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deep_nrsfm_ros.batched import slices
-from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.kernel import supports
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
 from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.lifting.observation import from_arrays
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model
 
 _BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
-
-
-@dataclass(frozen=True)
-class LiftingOptions:
-    """Lifting."""
-
-    correction: str = option(
-        "bones",
-        "how the lifted shape is corrected by the keypoints, depth included: bones = by the error "
-        "covariance that the model has learned and by the lengths of bones (most accurate); "
-        "learned = by the error covariance alone; back_projection = within the image plane; none",
-        choices=("bones", "learned", "back_projection", "none"),
-    )
-    noise: float = option(
-        0.02,
-        "standard deviation of the keypoints, relative to the size of the object in the image: how "
-        "far the corrected shape may stay from them; 0 = meets them exactly and amplifies their "
-        "noise, 0.02 typical, 0.1 strong",
-        low=0.0,
-        high=1.0,
-    )
-    refill: int = option(
-        2,
-        "rounds in which missing keypoints are filled with those of the lifted shape and the "
-        "object is lifted again; 0 = off, 2 typical; each round takes as long as the first lift, "
-        "and messages without missing keypoints need none",
-        low=0,
-        high=50,
-    )
-    test_time_rotations: int = option(
-        3,
-        "in-plane rotations of the input, lifted and averaged by reprojection error (test-time "
-        "augmentation); 1 = off, 3 typical; time rises with the number",
-        low=1,
-        high=64,
-    )
-    mirror: bool = option(
-        False,
-        "whether the mirror image is lifted and averaged as well: slightly more accurate on "
-        "average, at twice the time and with an occasional mirrored frame; needs a layout with "
-        "handedness and with pairs of left_ and right_ keypoints",
-    )
-    min_visible: int = option(
-        4,
-        "fewest detected keypoints with which an object is lifted; a keypoint that follows from "
-        "others does not count, as a neck between two visible shoulders, nor does one whose "
-        "confidence is far below that of the others; 4 typical",
-        low=3,
-        high=1000,
-    )
-    reference_length: float = option(
-        0.0,
-        "length in the output of the layout's reference pair (of people: neck to mid-hip), or of "
-        "the RMS radius if the layout has no pair; 0.5 gives metres for an adult; 0 = the length "
-        "in metres from the model's layout file, or 1 if it has none",
-        low=0.0,
-        high=1e6,
-    )
 
 
 class Lifted(NamedTuple):

@@ -22,7 +22,7 @@ from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector, rotation_vector
 
 Floats = NDArray[Any]
 
-MAX_AGE = 1.0
+FILTER_RESET_TIME = 1.0
 """Seconds after which an object that was not lifted is filtered from its next frame on."""
 _INTERVALS = 3.0  # between messages, for which a filter lives and a gap is filled at least
 _SPEED_CUTOFF = 1.0  # Hz, of the low-pass of the speed, as in the paper
@@ -136,10 +136,10 @@ def _decompose(lifted: Lifted) -> tuple[Floats, Floats, Floats]:
 class Smoother:
     """Smooths all objects of one topic, each by its identity.
 
-    The filter of an object starts anew when the object is lifted again after more than `MAX_AGE`,
-    `max_gap` and 3 periods of the stream. A frame of an object with the stamp of its last frame, or
-    an earlier one, is returned as lifted and does not change the filter. A clock that jumps back by
-    more than `MAX_AGE` and 3 periods deletes all filters.
+    The filter of an object starts anew when the object is lifted again after more than
+    `FILTER_RESET_TIME`, `max_gap` and 3 periods of the stream. A frame of an object with the stamp
+    of its last frame, or an earlier one, is returned as lifted and does not change the filter. A
+    clock that jumps back by more than `FILTER_RESET_TIME` and 3 periods deletes all filters.
     """
 
     def __init__(self, options: SmoothingOptions) -> None:
@@ -165,11 +165,11 @@ class Smoother:
         if not self._options.enabled:
             return lifted, identities
         self._period = period
-        if time < self._now - max(MAX_AGE, _INTERVALS * period):
+        if time < self._now - max(FILTER_RESET_TIME, _INTERVALS * period):
             self._tracks.clear()
             self._now = -np.inf
         self._now = max(time, self._now)
-        oldest = self._now - max(MAX_AGE, self._max_gap, _INTERVALS * period)
+        oldest = self._now - max(FILTER_RESET_TIME, self._max_gap, _INTERVALS * period)
         self._tracks = {
             identity: track for identity, track in self._tracks.items() if track.time >= oldest
         }

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
 
-MAX_AGE = 1.0
+MAX_TRACK_AGE = 1.0
 """Seconds after which a track without a detection is deleted, in a stream of at least 3 Hz."""
 INTERVALS = 3.0
 """Intervals between messages for which a track lives at least."""
@@ -31,7 +31,7 @@ _UNCERTAINTY = 1.0  # growth of a predicted keypoint's standard deviation, in si
 _DECAY = 0.4  # s, time constant with which the predicted velocity falls to 0
 _VELOCITY_GAIN = 0.3  # share of an error of the prediction that corrects the velocity
 _SIZE_DECAY = 1.0  # s, with which a track forgets that it was larger
-_SHRINKAGE = 1.0  # keypoints without similarity that every pair is taken to have: few prove little
+_SHRINKAGE = 1.0  # added to the number of common keypoints, so that few keypoints score lower
 _NEARNESS = 0.1  # weight of the mean motion, which decides where all keypoints are far away
 _REACH = np.float32(2)  # sizes by which the centre moves where keypoints are hidden
 _MAX_LOST = 256  # tracks without a detection that are kept, the latest ones
@@ -77,8 +77,8 @@ class _Tracks(NamedTuple):
     time: NDArray[Any]  # (m,) float64, of the last detection, seconds
 
 
-class _Lone(NamedTuple):
-    """The only track, whose keypoints are visible or never were: one object takes no arrays."""
+class _SingleTrack(NamedTuple):
+    """The state of the only track; one object is faster without arrays."""
 
     points: _Complex  # (q,)
     visible: bytes  # of the booleans (q,)
@@ -115,9 +115,9 @@ class Tracker:
 
     An identity that the detector gives is kept. Other objects are assigned to the tracks by
     keypoint similarity to the tracks' predictions. An object that is hidden keeps its identity for
-    `MAX_AGE`, while the uncertainty of its place grows. A detection that is further than 1.5 times
-    the size of the object from every prediction is a new object; the size is the RMS distance of
-    the keypoints from their centre. The order of the objects in a message does not matter.
+    `MAX_TRACK_AGE`, while the uncertainty of its place grows. A detection that is further than 1.5
+    times the size of the object from every prediction is a new object; the size is the RMS distance
+    of the keypoints from their centre. The order of the objects in a message does not matter.
     """
 
     def __init__(self, topic: str = "") -> None:
@@ -131,7 +131,7 @@ class Tracker:
         self._topic = topic
         self._identities: list[str] = []
         self._tracks: _Tracks | None = None
-        self._lone: _Lone | None = None  # instead of `_tracks`, which is older
+        self._single: _SingleTrack | None = None  # instead of `_tracks`, which is older
         self._now = -np.inf
         self._count = 0
 
@@ -154,16 +154,16 @@ class Tracker:
         """
         if self._topic and len(detections.confidence) == 1 and not any(detections.identities):
             return (self._topic,)
-        memory = max(MAX_AGE, INTERVALS * period)
+        memory = max(MAX_TRACK_AGE, INTERVALS * period)
         if now < self._now - memory:
             self.restart()
         self._now = max(now, self._now)
-        if self._lone and self._continue_lone(self._lone, detections, now, memory):
+        if self._single and self._continue_single(self._single, detections, now, memory):
             identities = list(self._identities)
         else:
             self._to_arrays()
             identities = self._identify(detections, now, memory, tolerances)
-            self._to_lone(len(identities))
+            self._to_single(len(identities))
         if self._topic:
             return tuple(identity and f"{self._topic}/{identity}" for identity in identities)
         return tuple(identities)
@@ -175,18 +175,18 @@ class Tracker:
 
     def restart(self) -> None:
         """Delete all tracks, as when the stamps begin anew; no identity is given a second time."""
-        self._tracks = self._lone = None
+        self._tracks = self._single = None
         self._now = -np.inf
 
-    def _continue_lone(
-        self, lone: _Lone, observation: Observation, now: float, memory: float
+    def _continue_single(
+        self, single: _SingleTrack, observation: Observation, now: float, memory: float
     ) -> bool:
         """Update the only track by the only detection; return whether that is possible."""
         if len(observation.confidence) != 1 or any(observation.identities):
             return False
         mask: NDArray[np.bool_] = observation.confidence[0] > 0
-        passed = max(now - lone.time, 0.0)
-        if mask.tobytes() != lone.visible or passed > memory:
+        passed = max(now - single.time, 0.0)
+        if mask.tobytes() != single.visible or passed > memory:
             return False
         points = _to_complex(observation.points)[0].copy()
         visible = points[mask]
@@ -194,28 +194,28 @@ class Tracker:
         offset = visible - np.complex64(centre)
         decay = math.exp(-passed / _DECAY)
         size = math.sqrt(np.vdot(offset, offset).real / len(visible))
-        size = max(size, lone.size * math.exp(-passed / _SIZE_DECAY), 1e-9)
-        shift = centre - lone.centre - lone.velocity * (_DECAY * (1 - decay))
+        size = max(size, single.size * math.exp(-passed / _SIZE_DECAY), 1e-9)
+        shift = centre - single.centre - single.velocity * (_DECAY * (1 - decay))
         if abs(shift) >= (_MAX_MOTION + _MOTION_GROWTH * passed) * size:
             return False
-        velocity = lone.velocity * decay + shift * (_VELOCITY_GAIN / max(passed, 1e-3))
-        self._lone = _Lone(points, lone.visible, centre, velocity, size, now)
+        velocity = single.velocity * decay + shift * (_VELOCITY_GAIN / max(passed, 1e-3))
+        self._single = _SingleTrack(points, single.visible, centre, velocity, size, now)
         return True
 
     def _to_arrays(self) -> None:
         """Write the only track to the arrays."""
-        if lone := self._lone:
-            visible = np.frombuffer(lone.visible, bool)
+        if single := self._single:
+            visible = np.frombuffer(single.visible, bool)
             self._tracks = _Tracks(
-                np.where(visible, lone.points, np.complex64(0))[None],
+                np.where(visible, single.points, np.complex64(0))[None],
                 np.where(visible, np.float32(0), np.float32(np.inf))[None],
-                np.array([lone.velocity], np.complex64),
-                np.array([lone.size], np.float32),
-                np.array([lone.time]),
+                np.array([single.velocity], np.complex64),
+                np.array([single.size], np.float32),
+                np.array([single.time]),
             )
-            self._lone = None
+            self._single = None
 
-    def _to_lone(self, count: int) -> None:
+    def _to_single(self, count: int) -> None:
         """Take the only track out of the arrays if none of its keypoints is hidden."""
         tracks = self._tracks
         if tracks is None or count != 1 or len(self._identities) != 1:
@@ -225,7 +225,7 @@ class Tracker:
         if (visible | (age == np.inf)).all() and float(tracks.time[0]) == self._now:
             centre, velocity = complex(points[visible].mean()), complex(tracks.velocity[0])
             state = (centre, velocity, float(tracks.size[0]), float(tracks.time[0]))
-            self._lone = _Lone(points, visible.tobytes(), *state)
+            self._single = _SingleTrack(points, visible.tobytes(), *state)
 
     def _identify(
         self, observation: Observation, now: float, memory: float, tolerances: _Floats | None

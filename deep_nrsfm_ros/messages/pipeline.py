@@ -2,101 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation, without_border
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
 from deep_nrsfm_ros.lifting.tracking import keypoint_tolerances
-from deep_nrsfm_ros.messages.decoding import INPUT_TYPES
 from deep_nrsfm_ros.messages.field_mapping import Size
+from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.serialised import Header, MessageReader
 from deep_nrsfm_ros.messages.stamps import Moment
-from deep_nrsfm_ros.model_files.folders import default_bags_dir, default_models_dir
 from deep_nrsfm_ros.model_files.model_file import Model
-
-MODEL_ORDER = "model"
-"""Value of `keypoint_layout` for keypoints in the order of the model's layout."""
-AUTO = "auto"
-"""Value of `input_type` for the type of the first publisher, and of `keypoint_layout` for the
-layout that the input names or that fits best."""
-
-
-@dataclass(frozen=True)
-class InputOptions:
-    """Model and input of the lifter."""
-
-    model: str = option("human", "model to lift with: a name in the model folders, or a path")
-    models_dir: str = option(
-        str(default_models_dir()),
-        "folder of trained models; it is searched before the models of the package",
-        read_only=True,
-    )
-    bags_dir: str = option(
-        str(default_bags_dir()),
-        "folder that holds all bags that train.bags may name; relative names begin here",
-        read_only=True,
-    )
-    input_type: str = option(
-        AUTO,
-        f"type of the keypoint messages: one of {', '.join(INPUT_TYPES)}; the path of a field "
-        "mapping for any other type; or 'auto' for the type of the first publisher",
-        read_only=True,
-    )
-    topics: tuple[str, ...] = option(
-        (),
-        "topics with keypoints; '*' stands for one part of a topic name, which becomes the "
-        "identity of the objects on it, as in /humans/bodies/*/skeleton2d; empty = keypoints",
-        read_only=True,
-    )
-    image_width: int = option(
-        0,
-        "width of the image in pixels, by which normalised keypoints (0 to 1) are multiplied; 0 = "
-        "unknown, 640 typical",
-        low=0,
-        high=1000000,
-    )
-    image_height: int = option(
-        0,
-        "height of the image in pixels, by which normalised keypoints (0 to 1) are multiplied; 0 = "
-        "unknown, 480 typical",
-        low=0,
-        high=1000000,
-    )
-    keypoint_layout: str = option(
-        AUTO,
-        "order of the detector's keypoints: a preset such as coco17, the path of a layout file, "
-        "'model' for the order of the model's layout, or 'auto' for the layout that the input "
-        "implies, or else the one of that number of keypoints that fits clearly best",
-    )
-    max_objects: int = option(
-        100,
-        "largest number of objects in a message; a message with more is rejected, so that it does "
-        "not block the lifter for seconds; 100 typical",
-        low=1,
-        high=100_000,
-    )
-    min_confidence: float = option(
-        0.1,
-        "detector confidence below which a keypoint is missing; 0 = every keypoint with a positive "
-        "confidence is used, 0.1 typical, 0.5 strict",
-        low=0,
-        high=1,
-    )
-
-    @property
-    def image_size(self) -> Size | None:
-        """Width and height of the image in pixels, None if they are unknown."""
-        known = self.image_width and self.image_height
-        return (self.image_width, self.image_height) if known else None
 
 
 class Pipeline:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
-from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.messages.options import InputOptions
 
 
 def unused_options(

@@ -39,11 +39,12 @@ from visualization_msgs.msg import MarkerArray
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
-from deep_nrsfm_ros.messages.pipeline import AUTO, MODEL_ORDER, InputOptions, Pipeline
+from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
+from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
@@ -51,7 +52,7 @@ from deep_nrsfm_ros.messages.unused_options import unused_options
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
-from deep_nrsfm_ros.node import parameters, publishing
+from deep_nrsfm_ros.node import parameter_bridge, publishing
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
@@ -91,15 +92,15 @@ class LifterNode(Node):
             ParameterException: rclpy refuses the value of a parameter.
         """
         super().__init__("lifter")
-        self._inputs = parameters.declare(self, InputOptions)
-        parameters.declare(self, LiftingOptions)
-        camera = parameters.declare(self, CameraOptions)
-        parameters.declare(self, SmoothingOptions, _SMOOTHING)
-        training = parameters.declare(self, TrainingOptions, _TRAIN)
-        parameters.declare(self, Recipe, _TRAIN)
-        parameters.declare(self, LayoutLossWeights, _TRAIN)
-        parameters.declare(self, Limits, _TRAIN)
-        parameters.declare(self, Curation, _TRAIN)
+        self._inputs = parameter_bridge.declare(self, InputOptions)
+        parameter_bridge.declare(self, LiftingOptions)
+        camera = parameter_bridge.declare(self, CameraOptions)
+        parameter_bridge.declare(self, SmoothingOptions, _SMOOTHING)
+        training = parameter_bridge.declare(self, TrainingOptions, _TRAIN)
+        parameter_bridge.declare(self, Recipe, _TRAIN)
+        parameter_bridge.declare(self, LayoutLossWeights, _TRAIN)
+        parameter_bridge.declare(self, Limits, _TRAIN)
+        parameter_bridge.declare(self, Curation, _TRAIN)
         self._sandbox = PathSandbox(
             Path(self._inputs.models_dir).expanduser(),
             Path(self._inputs.bags_dir).expanduser(),
@@ -148,7 +149,7 @@ class LifterNode(Node):
             on_dropped=self._lifter_diagnostics.dropped,
         )
         self._name_check = NameCheck(self)
-        for warning in (*parameters.undeclared(self), *self._unused_options()):
+        for warning in (*parameter_bridge.undeclared(self), *self._unused_options()):
             self.get_logger().warning(warning)
 
     def _quiet_publisher(self, kind: type, topic: str) -> Publisher:
@@ -335,7 +336,7 @@ class LifterNode(Node):
             self._findings = self._stream.look(
                 self._pipeline, size, self._camera.intrinsics, residual
             )
-            inputs = parameters.read(self, InputOptions)
+            inputs = parameter_bridge.read(self, InputOptions)
             if bool(inputs.image_width) != bool(inputs.image_height):
                 text = (
                     f"image_width is {inputs.image_width} and image_height is "
@@ -355,7 +356,7 @@ class LifterNode(Node):
 
     def _build_pipeline(self, changes: Sequence[Parameter]) -> Pipeline:
         """Return the pipeline for the parameters after `changes`; raise ValueError if invalid."""
-        inputs = parameters.read(self, InputOptions, changes=changes)
+        inputs = parameter_bridge.read(self, InputOptions, changes=changes)
         self._training_parameters(changes)
         # A file is read only when its parameter is set: it may have been deleted since.
         changed = {change.name for change in changes} or {"model", "keypoint_layout"}
@@ -383,9 +384,9 @@ class LifterNode(Node):
         return Pipeline(
             model,
             detector,
-            parameters.read(self, InputOptions, changes=changes),
-            parameters.read(self, LiftingOptions, changes=changes),
-            parameters.read(self, SmoothingOptions, _SMOOTHING, changes),
+            parameter_bridge.read(self, InputOptions, changes=changes),
+            parameter_bridge.read(self, LiftingOptions, changes=changes),
+            parameter_bridge.read(self, SmoothingOptions, _SMOOTHING, changes),
         )
 
     def _layout_so_far(self, model: Model) -> KeypointLayout | None:
@@ -410,7 +411,7 @@ class LifterNode(Node):
         """Swap in the pipeline of the accepted parameters."""
         if self._proposed.model is not self._pipeline.model:
             self.get_logger().info(f"lifting with model {self._proposed.model.name!r}")
-        search = parameters.read(self, InputOptions).keypoint_layout == AUTO
+        search = parameter_bridge.read(self, InputOptions).keypoint_layout == AUTO
         if self._proposed.model is not self._pipeline.model or search != self._auto:
             self._auto, self._chosen = search, None
             self._stream.restart(search=search)
@@ -421,9 +422,9 @@ class LifterNode(Node):
     def _unused_options(self, changes: Sequence[Parameter] | None = None) -> list[str]:
         """Return a warning for each parameter, or each of `changes`, that has no effect."""
         warnings = unused_options(
-            parameters.read(self, InputOptions, changes=changes or ()),
-            parameters.read(self, LiftingOptions, changes=changes or ()),
-            parameters.read(self, SmoothingOptions, _SMOOTHING, changes or ()),
+            parameter_bridge.read(self, InputOptions, changes=changes or ()),
+            parameter_bridge.read(self, LiftingOptions, changes=changes or ()),
+            parameter_bridge.read(self, SmoothingOptions, _SMOOTHING, changes or ()),
         )
         if changes is not None:
             names = {change.name for change in changes}
@@ -432,7 +433,7 @@ class LifterNode(Node):
 
     def _training_request(self) -> TrainingRequest:
         """Return the training that the present parameters ask for."""
-        inputs, topics = parameters.read(self, InputOptions), self._keypoint_topics.topics
+        inputs, topics = parameter_bridge.read(self, InputOptions), self._keypoint_topics.topics
         layout = inputs.keypoint_layout
         if layout == AUTO:
             layout = self._pipeline.detector.name if self._pipeline.detector else MODEL_ORDER
@@ -450,11 +451,11 @@ class LifterNode(Node):
     def _training_parameters(self, changes: Sequence[Parameter] = ()) -> TrainingParameters:
         """Return the parameters `train.*` after `changes`; raise ValueError for a wrong one."""
         return TrainingParameters(
-            parameters.read(self, TrainingOptions, _TRAIN, changes),
-            parameters.read(self, Recipe, _TRAIN, changes),
-            parameters.read(self, LayoutLossWeights, _TRAIN, changes),
-            parameters.read(self, Limits, _TRAIN, changes),
-            parameters.read(self, Curation, _TRAIN, changes),
+            parameter_bridge.read(self, TrainingOptions, _TRAIN, changes),
+            parameter_bridge.read(self, Recipe, _TRAIN, changes),
+            parameter_bridge.read(self, LayoutLossWeights, _TRAIN, changes),
+            parameter_bridge.read(self, Limits, _TRAIN, changes),
+            parameter_bridge.read(self, Curation, _TRAIN, changes),
         )
 
     def _activate(self, path: str) -> None:

@@ -24,7 +24,7 @@ from rclpy.subscription import Subscription
 from deep_nrsfm_ros.lifting.tracking import Tracker
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, InputType, resolve_input_type, type_name
 from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
-from deep_nrsfm_ros.messages.pipeline import AUTO, InputOptions
+from deep_nrsfm_ros.messages.options import AUTO, InputOptions
 from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.messages.stamps import TopicClock
 from deep_nrsfm_ros.messages.topics import WILDCARD, match

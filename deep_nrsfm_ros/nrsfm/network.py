@@ -261,7 +261,7 @@ def _relu_threshold(V: Array, b: Array) -> Array:
 
 
 def _block_threshold(V: Array, b: Array) -> Array:
-    """Return h_b(||V_j||_F) / ||V_j||_F V_j for every block j of V (..., 2, 3, k).
+    """Return the block soft threshold max(1 - b_j / ||V_j||_F, 0) V_j of V (..., 2, 3, k).
 
     Source: the exact proximal step, in the text before eq:singleBISTA.
     """

@@ -1,4 +1,4 @@
-"""The best weights of a training, by a quality that needs no label, and its standstill."""
+"""The best weights of a training, by a quality that needs no label."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.training.early_stopping import patience_exceeded
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -30,11 +31,11 @@ class BestCheckpoint:
     """Measures a training at intervals and keeps its best weights.
 
     Attributes:
-        enabled: whether the limits ask for the best weights or for an end at standstill.
+        enabled: whether the limits ask for the best weights or set a patience.
         weights: (n,) the best weights, None before the first measurement.
         quality: of the best weights, as of `Trainer.quality`.
         step: of the best weights.
-        standstill: whether the quality has not improved for as long as the patience.
+        patience_exceeded: whether the quality has not improved for longer than the patience.
     """
 
     def __init__(self, limits: Limits, recipe: Recipe) -> None:
@@ -45,7 +46,7 @@ class BestCheckpoint:
         self.weights: Tensor | None = None
         self.quality = self.reference = math.inf
         self.step, self.last_improvement = 0, 0.0
-        self.standstill = False
+        self.patience_exceeded = False
 
     def update(self, trainer: Trainer) -> None:
         """Measure the trainer if its step is one of the interval, and keep the better weights."""
@@ -57,8 +58,9 @@ class BestCheckpoint:
             self.weights = trainer.weights.clone()
         if quality < self.reference * (1 - _MIN_IMPROVEMENT):
             self.reference, self.last_improvement = quality, trainer.progress
-        idle = trainer.progress - self.last_improvement
-        self.standstill = 0 < self.limits.patience < idle
+        self.patience_exceeded = patience_exceeded(
+            self.limits, trainer.progress, self.last_improvement
+        )
 
     def restore_best(self, trainer: Trainer) -> None:
         """Set the trainer to the best weights if the limits ask for it and its own are worse."""

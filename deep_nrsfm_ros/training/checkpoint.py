@@ -1,4 +1,8 @@
-"""Checkpoints: named tensors in a file that is complete or does not exist."""
+"""Checkpoints: named tensors in a file that is complete or does not exist.
+
+The content comes from the methods `state` of `_Loop` (loop.py), `Trainer` (trainer.py) and
+`BestCheckpoint` (best_checkpoint.py).
+"""
 
 from __future__ import annotations
 

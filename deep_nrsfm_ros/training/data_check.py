@@ -10,7 +10,8 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.layout_fit import MAX_OBJECTS, better_layout, fit_layouts
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import (
     Finding,
     Size,

@@ -1,4 +1,4 @@
-"""Limits: when a training ends before its last step, and which state it keeps."""
+"""Options that bound a training; `early_stopping.py` and the checks of the data apply them."""
 
 from __future__ import annotations
 

@@ -25,6 +25,7 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
+from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.progress import Clock, Progress
@@ -112,9 +113,9 @@ def train(
         checkpointing: where to save the state and to continue from.
 
     Returns:
-        The trainer at its last step, or at its best one if `setup.limits.keep_best`. Its `ended`
-        says why the training is complete, and is "" where `should_stop` ended it. A training that
-        was stopped while seeds were screened returns the best seed so far.
+        The trainer at its last step, or at its best one if `setup.limits.keep_best`. Its
+        `end_reason` says why the training is complete, and is "" where `should_stop` ended it. A
+        training that was stopped while seeds were screened returns the best seed so far.
 
     Raises:
         ValueError: for options out of range, for data without two points apart, or for a
@@ -180,11 +181,11 @@ class _Loop:
             if self.checkpointing.file is not None and (trainer.step or self.leader):
                 write_checkpoint(self.checkpointing.file, self.state())
             trainer = self.leader or trainer
-        elif self.best.standstill:
-            trainer.end_reason = "its quality no longer improved"
         else:
-            finished = trainer.step == self.preset.recipe.steps
-            trainer.end_reason = "all steps were taken" if finished else "its time was up"
+            trainer.end_reason = end_reason(
+                all_steps=trainer.step == self.preset.recipe.steps,
+                no_improvement=self.best.patience_exceeded,
+            )
         self.best.restore_best(trainer)
         if not self.group.rank:
             self.callbacks.on_progress(self.clock.progress(trainer))
@@ -214,23 +215,22 @@ class _Loop:
         setup = self.setup
         return Trainer(self.frames, self.preset, seed, setup.start, setup.group, setup.layout_loss)
 
-    def _advance(self, steps: int, time_share: float, *, chosen: bool = False) -> None:
-        """Train up to step `steps`, or until `time_share` of the time has passed.
+    def _advance(self, steps: int, time_budget: float, *, chosen: bool = False) -> None:
+        """Train up to step `steps`, or until `time_budget` of the time limit has elapsed.
 
-        Takes at least one step, so that there is a result to compare or to keep. `chosen`: the
-        seed is chosen; calls `on_step` and looks for the best state.
+        `chosen`: the seed is chosen; calls `on_step` and looks for the best state.
         """
         trainer, best = self.trainer, self.best if chosen else None
         self.clock.restart(trainer.step)
         if chosen:
             self.callbacks.on_step(trainer)
-        while trainer.step < steps and not (best and best.standstill):
+        while trainer.step < steps and not (best and best.patience_exceeded):
             if self.iterations % self.group.stop_interval == 0:
                 wishes = self.callbacks.should_stop(), self.clock.elapsed_fraction()
                 self.stopped, self.time_fraction = self.group.any_stop(*wishes)
             self.iterations += 1
             trainer.time_fraction = self.time_fraction
-            if self.stopped or (trainer.step and trainer.time_fraction >= time_share):
+            if self.stopped or time_is_up(trainer.step, trainer.time_fraction, time_budget):
                 return
             trainer.advance()
             if best:

@@ -12,7 +12,7 @@ from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.data.bag_files import open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.curation import Curation
-from deep_nrsfm_ros.messages.pipeline import MODEL_ORDER
+from deep_nrsfm_ros.messages.options import MODEL_ORDER
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, check_name
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox

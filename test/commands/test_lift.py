@@ -12,7 +12,7 @@ from deep_nrsfm_ros.commands.lift import arguments, main
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.keypoint_files import read_keypoints
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from test.fixtures.walking import CAMERA as WALKING_CAMERA
 from test.fixtures.walking import DISTANCE, IMAGE, in_layout
 

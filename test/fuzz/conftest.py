@@ -22,10 +22,12 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.lifter import Lifted, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.decoding import InputType
-from deep_nrsfm_ros.messages.pipeline import InputOptions, Pipeline
+from deep_nrsfm_ros.messages.options import InputOptions
+from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.model_file import Model

@@ -13,15 +13,16 @@ from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data import bags
 from deep_nrsfm_ros.data.bags import frames
 from deep_nrsfm_ros.data.curation import Curation
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
-from deep_nrsfm_ros.messages.pipeline import InputOptions, Pipeline
+from deep_nrsfm_ros.messages.options import InputOptions
+from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.model_files.model_file import save_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
-from deep_nrsfm_ros.node import parameters as ros_parameters
+from deep_nrsfm_ros.node import parameter_bridge
 from deep_nrsfm_ros.node.lifter import LifterNode
-from deep_nrsfm_ros.node.parameters import parameter_name
+from deep_nrsfm_ros.node.parameter_bridge import parameter_name
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.training.job import parse_progress
 from deep_nrsfm_ros.training.limits import Limits
@@ -99,7 +100,7 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
             Parameter(name, value=given[name]) if name in given else default
         )
         try:
-            sandboxed(ros_parameters.read(stub, TrainingOptions, "train."), stub._sandbox)
+            sandboxed(parameter_bridge.read(stub, TrainingOptions, "train."), stub._sandbox)
         except (ValueError, OSError) as refusal:
             assert str(refusal)
         finally:

@@ -16,8 +16,9 @@ from deep_nrsfm_ros.kernel import AVAILABLE, _kernel
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.numpy_backend import NumpyBackend
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser

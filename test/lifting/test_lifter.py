@@ -13,7 +13,8 @@ import pytest
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
-from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import EQUIDISTANT, Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective, virtual_views
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise

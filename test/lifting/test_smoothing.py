@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from deep_nrsfm_ros.lifting.lifter import Lifted
-from deep_nrsfm_ros.lifting.smoothing import MAX_AGE, Smoother, SmoothingOptions
+from deep_nrsfm_ros.lifting.smoothing import FILTER_RESET_TIME, Smoother, SmoothingOptions
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector
 
 P = 8
@@ -152,7 +152,7 @@ def test_no_gap_is_filled_with_max_gap_0_or_for_a_new_object() -> None:
 
 def test_an_object_that_was_away_for_long_begins_anew() -> None:
     far = one(SHAPE + np.eye(P, 3))
-    for wait, anew in ((0.5 * MAX_AGE, False), (1.5 * MAX_AGE, True)):
+    for wait, anew in ((0.5 * FILTER_RESET_TIME, False), (1.5 * FILTER_RESET_TIME, True)):
         smoother = Smoother(dataclasses.replace(ON, min_cutoff=0.1, beta=0.0))
         smoother(one(), ("a",), 0.0)
         back, _ = smoother(far, ("a",), wait)

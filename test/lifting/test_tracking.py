@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.observation import Identities, Observation
-from deep_nrsfm_ros.lifting.tracking import MAX_AGE, Tracker, keypoint_tolerances
+from deep_nrsfm_ros.lifting.tracking import MAX_TRACK_AGE, Tracker, keypoint_tolerances
 
 BODY = np.random.default_rng(0).uniform(-50, 50, (8, 2)).astype(np.float32)
 
@@ -42,8 +42,8 @@ def test_a_jump_is_another_object_and_so_is_one_that_was_long_away() -> None:
     (a,) = tracker(seen((100, 100)), 0.0)
     (b,) = tracker(seen((400, 100)), 0.1)
     assert a != b
-    assert tracker(seen((100, 100)), MAX_AGE) == (a,)
-    assert tracker(seen((100, 100)), 3 * MAX_AGE)[0] not in (a, b)
+    assert tracker(seen((100, 100)), MAX_TRACK_AGE) == (a,)
+    assert tracker(seen((100, 100)), 3 * MAX_TRACK_AGE)[0] not in (a, b)
 
 
 def test_another_number_of_keypoints_is_another_object() -> None:

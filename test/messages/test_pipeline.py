@@ -8,10 +8,12 @@ import pytest
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
-from deep_nrsfm_ros.messages.pipeline import InputOptions, Pipeline
+from deep_nrsfm_ros.messages.options import InputOptions
+from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.model_file import load_model
 

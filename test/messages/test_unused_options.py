@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from deep_nrsfm_ros.lifting.lifter import LiftingOptions
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
-from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.unused_options import unused_options
 
 DEFAULTS = (InputOptions(), LiftingOptions(), SmoothingOptions())

@@ -12,7 +12,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from deep_nrsfm_ros.lifting.lifter import Lifter, LiftingOptions
+from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.nrsfm.geometry import align
 from deep_nrsfm_ros.nrsfm.handedness import votes
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors

@@ -32,7 +32,6 @@ _EXPECTED = (
     "neither of DeepLabCut (rows scorer, bodyparts, coords), nor with a landmark a row (columns "
     "frame, landmark, x, y), nor with a column for each coordinate (nose_x, nose_y, ...)"
 )
-_DEEPLABCUT = ("scorer", "individuals", "bodyparts", "coords")
 _METRES = 50.0  # a larger coordinate of a TRC is in pixels: no one is filmed on 50 m
 
 Column = tuple[str, str, str]

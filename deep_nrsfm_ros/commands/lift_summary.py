@@ -1,4 +1,4 @@
-"""Summary of a lifted recording: what was lifted, how well, what was left out, what looks wrong."""
+"""The summary that `lift` prints: what was lifted, how well, what was left out and why."""
 
 from __future__ import annotations
 
@@ -6,20 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.recording import Recording
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.layout_fit import LayoutFit, better_layout, choose_layout, fit_layouts
-from deep_nrsfm_ros.lifting.sanity import (
-    POOR_RESIDUAL,
-    Finding,
-    Size,
-    check,
-    is_person,
-    orientation,
-)
+from deep_nrsfm_ros.lifting.layout_fit import better_layout, fit_layouts
+from deep_nrsfm_ros.lifting.sanity import Finding, Size, check, is_person, orientation
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import Model
 
@@ -49,7 +40,7 @@ class Summary:
     findings: tuple[Finding, ...]
 
     @property
-    def figures(self) -> str:
+    def figures_text(self) -> str:
         """The figures in one sentence."""
         counts = f"{self.lifted} of {self.total} objects in {self.frames} frames lifted"
         if not self.lifted:
@@ -57,7 +48,7 @@ class Summary:
         return f"{counts}; median residual {self.residual:.2f}, confidence {self.confidence:.2f}"
 
     @property
-    def reasons(self) -> str:
+    def left_out_text(self) -> str:
         """Why objects were left out; "" if none was."""
         return "; ".join(f"{count} {reason}" for reason, count in self.left_out.items())
 
@@ -107,40 +98,6 @@ def summarise(
         float(np.median(certainty[is_lifted])) if is_lifted.any() else np.nan,
         tuple(findings),
     )
-
-
-def resolve_layout(detections: Detections, model: Model) -> tuple[KeypointLayout, str]:
-    """Return the layout in which the keypoints fit best, and a sentence that says why.
-
-    The model's own layout is taken unless another one fits clearly better.
-
-    Args:
-        detections: keypoints of which nothing says the layout.
-        model: lifts them.
-
-    Raises:
-        ValueError: no layout of that number of keypoints can be lifted by the model.
-    """
-    fits = fit_layouts(detections.points, detections.confidence, model)
-    q = detections.confidence.shape[1]
-    chosen = choose_layout(fits, model.layout)
-    if chosen and chosen.residual >= POOR_RESIDUAL:
-        return chosen.layout, f"taken although no layout fits well; {_ranking(chosen, fits)}"
-    if chosen:
-        return chosen.layout, _ranking(chosen, fits)
-    if q == len(model.layout):
-        return model.layout, f"the order of the model, {q} keypoints"
-    raise ValueError(
-        f"the objects have {q} keypoints; no layout of {q} keypoints is known that model "
-        f"{model.name!r} ({len(model.layout)} keypoints) can lift: name one with --keypoint-layout"
-    )
-
-
-def _ranking(chosen: LayoutFit, fits: list[LayoutFit]) -> str:
-    """Return the residual of the chosen layout, and those of the others."""
-    others = ", ".join(f"{fit.layout.name} {fit.residual:.2f}" for fit in fits if fit is not chosen)
-    text = f"it fits with residual {chosen.residual:.2f}"
-    return f"{text} ({others})" if others else f"{text}; no other layout has that size"
 
 
 def _left_out(recording: Recording, min_visible: int, *, with_camera: bool) -> dict[str, int]:

@@ -1,0 +1,43 @@
+"""Choose the keypoint layout of detections that do not name their own."""
+
+from __future__ import annotations
+
+from deep_nrsfm_ros.data.detections import Detections
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.layout_fit import LayoutFit, choose_layout, fit_layouts
+from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL
+from deep_nrsfm_ros.model_files.model_file import Model
+
+
+def resolve_layout(detections: Detections, model: Model) -> tuple[KeypointLayout, str]:
+    """Return the layout in which the keypoints fit best, and a sentence that says why.
+
+    The model's own layout is taken unless another one fits clearly better.
+
+    Args:
+        detections: keypoints of which nothing says the layout.
+        model: lifts them.
+
+    Raises:
+        ValueError: no layout of that number of keypoints can be lifted by the model.
+    """
+    fits = fit_layouts(detections.points, detections.confidence, model)
+    q = detections.confidence.shape[1]
+    chosen = choose_layout(fits, model.layout)
+    if chosen and chosen.residual >= POOR_RESIDUAL:
+        return chosen.layout, f"taken although no layout fits well; {_ranking(chosen, fits)}"
+    if chosen:
+        return chosen.layout, _ranking(chosen, fits)
+    if q == len(model.layout):
+        return model.layout, f"the order of the model, {q} keypoints"
+    raise ValueError(
+        f"the objects have {q} keypoints; no layout of {q} keypoints is known that model "
+        f"{model.name!r} ({len(model.layout)} keypoints) can lift: name one with --keypoint-layout"
+    )
+
+
+def _ranking(chosen: LayoutFit, fits: list[LayoutFit]) -> str:
+    """Return the residual of the chosen layout, and those of the others."""
+    others = ", ".join(f"{fit.layout.name} {fit.residual:.2f}" for fit in fits if fit is not chosen)
+    text = f"it fits with residual {chosen.residual:.2f}"
+    return f"{text} ({others})" if others else f"{text}; no other layout has that size"
