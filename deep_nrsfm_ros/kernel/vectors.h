@@ -22,15 +22,17 @@ HERE void FOR(tile)(const int rows, const int panels, const float *X, int stride
         if (b) from -= ((const vector *)(b + column))[h];
         for (int r = 0; r < rows; r++) sums[r][h] = from;
     }
-    const float *panel = A.panels + (size_t)column * A.k;
-    for (int i = 0; i < A.k; i++) {
+    const float *panel = A.panels + (size_t)column * A.k, *row_of[6];
+    /* Addresses are computed here, because in the loop they would cost as much as the products. */
+    for (int r = 0; r < rows; r++) row_of[r] = X + (ptrdiff_t)r * stride;
+    for (ptrdiff_t i = 0; i < A.k; i++) {
         vector a[2 * A_PANEL];
         for (int h = 0; h < A_PANEL * panels; h++) {
             const float *row = panel + ((size_t)(h / A_PANEL) * A.k + i) * FLOATS;
             a[h] = ((const vector *)row)[h % A_PANEL];
         }
         for (int r = 0; r < rows; r++)
-            for (int h = 0; h < A_PANEL * panels; h++) sums[r][h] += X[r * stride + i] * a[h];
+            for (int h = 0; h < A_PANEL * panels; h++) sums[r][h] += row_of[r][i] * a[h];
     }
     for (int r = 0; r < rows; r++)
         for (int h = 0; h < A_PANEL * panels; h++) {
@@ -76,11 +78,13 @@ HERE void FOR(outer)(const int rows, const int panels, int n, const float *X, in
     vector sums[6][2 * A_PANEL];
     for (int r = 0; r < rows; r++)
         for (int h = 0; h < A_PANEL * panels; h++) sums[r][h] = ((vector *)(out + (size_t)r * apart))[h];
-    for (int i = 0; i < n; i++, X += stride, Y += wide)
-        for (int h = 0; h < A_PANEL * panels; h++) {
-            vector y = ((const vector *)Y)[h];
-            for (int r = 0; r < rows; r++) sums[r][h] += X[r] * y;
-        }
+    for (int i = 0; i < n; i++, X += stride, Y += wide) {
+        /* Row by row of the sums: the other order takes more registers than there are. */
+        vector y[2 * A_PANEL];
+        for (int h = 0; h < A_PANEL * panels; h++) y[h] = ((const vector *)Y)[h];
+        for (int r = 0; r < rows; r++)
+            for (int h = 0; h < A_PANEL * panels; h++) sums[r][h] += X[r] * y[h];
+    }
     for (int r = 0; r < rows; r++)
         for (int h = 0; h < A_PANEL * panels; h++) ((vector *)(out + (size_t)r * apart))[h] = sums[r][h];
 }
