@@ -22,6 +22,7 @@ Floats = NDArray[Any]
 CACHE = Path(".cache")
 """Download folder of the demo."""
 LIMBS = [MEDIAPIPE33.index(joint) for joint in JOINTS]
+_UP = np.array([0.0, 0.0, 1.0])  # against gravity, in the world of the calibration
 
 
 class PoseDetections(NamedTuple):
@@ -39,6 +40,7 @@ class Scene(NamedTuple):
     Attributes:
         camera: name of the camera.
         intrinsics: its intrinsics.
+        up: (3,) the direction against gravity in the camera's axes.
         truth: (f, 12, 3) mm, `JOINTS` in the camera's axes.
         mediapipe: results of MediaPipe.
         detections: the detections that come with the clip, None if there are none.
@@ -46,6 +48,7 @@ class Scene(NamedTuple):
 
     camera: str
     intrinsics: Intrinsics
+    up: Floats
     truth: Floats
     mediapipe: PoseDetections
     detections: View | None
@@ -58,7 +61,10 @@ def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]
     cameras = [view.camera for view in session.views]
     moving = detect_trial(wheel, "Balancing", output)
     balancing = [
-        Scene(view.camera.name, view.camera.intrinsics, view.truth, moving[view.camera.name], view)
+        Scene(
+            *(view.camera.name, view.camera.intrinsics, view.camera.rotation @ _UP),
+            *(view.truth, moving[view.camera.name], view),
+        )
         for view in session.views
     ]
     still = detect_trial(wheel, "Static", output)
@@ -68,7 +74,10 @@ def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]
     weights = np.stack([mediapipe.confidence[:, LIMBS] for mediapipe in standing]).astype(float)
     world, reprojection = triangulate([c.without_lens() for c in cameras], points, weights)
     truths = [
-        Scene(camera.name, camera.intrinsics, camera.to_camera(world), mediapipe, None)
+        Scene(
+            *(camera.name, camera.intrinsics, camera.rotation @ _UP),
+            *(camera.to_camera(world), mediapipe, None),
+        )
         for camera, mediapipe in zip(cameras, standing, strict=True)
     ]
     pixels = float(np.nanmean(np.linalg.norm(reprojection, axis=-1)))

@@ -1,0 +1,163 @@
+"""The figures of people over time on cases whose answer is known, and the program on tiny data."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.data import people_scenes
+from benchmarks.data.people_scenes import Track, filmed, noisy
+from benchmarks.real import people
+from deep_nrsfm_ros.data.pose2sim import JOINTS
+from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
+
+LIMBS = [HUMAN17.index(joint) for joint in JOINTS]
+
+
+@pytest.fixture
+def track(walking: Any) -> Track:
+    """Return a person who walks, as a camera sees it, without noise."""
+    return filmed(walking(90), 120.0, 0)
+
+
+@pytest.fixture
+def walking() -> Any:
+    """Return f frames (f, 17, 3) of a figure, m, y up, that swings its limbs."""
+    rng = np.random.default_rng(0)
+    rest, swing = rng.normal(0, 0.4, (17, 3)), rng.normal(0, 0.2, (17, 3))
+
+    def motion(frames: int) -> np.ndarray:
+        return rest + [0, 1, 0] + swing * np.sin(np.arange(frames) / 6)[:, None, None]
+
+    return motion
+
+
+def test_the_truth_projects_to_the_keypoints(track: Track) -> None:
+    X = track.truth / track.truth[..., 2:]
+    assert np.allclose(track.intrinsics.pixels(X[..., :2]), track.points[:, LIMBS], atol=1e-6)
+    assert track.up[1] < -0.9  # the image's y points down
+
+
+def test_a_perfect_system_has_no_error(track: Track) -> None:
+    unit = track.reference_length
+    row = people.figures([("one", people.shape_errors(track, track.truth / unit, 1.0))])
+    assert row.pop("frames") == 90
+    assert row.pop("lag ms") == pytest.approx(0, abs=3)
+    assert row.pop("image lag ms") == pytest.approx(0, abs=3)
+    assert {name: abs(value) < 1e-3 for name, value in row.items()} == dict.fromkeys(row, True)
+    assert "missing mm" not in row
+
+
+def test_pitch_is_positive_where_the_head_is_too_far_away(track: Track) -> None:
+    tilt = Rotation.from_euler("x", -10, degrees=True).as_matrix()
+    above = np.array([0, -1.0, 0]) @ tilt.T
+    assert above[2] > 0
+    row = people.figures([("one", people.shape_errors(track, track.truth @ tilt.T, None))])
+    assert row["pitch deg"] == pytest.approx(10)
+    assert row["rotation deg"] == pytest.approx(10)
+    assert row["PA mm"] == pytest.approx(0, abs=1e-6)
+    assert "place mm" not in row
+
+
+def test_lag_is_the_delay_in_all_axes_and_in_the_image(track: Track) -> None:
+    late = np.concatenate([track.truth[:1], track.truth[:1], track.truth[:-2]])
+    row = people.figures([("one", people.shape_errors(track, late, None))])
+    assert row["lag ms"] == pytest.approx(2000 / people_scenes.CMU_RATE, abs=3)
+    in_depth = track.truth.copy()
+    in_depth[..., 2] = late[..., 2]
+    row = people.figures([("one", people.shape_errors(track, in_depth, None))])
+    assert row["image lag ms"] == pytest.approx(0, abs=3)
+    assert row["lag ms"] > 10
+
+
+def test_noise_hides_and_moves_keypoints(walking: Any) -> None:
+    exact = filmed(walking(3000), 0.0, 1)
+    track = noisy(exact, 2)
+    shown = track.confidence > 0
+    limbs = shown[:, LIMBS]
+    assert 1 - limbs.mean() == pytest.approx(people_scenes.DROPOUTS, rel=0.3)
+    ends = (~limbs[:-1] & limbs[1:]).sum() / (~limbs).sum()
+    assert 1 / (ends * people_scenes.CMU_RATE) == pytest.approx(0.2, rel=0.3)
+    size = np.sqrt(np.square(exact.points - exact.points.mean(1, keepdims=True)).sum(2).mean(1))
+    error = ((track.points - exact.points) / size[:, None, None])[:, LIMBS][limbs]
+    assert np.sqrt(np.median(error**2) / 0.455) == pytest.approx(people_scenes.NOISE, rel=0.1)
+    neck, shoulders = HUMAN17.index("neck"), [HUMAN17.index("left_shoulder")]
+    assert (shown[:, neck] <= shown[:, shoulders[0]]).all()
+
+
+def write_shelf(folder: Path, motion: np.ndarray) -> None:
+    """Write a scene of one person before two cameras, in the layout BODY25."""
+    folder.mkdir(parents=True)
+    f, places = len(motion), [BODY25.index(name) for name in HUMAN17.keypoints]
+    world = np.full((f, 1, 25, 3), np.nan)
+    world[:, 0, places] = motion @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up
+    views = []
+    for turn in (0, 90):
+        R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+        R = R @ Rotation.from_euler("z", turn, degrees=True).as_matrix()
+        views.append((R, -R @ world[0, 0, places].mean(0) + [0, 0, 5]))
+    K = np.array([[900.0, 0, 500], [0, 900, 400], [0, 0, 1]])
+    points = np.stack([((X := world[:, 0] @ R.T + t) / X[..., 2:]) @ K.T for R, t in views], 1)[
+        :, :, None, :, :2
+    ]
+    np.savez(
+        folder / "shelf_dev.npz",
+        points=points,
+        confidence=np.isfinite(points[..., 0]) * 0.8,
+        truth=world,
+        K=np.stack([K, K]),
+        dist=np.zeros((2, 5)),
+        R=np.stack([R for R, _ in views]),
+        t=np.stack([t for _, t in views]),
+    )
+
+
+def test_the_program_prints_a_row_for_each_system(
+    tmp_path: Path,
+    data: Path,
+    walking: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    (folder / "cmu").symlink_to(data / "cmu")
+    data = folder
+    write_shelf(data / "scenes" / "shelf", walking(40))
+    np_mpii = {"points": np.random.default_rng(0).normal(0, 90, (4, 16, 2)) + 300}
+    (data / "scenes" / "people_mpii").mkdir()
+    np.savez(
+        data / "scenes" / "people_mpii" / "people_mpii.npz",
+        points=np_mpii["points"],
+        points_annotated=np_mpii["points"],
+        missing=np.zeros((4, 16), bool),
+    )
+    monkeypatch.setattr(people, "SUBJECTS", ("01",))
+    monkeypatch.setattr(people_scenes, "HELD_OUT", ("01",))
+    monkeypatch.setattr(people_scenes, "CMU_STRIDE", 1)
+    monkeypatch.setattr(people, "MEAN_STRIDE", 1)
+
+    def no_clip(output: Path) -> None:
+        raise ValueError("no clip here")
+
+    monkeypatch.setattr(people_scenes, "scenes", no_clip)
+    people.main(["--data", str(data), "--output", str(tmp_path / "out")])
+    printed = capsys.readouterr().out
+    assert "no rows of the pose2sim clip: no clip here" in printed
+    rows = list(csv.DictReader((tmp_path / "out" / "people.csv").open()))
+    systems = {(row["scene"], row["system"], row["intrinsics"]) for row in rows}
+    names = ("shelf_dev", "CMU 03, 131", "CMU 03, 131, still")
+    known = ("yes", "no")
+    assert systems == {
+        *((scene, system, i) for scene in names for system in people.SYSTEMS for i in known),
+        *((scene, "mean shape", "") for scene in names),
+    }
+    assert all(float(row["PA mm"]) > 0 for row in rows)
+    seen = list(csv.DictReader((tmp_path / "out" / "people_without_truth.csv").open()))
+    assert [row["scene"] for row in seen] == ["MPII, detector", "MPII, annotated"]
+    assert (tmp_path / "out" / "people_MPII_detector.png").stat().st_size > 1000
