@@ -19,7 +19,9 @@ def plan(header: Any, floats: Any, doubles: Any, /) -> object:
         ValueError: A count, index or length is out of range.
     """
 
-def lift(plan: object, points: Any, confidence: Any, perspective: bool, /, *outputs: Any) -> None:
+def lift(
+    plan: object, points: Any, confidence: Any, perspective: bool, context: Any, /, *outputs: Any
+) -> None:
     """Lift n objects and fill the outputs, which must not overlap other arrays.
 
     Args:
@@ -27,6 +29,7 @@ def lift(plan: object, points: Any, confidence: Any, perspective: bool, /, *outp
         points: (n, p, 2) float32.
         confidence: (n, p) float32, 0 = missing.
         perspective: whether points are where rays meet the plane z = 1.
+        context: None, or `lifting.history.Context`, whose states are updated.
         outputs: the six arrays of `lifting.Lifted`, float32, and (n,) bool: not lifted.
 
     Raises:

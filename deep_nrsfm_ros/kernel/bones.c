@@ -8,7 +8,7 @@ double measure_bones(Plan *k, const Object *o) {
     double size = 0, weights = 0;
     for (int b = 0; b < k->bones; b++) {
         const int *ends = k->bone_ends + 2 * b;
-        const double *bone = k->bone_lengths + 2 * b;
+        const double *bone = o->bones + 2 * b;
         double *edge = k->bone_directions + 4 * b, square = 0, weight = bone[0] / bone[1] * (bone[0] / bone[1]);
         for (int r = 0; r < 3; r++) {
             const float *S = o->S + r * k->stride;

@@ -39,8 +39,9 @@ INLINE void combine_inline(ptrdiff_t n, const double *restrict v, const float *r
 }
 FAST(combine, (ptrdiff_t n, const double *v, const float *Sigma, double *E), (n, v, Sigma, E))
 
-/* Set E (3, p) = Sigma H^T x from the solution x (2 p + n) of the keypoints and n bones; x is a column of A. */
-static void expected_error(Plan *k, const double *x, int stride, int n) {
+/* Set E (3, p) = Sigma H^T x from the solution x (2 p + n + upright) of the keypoints, n bones and gravity; x is a
+   column of A. */
+static void expected_error(Plan *k, const double *x, int stride, int n, int upright) {
     int p = DOUBLES_OF(k->p);
     double *m = k->point_cameras, *v = k->spread;
     for (int j = 0; j < 3 * p; j++) k->E[j] = 0;
@@ -54,6 +55,10 @@ static void expected_error(Plan *k, const double *x, int stride, int n) {
             for (int r = 0; r < 3; r++)
                 v[3 * k->bone_ends[2 * b + end] + r] +=
                     (end ? -1 : 1) * k->bone_directions[4 * b + r] * x[(size_t)(2 * p + b) * stride];
+    for (int row = n; row < n + upright; row++)
+        for (int i = 0; i < k->p; i++)
+            for (int r = 0; r < 3; r++)
+                v[3 * i + r] += k->axis[i] * k->bone_directions[4 * row + r] * x[(size_t)(2 * p + row) * stride];
     combine(3 * p, v, k->covariance, k->E);
 }
 
@@ -76,51 +81,91 @@ FAST(bone_spread,
       double *along, double *spread),
      (p, from, to, g, m, along, spread))
 
-/* Set the columns of the bones and the right side b (2, p) in the rows (2, p) of the keypoints. */
-static void add_columns(Plan *k, const double *b, double *A, int stride) {
-    int p = DOUBLES_OF(k->p), n = DOUBLES_OF(k->bones);
+/* Set the same of the axis from bottom to top, in direction g. */
+static void axis_spread(const Plan *k, const double *g, double *along, double *spread) {
+    int p = DOUBLES_OF(k->p);
+    const double *m = k->point_cameras;
+    for (int j = 0; j < 3 * p; j++) along[j] = 0;
+    for (int i = 0; i < k->p; i++)
+        for (int r = 0; r < 3 && k->axis[i] != 0; r++) {
+            const float *Sigma = k->covariance + (size_t)9 * p * i + 3 * p * r;
+            for (int j = 0; j < 3 * p; j++) along[j] += k->axis[i] * g[r] * Sigma[j];
+        }
+    for (int i = 0; i < p; i++)
+        for (int a = 0; a < 2; a++) {
+            spread[a * p + i] = 0;
+            for (int r = 0; r < 3; r++) spread[a * p + i] += m[(2 * r + a) * p + i] * along[r * p + i];
+        }
+}
+
+/* Set the columns of the bones and of gravity, n together, and the right side b (2, p) in the rows (2, p) of the
+   keypoints. */
+static void add_columns(Plan *k, const double *b, double *A, int stride, int n) {
+    int p = DOUBLES_OF(k->p), wide = DOUBLES_OF(n);
     double *spread = k->spread;
-    for (int first = 0; first < n; first += DOUBLES) {
+    for (int first = 0; first < wide; first += DOUBLES) {
         memset(spread, 0, DOUBLES * 2 * p * sizeof(double));
-        for (int bone = first; bone < first + DOUBLES && bone < k->bones; bone++) {
+        for (int bone = first; bone < first + DOUBLES && bone < n; bone++) {
+            double *along = k->bone_covariance + (size_t)3 * p * bone, *to_image = spread + (bone - first) * 2 * p;
+            const double *g = k->bone_directions + 4 * bone;
+            if (bone >= k->bones) {
+                axis_spread(k, g, along, to_image);
+                continue;
+            }
             const float *from = k->covariance + (size_t)9 * p * k->bone_ends[2 * bone];
             const float *to = k->covariance + (size_t)9 * p * k->bone_ends[2 * bone + 1];
-            bone_spread(p, from, to, k->bone_directions + 4 * bone, k->point_cameras, k->bone_covariance + (size_t)3 * p * bone,
-                 spread + (bone - first) * 2 * p);
+            bone_spread(p, from, to, g, k->point_cameras, along, to_image);
         }
         for (int i = 0; i < 2 * p; i++)
             for (int j = 0; j < DOUBLES; j++)
                 A[(size_t)i * stride + 2 * p + first + j] = spread[2 * j * p + i];
     }
     for (int i = 0; i < 2 * p; i++)
-        for (int j = 0; j < DOUBLES; j++) A[(size_t)i * stride + 2 * p + n + j] = j ? 0 : b[i];
+        for (int j = 0; j < DOUBLES; j++) A[(size_t)i * stride + 2 * p + wide + j] = j ? 0 : b[i];
 }
 
-/* Set the rows of the bones from their covariances; size: that of the object, see measure_bones. */
-static void add_rows(Plan *k, double size, double *A, int stride) {
-    int p = DOUBLES_OF(k->p), n = DOUBLES_OF(k->bones);
-    for (int b = 0; b < n; b++) {
+/* Return the component of e (3, p) along row c of gravity. */
+static double along_axis(const Plan *k, int c, const double *e) {
+    int p = DOUBLES_OF(k->p);
+    double sum = 0;
+    for (int r = 0; r < 3; r++)
+        for (int i = 0; i < k->p; i++) sum += k->bone_directions[4 * c + r] * k->axis[i] * e[r * p + i];
+    return sum;
+}
+
+/* Set the rows of the bones from their covariances, and those of gravity, n together.
+
+   size: that of the object, see measure_bones. upright: see set_upright. */
+static void add_rows(Plan *k, const Object *o, double size, const double *upright, double *A, int stride, int n) {
+    int p = DOUBLES_OF(k->p), wide = DOUBLES_OF(n);
+    for (int b = 0; b < wide; b++) {
         double *row = A + (size_t)(2 * p + b) * stride + 2 * p;
-        for (int j = b; j < n + DOUBLES; j++) row[j] = j == b;
-        if (b >= k->bones) continue; /* Beyond the last bone: x = 0. */
+        for (int j = b; j < wide + DOUBLES; j++) row[j] = j == b;
+        if (b >= n) continue; /* Beyond the last one: x = 0. */
+        const double *along = k->bone_covariance + (size_t)3 * p * b;
+        for (int c = b > k->bones ? b : k->bones; c < n; c++) row[c] = along_axis(k, c, along);
+        if (b >= k->bones) {
+            row[b] += upright[2] * upright[2] + 1e-12 * k->unknown_variance;
+            row[wide] = upright[b - k->bones];
+            continue;
+        }
         const int *ends = k->bone_ends + 2 * b;
-        const double *bone = k->bone_lengths + 2 * b, *along = k->bone_covariance + (size_t)3 * p * b;
-        const double *g = k->bone_directions + 4 * b;
+        const double *bone = o->bones + 2 * b, *g = k->bone_directions + 4 * b;
         double spread = size * bone[1], shortfall = size * bone[0] - g[3];
         for (int r = 0; r < 3; r++) shortfall += g[r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
         for (int c = b; c < k->bones; c++) {
             const int *other_ends = k->bone_ends + 2 * c;
             const double *h = k->bone_directions + 4 * c;
-            row[c] = size * size * bone[0] * k->bone_lengths[2 * c];
+            row[c] = size * size * bone[0] * o->bones[2 * c];
             for (int r = 0; r < 3; r++) row[c] += h[r] * (along[r * p + other_ends[0]] - along[r * p + other_ends[1]]);
         }
         row[b] += spread * spread + 1e-12 * k->unknown_variance;
-        row[n] = shortfall;
+        row[wide] = shortfall;
     }
 }
 
 void correct(Plan *k, Object *o, double noise) {
-    int p = DOUBLES_OF(k->p), n = 2 * p, bones = DOUBLES_OF(k->bones), stride = n + bones + DOUBLES;
+    int p = DOUBLES_OF(k->p), n = 2 * p, more = k->bones + 2 * o->upright, stride = n + DOUBLES_OF(more) + DOUBLES;
     double *A = k->system, *m = k->point_cameras, unknown = k->unknown_variance;
     for (int i = 0; i < p; i++) {
         const float *Sigma = k->covariance + (size_t)9 * p * i;
@@ -143,13 +188,15 @@ void correct(Plan *k, Object *o, double noise) {
         }
     }
     solve(n, 0, stride, A);
-    expected_error(k, A + n, stride, 0);
-    if (bones) {
-        double size = measure_bones(k, o);
-        add_columns(k, k->difference, A, stride);
-        add_rows(k, size, A, stride);
-        solve(n + bones, n, stride, A);
-        expected_error(k, A + n + bones, stride, k->bones);
+    expected_error(k, A + n, stride, 0, 0);
+    if (o->last && o->updates) learn_bones(k, o);
+    if (more) {
+        double size = k->bones ? measure_bones(k, o) : 0, upright[3];
+        if (o->upright) set_upright(k, o, k->bone_directions + 4 * k->bones, upright);
+        add_columns(k, k->difference, A, stride, more);
+        add_rows(k, o, size, upright, A, stride, more);
+        solve(n + DOUBLES_OF(more), n, stride, A);
+        expected_error(k, A + n + DOUBLES_OF(more), stride, k->bones, 2 * o->upright);
     }
     for (int r = 0; r < 3; r++)
         for (int i = 0; i < k->p; i++) o->S[r * k->stride + i] += (float)k->E[r * p + i];

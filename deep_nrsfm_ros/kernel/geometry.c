@@ -1,6 +1,7 @@
 #include "geometry.h"
 
 #include <math.h>
+#include <string.h>
 
 #define TINY 1e-12
 
@@ -32,6 +33,27 @@ void rotation_from_camera(camera M, rotation R) {
 void transpose(rotation R, rotation out) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) out[i][j] = R[j][i];
+}
+
+void rotation_part(rotation R, double part, rotation out) {
+    double trace = R[0][0] + R[1][1] + R[2][2], q[4]; /* a quaternion x, y, z, w: as `quaternion` of geometry.py */
+    int i = R[1][1] > R[0][0] ? 1 : 0;
+    if (R[2][2] > R[i][i]) i = 2;
+    int j = (i + 1) % 3, k = (i + 2) % 3;
+    if (trace >= R[i][i]) {
+        for (int r = 0; r < 3; r++) q[r] = R[(r + 2) % 3][(r + 1) % 3] - R[(r + 1) % 3][(r + 2) % 3];
+        q[3] = 1 + trace;
+    } else {
+        q[i] = 1 + 2 * R[i][i] - trace, q[j] = R[i][j] + R[j][i], q[k] = R[k][i] + R[i][k];
+        q[3] = R[k][j] - R[j][k];
+    }
+    double sine = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]), sign = q[3] < 0 ? -1 : 1;
+    double half = part * atan2(sine, sign * q[3]), by = sine > TINY ? sign * sin(half) / sine : 0;
+    double x = by * q[0], y = by * q[1], z = by * q[2], w = cos(half);
+    double turned[3][3] = {{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
+                           {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
+                           {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}};
+    memcpy(out, turned, sizeof(turned));
 }
 
 void rotate(int p, int stride, rotation A, float *S) {

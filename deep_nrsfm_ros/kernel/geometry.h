@@ -25,6 +25,8 @@ void polar(camera A);
 /* Set R, whose first two rows are the columns of M and the third their cross product. */
 void rotation_from_camera(camera M, rotation R);
 void transpose(rotation R, rotation out);
+/* Set out to the rotation about the same axis by `part` in [0, 1] of the angle of R; out may be R. */
+void rotation_part(rotation R, double part, rotation out);
 
 /* S (3, p) = A S for A (3, 3); rows of S are `stride` apart. */
 void rotate(int p, int stride, rotation A, float *S);

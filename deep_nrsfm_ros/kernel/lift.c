@@ -88,6 +88,9 @@ static void fit_block(Plan *k, int n, Object *const *objects, int perspective) {
         rotation back;
         rotation_from_camera(o->M, o->R);
         if (!k->corrected) continue;
+        transpose(o->R, back);
+        rotate(p, k->stride, back, o->S);
+        if (o->last && o->updates) smooth_network(k, o);
         for (int i = 0; i < p; i++) {
             int doubtful = o->weight[i] > 0 && !o->visible[i];
             for (int c = 0; c < 2; c++) {
@@ -99,8 +102,6 @@ static void fit_block(Plan *k, int n, Object *const *objects, int perspective) {
                 square += o->visible[i] * w * w;
             }
         }
-        transpose(o->R, back);
-        rotate(p, k->stride, back, o->S);
         correct(k, o, k->noise * sqrt(square / fmax(2 * o->visible_count, 1)));
         rotate(p, k->stride, o->R, o->S);
     }
@@ -147,8 +148,13 @@ static int detected_count(const Plan *k, const Object *o) {
     return n;
 }
 
-/* Write a fitted object as row i of the outputs; return 1 if it is not lifted: too few keypoints are detected, or
-   all lie on one line. */
+/* Return whether an object is lifted: enough keypoints are detected, and not all lie on one line. */
+static int is_lifted(Plan *k, const Object *o) {
+    return !on_one_line(moments(k->p, o->image_points, o->S, k->stride, o->visible)) &&
+           detected_count(k, o) >= k->min_visible;
+}
+
+/* Write a fitted object as row i of the outputs; return 1 if it is not lifted. */
 static int write_lifted(Plan *k, Object *o, ptrdiff_t i, float *const outputs[6]) {
     int p = k->p, stride = k->stride;
     const int *pair = k->reference;
@@ -195,7 +201,7 @@ static void set_weights(const Plan *k, Object *o) {
 }
 
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
-          float *const outputs[6], char *not_lifted) {
+          const Context *context, float *const outputs[6], char *not_lifted) {
     int p = k->p;
     for (ptrdiff_t start = 0; start < n; start += k->block) {
         int block = n - start < k->block ? (int)(n - start) : k->block, incomplete = 0;
@@ -204,12 +210,17 @@ void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, in
             o->image_points = points + 2 * p * (start + i), o->confidence = confidence + p * (start + i);
             memcpy(o->input, o->image_points, 2 * p * sizeof(float));
             set_weights(k, o);
+            recall(k, o, context, start + i, context && is_lifted(k, o));
+            o->last = !k->refill_rounds || o->visible_count >= p;
         }
         fit_block(k, block, k->incomplete, perspective);
         for (int i = 0; i < block; i++)
             if (k->objects[i].visible_count < p) k->incomplete[incomplete++] = k->objects + i;
         for (int round = 0; round < k->refill_rounds && incomplete; round++) {
-            for (int i = 0; i < incomplete; i++) refill_input(k, k->incomplete[i], perspective);
+            for (int i = 0; i < incomplete; i++) {
+                refill_input(k, k->incomplete[i], perspective);
+                k->incomplete[i]->last = round == k->refill_rounds - 1;
+            }
             fit_block(k, incomplete, k->incomplete, perspective);
         }
         for (int i = 0; i < block; i++)

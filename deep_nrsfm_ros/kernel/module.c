@@ -4,6 +4,7 @@
    is wrong raises TypeError, ValueError or RuntimeError. Functions of the other files assume what is checked. */
 #include "arguments.h"
 
+#include <math.h>
 #include <stdint.h>
 #include <string.h>
 
@@ -73,8 +74,42 @@ static int lengths_match(int count, const Py_buffer *arrays, const Py_ssize_t *s
     return 1;
 }
 
-/* lift(plan, points, confidence, perspective, shapes, rotations, scale, translation, residual, confidence,
-   not_lifted): fill the last seven: the arrays of `lifting.Lifted`, float32, and not_lifted (n,) of bool.
+/* Get the buffers of a context of n objects: Context of lifting/history.py. `views` holds those that are there, of
+   its states, rows, up and to_view. Returns 1, or 0 with an exception set and no buffer held. */
+static int get_context(const Plan *k, Py_ssize_t n, PyObject *tuple, Context *context, Py_buffer views[4]) {
+    static const ArrayArgument expected[4] = {
+        {"states", FLOAT64, 1}, {"rows", INT32, 0}, {"up", FLOAT64, 0}, {"to_view", FLOAT64, 0}};
+    PyObject *objects[4];
+    int held[4] = {1, 1, 0, 0}, i;
+    memset(views, 0, 4 * sizeof(Py_buffer));
+    if (!PyTuple_Check(tuple)) {
+        PyErr_SetString(PyExc_TypeError, "the context must be a tuple");
+        return 0;
+    }
+    if (!parse_arguments(tuple, "OOdOO:context", &objects[0], &objects[1], &context->time, &objects[2], &objects[3])) return 0;
+    for (i = 0; i < 4; i++) {
+        held[i] = objects[i] != Py_None || i < 2;
+        if (held[i] && !get_arrays(1, expected + i, objects + i, views + i)) break;
+    }
+    if (i == 4) {
+        Py_ssize_t size = state_size(k), states = count_items(views), turned;
+        int sound = states % size == 0 && count_items(views + 1) == n && isfinite(context->time);
+        sound = sound && (!held[2] || count_items(views + 2) == 3);
+        sound = sound && !__builtin_mul_overflow(n, 9, &turned) && (!held[3] || count_items(views + 3) == turned);
+        context->states = views[0].buf, context->rows = views[1].buf, context->capacity = states / size;
+        context->up = views[2].buf, context->to_view = views[3].buf;
+        for (Py_ssize_t row = 0; sound && row < n; row++) sound = context->rows[row] < context->capacity;
+        if (sound) return 1;
+        PyErr_SetString(PyExc_ValueError, "the context does not fit the plan and the objects");
+    }
+    for (int held_too = 0; held_too < i; held_too++)
+        if (held[held_too]) PyBuffer_Release(views + held_too);
+    return 0;
+}
+
+/* lift(plan, points, confidence, perspective, context, shapes, rotations, scale, translation, residual, confidence,
+   not_lifted): fill the last seven: the arrays of `lifting.Lifted`, float32, and not_lifted (n,) of bool. context:
+   None, or a Context of lifting/history.py, whose states are updated.
 
    The GIL is held: a lift takes less than waiting for the GIL does, and the scratch memory of a plan serves one
    lift at a time. The busy flag also rejects a nested lift with the same plan, which the buffer method of an
@@ -84,11 +119,12 @@ static PyObject *lift_entry(PyObject *Py_UNUSED(module), PyObject *args) {
         {"points", FLOAT32, 0},    {"confidence", FLOAT32, 0}, {"shapes", FLOAT32, 1},
         {"rotations", FLOAT32, 1}, {"scale", FLOAT32, 1},      {"translation", FLOAT32, 1},
         {"residual", FLOAT32, 1},  {"confidence", FLOAT32, 1}, {"not_lifted", BOOL, 1}};
-    PyObject *capsule, *o[9];
-    Py_buffer arrays[9];
+    PyObject *capsule, *tuple, *o[9];
+    Py_buffer arrays[9], views[4];
+    Context context;
     int perspective, lifted = 0;
-    if (!parse_arguments(args, "OOOpOOOOOOO:lift", &capsule, &o[0], &o[1], &perspective, &o[2], &o[3], &o[4], &o[5],
-                         &o[6], &o[7], &o[8]))
+    if (!parse_arguments(args, "OOOpOOOOOOOO:lift", &capsule, &o[0], &o[1], &perspective, &tuple, &o[2], &o[3], &o[4],
+                         &o[5], &o[6], &o[7], &o[8]))
         return NULL;
     Plan *k = PyCapsule_GetPointer(capsule, PLAN);
     if (!k) return NULL;
@@ -99,11 +135,16 @@ static PyObject *lift_entry(PyObject *Py_UNUSED(module), PyObject *args) {
         const Py_ssize_t sizes[9] = {2 * p, p, 3 * p, 9, 1, 2, 1, p, 1};
         float *outputs[6];
         for (int i = 0; i < 6; i++) outputs[i] = arrays[2 + i].buf;
-        lifted = lengths_match(9, arrays, sizes, n);
-        if (lifted)
-            lift(k, n, arrays[0].buf, arrays[1].buf, perspective, outputs, arrays[8].buf);
-        else
+        int has_context = tuple != Py_None;
+        if (!lengths_match(9, arrays, sizes, n))
             PyErr_SetString(PyExc_ValueError, "the arrays do not fit the plan and each other");
+        else if (!has_context || get_context(k, n, tuple, &context, views)) {
+            lift(k, n, arrays[0].buf, arrays[1].buf, perspective, has_context ? &context : NULL, outputs,
+                 arrays[8].buf);
+            lifted = 1;
+            for (int i = 0; has_context && i < 4; i++)
+                if (views[i].obj) PyBuffer_Release(views + i);
+        }
         release_arrays(9, arrays);
     }
     __atomic_store_n(&k->busy, 0, __ATOMIC_RELEASE);

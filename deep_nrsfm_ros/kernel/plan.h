@@ -28,18 +28,47 @@ typedef struct {
     double visible_count, residual;
     camera M;
     rotation R;
+    /* Of a context; see `recall`. */
+    double *state;          /* what is remembered of it; NULL: nothing */
+    const double *bones;    /* (bones, 2) length and deviation: its own, or the model's */
+    double *own_bones, *own_growth; /* (bones, 2); (bones) logarithms of their lengths relative to the model's */
+    const double *view;     /* (3, 3) from the camera to the view that is lifted; NULL: they are the same */
+    double time, seconds;   /* of this frame; since the last one */
+    int last;               /* whether the next fit is the last one, which updates the state */
+    int goes_on, updates;   /* whether the state is smoothed on, and changed at all */
+    int upright;            /* whether gravity is known */
+    double up[3];           /* against gravity, in the view */
 } Object;
+
+/* What is known of n objects beside their keypoints: Context of lifting/history.py. */
+typedef struct {
+    double *states;                 /* (capacity, state_size) */
+    ptrdiff_t capacity;
+    const int *rows;                /* (n); < 0: nothing is remembered */
+    double time;                    /* seconds */
+    const double *up, *to_view;     /* (3), (n, 3, 3); NULL: unknown, the same */
+} Context;
+
+/* Constants of lifting/history.py, own_bones.py and gravity.py, in the order of the plan's doubles. */
+typedef struct {
+    double shape_time, hidden_time, rotation_time, bones_time, max_gap, max_back, outlier, max_step, max_seconds,
+        memory, own_variance, misfit_time, misfit_ratio, change_evidence, doubted_evidence, lean_deviation, free_lean;
+} Past;
+#define PAST_NUMBERS ((int)(sizeof(Past) / sizeof(double)))
 
 typedef struct {
     int p, stride, layers, rotations, refill_rounds, reference[2], min_visible, bones, derivations;
-    int mirrored, whitened, scale_by_rms, corrected;                     /* flags */
+    int mirrored, whitened, scale_by_rms, corrected, has_axis;           /* flags */
     const int *widths, *partners, *bone_ends;                            /* (layers), (p), (bones, 2) */
     const int *derivation_pairs; /* (derivations, 2): a keypoint, and one that it follows from */
+    const int *bone_partners;    /* (bones): of each bone that of the other side, or itself */
     Matrix L, L_inverse, encoder[MAX_LAYERS], decoder[MAX_LAYERS], code_head;
     const float *b[MAX_LAYERS], *b_[MAX_LAYERS], *camera_head;
     const float *error_std, *covariance;                                 /* (p), (p, 3, 3, p) in DOUBLES */
     const double *completion, *image_rotations, *object_frame;           /* (p, p), (rotations, 2, 2), (3, 3) */
     const double *calibration, *bone_lengths;                            /* (5), (bones, 2) length and deviation */
+    const double *axis;                                                  /* (p) from bottom to top */
+    Past past;
     double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, residual_offset,
         trusted_weight, full_ratio;
     void *constants, *scratch; /* the memory of all above, and of all below */
@@ -53,8 +82,10 @@ typedef struct {
     double *cameras, *residuals;  /* (mirrored + 1, n, rotations, 3, 2), (mirrored + 1, rotations) */
     double *point_cameras, *E;    /* (3, 2, p) projection of each keypoint, (3, p) errors of the shape */
     double *system, *difference;  /* A x = b of the correction, W less the projection of S (2, p) */
-    double *bone_directions;      /* (bones, 4) unit vectors and lengths */
-    double *bone_covariance;      /* (bones, 3, p) of the growth of a bone and the errors */
+    double *bone_directions;      /* (bones + 2, 4) unit vectors and lengths; last those of gravity */
+    double *bone_covariance;      /* (bones + 2, 3, p) of the growth of a bone and the errors */
+    double *sight;                /* (2, bones) growth and weight of the bones in this frame */
+    double *precision, *no_growth; /* (bones) length / deviation of the model; 0 */
     double *spread;               /* (DOUBLES, 2, p) of bones and keypoints in the image */
 } Plan;
 
@@ -86,6 +117,23 @@ void normalise(Plan *k, Object *o);
    mirror image. */
 void forward(Plan *k, int n, Object *const *objects, int mirrored, float *shapes, camera *cameras);
 
+/* Return the doubles of a state. */
+ptrdiff_t state_size(const Plan *k);
+
+/* Set what object i has of a context, NULL if there is none. `lifted`: an object that is not lifted changes no
+   state. */
+void recall(Plan *k, Object *o, const Context *context, ptrdiff_t i, int lifted);
+
+/* Smooth S, in object axes, R and M of an object with a state, and update its shape, rotation and time. */
+void smooth_network(Plan *k, Object *o);
+
+/* Learn the bone lengths of S + E, in object axes, of an object with a state. */
+void learn_bones(Plan *k, Object *o);
+
+/* Set two directions (2, 4) across gravity, in object axes, and values: how much is missing along each for S to be
+   upright, and the standard deviation of both, by the lean of S + E. Returns their number. */
+int set_upright(Plan *k, Object *o, double *directions, double values[3]);
+
 /* Set the directions and lengths of the bones of S + E; return the size of the object, relative to the bone
    lengths of the plan. */
 double measure_bones(Plan *k, const Object *o);
@@ -98,8 +146,9 @@ void correct(Plan *k, Object *o, double noise);
 
    points (n, p, 2), confidence (n, p). Outputs, as in `lifting.Lifted`: shapes (n, p, 3), rotations (n, 3, 3),
    scale (n), translation (n, 2), residual (n), confidence (n, p); not_lifted (n) is 1 where too few keypoints
-   are detected or all lie on one line. An object's result does not depend on the others. */
+   are detected or all lie on one line. An object's result does not depend on the others. context: NULL if there is
+   none; its states are updated. */
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
-          float *const outputs[6], char *not_lifted);
+          const Context *context, float *const outputs[6], char *not_lifted);
 
 #endif

@@ -2,6 +2,7 @@
 #include "plan.h"
 
 #include <math.h>
+#include <string.h>
 
 /* Rows of a product, at most: the codes of more do not stay in the cache. */
 #define MAX_ROWS 144
@@ -31,13 +32,16 @@ const char *check_header(const int *h, ptrdiff_t length) {
     if (!in_range(bones, 0, MAX_BONES)) return "the number of bones is out of range";
     if (!in_range(derivations, 0, MAX_DERIVATIONS)) return "the number of derivations is out of range";
     /* All five are bounded: the sum cannot overflow. */
-    if (length != HEADER_LENGTH + (ptrdiff_t)layers + p + 2 * bones + 2 * derivations) return "the header has another length";
+    if (length != HEADER_LENGTH + (ptrdiff_t)layers + p + 3 * bones + 2 * derivations) return "the header has another length";
     h += HEADER_LENGTH;
     for (int i = 0; i < layers; i++, h++)
         if (!in_range(*h, 1, MAX_WIDTH)) return "the width of a dictionary is out of range";
     if (!all_keypoints(h, p, p)) return "a partner is no keypoint";
     if (!all_keypoints(h + p, 2 * (ptrdiff_t)bones, p)) return "the end of a bone is no keypoint";
     if (!all_keypoints(h + p + 2 * bones, 2 * (ptrdiff_t)derivations, p)) return "a derivation is of no keypoints";
+    h += p + 2 * bones + 2 * derivations;
+    for (int b = 0; b < bones; b++)
+        if (!in_range(h[b], 0, bones - 1)) return "the partner of a bone is no bone";
     return NULL;
 }
 
@@ -76,7 +80,8 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     k->widths = h, h += k->layers;
     k->partners = h, h += p;
     k->bone_ends = h, h += 2 * k->bones;
-    k->derivation_pairs = h;
+    k->derivation_pairs = h, h += 2 * k->derivations;
+    k->bone_partners = h;
     f = matrix(&k->L, p, p, f, &f_items);
     f = matrix(&k->L_inverse, p, p, f, &f_items);
     for (int i = 0; i < k->layers; i++) {
@@ -96,6 +101,9 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     k->object_frame = d, d += take(&d_items, 9, 1);
     k->calibration = d, d += take(&d_items, 5, 1);
     k->bone_lengths = d, d += take(&d_items, k->bones, 2);
+    k->axis = d, d += take(&d_items, p, 1);
+    const double *past = d;
+    d += take(&d_items, PAST_NUMBERS, 1);
     take(&d_items, 8, 1);
     if (f_items.exceeded || f_items.left) return "the array of float32 has another length";
     if (d_items.exceeded || d_items.left) return "the array of float64 has another length";
@@ -105,6 +113,13 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     for (int i = 0; i < 8; i++)
         if (!(scalars[i] >= 0 && scalars[i] < INFINITY)) return "a variance or length is negative or not finite";
     if (!k->min_relative_depth || !k->residual_scale || !k->residual_offset || !k->trusted_weight) return "a divisor is zero";
+    for (int i = 0; i < PAST_NUMBERS; i++)
+        if (!(past[i] >= 0 && past[i] < INFINITY)) return "a constant of the past is negative or not finite";
+    memcpy(&k->past, past, sizeof(Past));
+    for (int i = 0; i < p; i++) {
+        if (!isfinite(k->axis[i])) return "the axis is not finite";
+        k->has_axis |= k->axis[i] != 0;
+    }
     for (int i = 0; i < 2 * k->bones; i++)
         if (!(k->bone_lengths[i] > 0 && k->bone_lengths[i] < INFINITY)) return "the length of a bone is not positive and finite";
     return NULL;
@@ -130,7 +145,7 @@ static void *room(Arena *arena, size_t item, size_t rows, size_t columns) {
 int lay_out_scratch(Plan *k, char *memory, size_t *size) {
     int n = k->block = 6 * k->rotations < MAX_ROWS ? MAX_ROWS / (6 * k->rotations) : 1;
     size_t p = k->p, stride = k->stride, rotated = (size_t)n * k->rotations, all = k->rotations * (1 + k->mirrored);
-    size_t even = DOUBLES_OF(k->p), bones = DOUBLES_OF(k->bones), system = 2 * even + bones;
+    size_t even = DOUBLES_OF(k->p), bones = DOUBLES_OF(k->bones + 2), system = 2 * even + bones;
     size_t widest = 3 * stride;
     for (int i = 0; i < k->layers; i++)
         if ((size_t)FLOATS_OF(k->widths[i]) > widest) widest = FLOATS_OF(k->widths[i]);
@@ -151,6 +166,10 @@ int lay_out_scratch(Plan *k, char *memory, size_t *size) {
     k->difference = room(a, sizeof(double), 2, even);
     k->bone_directions = room(a, sizeof(double), bones, 4);
     k->bone_covariance = room(a, sizeof(double), 3 * even, bones);
+    k->sight = room(a, sizeof(double), 2, k->bones);
+    k->precision = room(a, sizeof(double), k->bones, 1);
+    k->no_growth = room(a, sizeof(double), k->bones, 1);
+    for (int b = 0; memory && b < k->bones; b++) k->precision[b] = k->bone_lengths[2 * b] / k->bone_lengths[2 * b + 1];
     k->missing = room(a, sizeof(int), p, 1);
     k->incomplete = room(a, sizeof(Object *), n, 1);
     k->objects = room(a, sizeof(Object), n, 1);
@@ -162,6 +181,8 @@ int lay_out_scratch(Plan *k, char *memory, size_t *size) {
         o->weight = room(a, sizeof(double), p, 1);
         o->W = room(a, sizeof(float), p, 2);
         o->S = room(a, sizeof(float), 3, stride);
+        o->own_bones = room(a, sizeof(double), k->bones, 2);
+        o->own_growth = room(a, sizeof(double), k->bones, 1);
     }
     *size = arena.size;
     return !arena.overflow;

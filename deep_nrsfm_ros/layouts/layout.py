@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 Edge = tuple[str, str]
 Tetrahedron = tuple[str, str, str, str]
 MAX_KEYPOINTS = 1000
@@ -31,6 +34,8 @@ class KeypointLayout:
         reference_length: distance of the reference pair on the real object, in metres. The output
             is in metres then. None: unknown.
         rigid: pairs that keep their distance as bones do, and are not drawn.
+        top: keypoints whose mean is the upper end of the object when it is upright. (): unknown.
+        bottom: keypoints whose mean is its lower end.
     """
 
     name: str
@@ -41,6 +46,8 @@ class KeypointLayout:
     derived: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     reference_length: float | None = None
     rigid: tuple[Edge, ...] = ()
+    top: tuple[str, ...] = ()
+    bottom: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise ValueError for a layout that repeats a keypoint or names one that it lacks."""
@@ -64,7 +71,7 @@ class KeypointLayout:
             if len(set(group)) != size:
                 raise ValueError(f"layout {self.name!r}: {kind} {group!r} repeats a name")
         named = [name for _, _, group in groups for name in group]
-        for keypoint in [*named, *self.derived]:
+        for keypoint in [*named, *self.derived, *self.top, *self.bottom]:
             if keypoint not in own:
                 raise ValueError(f"layout {self.name!r} has no keypoint {keypoint!r}")
         for keypoint, parts in self.derived.items():
@@ -72,6 +79,11 @@ class KeypointLayout:
                 raise ValueError(
                     f"layout {self.name!r}: derived {keypoint!r} is a mean of no names"
                 )
+        if bool(self.top) != bool(self.bottom) or set(self.top) & set(self.bottom):
+            raise ValueError(
+                f"layout {self.name!r}: top is {', '.join(self.top) or 'nothing'} and bottom is "
+                f"{', '.join(self.bottom) or 'nothing'}; name different keypoints for both"
+            )
         if self.reference_length is not None:
             self._check_reference_length(self.reference_length)
 
@@ -113,6 +125,25 @@ class KeypointLayout:
         """Return the bones, which are the edges and the rigid pairs, as pairs of indices."""
         return [(self.index(a), self.index(b)) for a, b in (*self.edges, *self.rigid)]
 
+    def sides(self) -> list[int]:
+        """Return for each keypoint that of the other side, left_ or right_; else its own index."""
+        exchanged = {"left": "right", "right": "left"}
+        partners = []
+        for i, name in enumerate(self.keypoints):
+            side, _, part = name.partition("_")
+            other = f"{exchanged.get(side, '')}_{part}"
+            partners.append(self.index(other) if other in self.keypoints else i)
+        return partners
+
+    def vertical_axis(self) -> NDArray[np.float64] | None:
+        """Return weights (p,) of the keypoints in the vector from bottom to top; None: unknown."""
+        if not self.top:
+            return None
+        axis = np.zeros(len(self))
+        for keypoints, sign in ((self.top, 1), (self.bottom, -1)):
+            axis[[self.index(keypoint) for keypoint in keypoints]] = sign / len(keypoints)
+        return axis
+
     def partners(self) -> list[int] | None:
         """Return the permutation of the keypoints that exchanges left_ and right_.
 
@@ -120,12 +151,7 @@ class KeypointLayout:
             For each keypoint the index of its partner, which is its own index for a keypoint in
             the middle. None if no keypoint has a partner, or if the layout has no handedness.
         """
-        exchanged = {"left": "right", "right": "left"}
-        partners = []
-        for i, name in enumerate(self.keypoints):
-            side, _, part = name.partition("_")
-            other = f"{exchanged.get(side, '')}_{part}"
-            partners.append(self.index(other) if other in self.keypoints else i)
+        partners = self.sides()
         changed = partners != list(range(len(self)))
         return partners if self.handedness and changed else None
 

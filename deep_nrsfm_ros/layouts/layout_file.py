@@ -14,7 +14,7 @@ from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 LAYOUT_SUFFIXES = (".yaml", ".yml")
 FIELDS = (
     *("name", "keypoints", "edges", "rigid", "handedness"),
-    *("reference", "reference_length", "derived"),
+    *("reference", "reference_length", "derived", "top", "bottom"),
 )
 HANDEDNESS = ("left", "right", "up", "front")
 _MIN_KEYPOINTS = 4  # W = S M has a unique shape from four points on
@@ -75,6 +75,8 @@ class _Description:
             reference=None if reference is None else self._pair("reference", reference),
             derived=self._derived(),
             reference_length=self._reference_length(),
+            top=self._names_or_name("top"),
+            bottom=self._names_or_name("bottom"),
         )
 
     def _pairs(self, field: str) -> tuple[Edge, ...]:
@@ -117,6 +119,10 @@ class _Description:
         if len(names) != 2:
             raise LayoutFileError(f"{where} has {len(names)} names; it must have 2")
         return names[0], names[1]
+
+    def _names_or_name(self, field: str) -> tuple[str, ...]:
+        value = self._fields.get(field, [])
+        return (value,) if isinstance(value, str) else self._names(field, value)
 
     def _names(self, where: str, value: Any) -> tuple[str, ...]:
         items = self._list(where, value)

@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.kernel import _kernel
+from deep_nrsfm_ros.lifting import gravity, history, own_bones
 from deep_nrsfm_ros.lifting.confidence import CALIBRATED, RESIDUAL_OFFSET
 from deep_nrsfm_ros.lifting.correction import UNKNOWN_VARIANCE
+from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.numpy_backend import MIN_RELATIVE_DEPTH, RESIDUAL_SCALE, LifterConstants
+from deep_nrsfm_ros.lifting.options import HistoryOptions
 from deep_nrsfm_ros.lifting.weights import FULL_RATIO, TRUSTED_RATIO
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.network import completion_matrix
@@ -47,7 +50,7 @@ class CompiledBackend:
         bones = constants.bones or Bones(np.zeros((2, 0), np.int32), np.zeros(0), np.zeros(0))
         header += [len(bones.lengths), len(constants.derivations), *options.widths]
         header += [*(constants.partners or range(p)), *bones.ends.T.flat]
-        header += [*constants.derivations.flat]
+        header += [*constants.derivations.flat, *constants.bone_partners]
         floats = [_panels(net.L), _panels(net.L_inverse)]
         for i, (D, b, b_) in enumerate(zip(net.D, net.b, net.b_, strict=True)):
             # The kernel stores shapes with the keypoints last, (3, p).
@@ -62,8 +65,11 @@ class CompiledBackend:
         rows = _padded(rows.swapaxes(0, 3), _kernel.DOUBLES).swapaxes(0, 3)
         floats += [rows]
         doubles = [completion_matrix(net), constants.test_time_rotations, constants.object_frame]
-        doubles += [CALIBRATED, np.stack(bones[1:], 1), constants.noise, constants.reference_length]
+        axis = np.zeros(p) if constants.axis is None else constants.axis
+        doubles += [CALIBRATED, np.stack(bones[1:], 1), axis, _past_constants(constants.history)]
         doubles += [
+            constants.noise,
+            constants.reference_length,
             UNKNOWN_VARIANCE * np.trace(covariance) / (3 * p),
             MIN_RELATIVE_DEPTH,
             RESIDUAL_SCALE,
@@ -75,14 +81,19 @@ class CompiledBackend:
         self._p = p
 
     def __call__(
-        self, points: NDArray[np.float32], confidence: NDArray[np.float32], perspective: bool
+        self,
+        points: NDArray[np.float32],
+        confidence: NDArray[np.float32],
+        perspective: bool,
+        context: Context | None = None,
     ) -> tuple[tuple[NDArray[np.float32], ...], NDArray[np.bool_]]:
         """Return the fields of `lifting.Lifted`, and (n,) True for objects that are not lifted.
 
         Args:
             points: (n, p, 2) as in `Lifter.__call__`.
             confidence: (n, p) in [0, 1], 0 = missing.
-            perspective: as in `Lifter.__call__`.
+            perspective: as in `Lifter.lift`.
+            context: as in `Lifter.lift`.
 
         Raises:
             ValueError: The shapes do not fit the model.
@@ -96,10 +107,23 @@ class CompiledBackend:
             np.ascontiguousarray(points, np.float32),
             np.ascontiguousarray(confidence, np.float32),
             perspective,
+            context,
             *lifted,
             not_lifted,
         )
         return lifted, not_lifted
+
+
+def _past_constants(options: HistoryOptions) -> list[float]:
+    """Return the numbers of the kernel's `Past`, in its order."""
+    return [
+        *(options.shape_time, options.hidden_time, options.rotation_time, options.bones_time),
+        *(history.MAX_GAP, history.MAX_BACK),
+        *(own_bones.OUTLIER, own_bones.MAX_STEP, own_bones.MAX_SECONDS, own_bones.MEMORY),
+        *(own_bones.OWN_VARIANCE, own_bones.MISFIT_TIME, own_bones.MISFIT_RATIO),
+        *(own_bones.CHANGE_EVIDENCE, own_bones.DOUBTED_EVIDENCE),
+        *(gravity.LEAN_DEVIATION, gravity.FREE_LEAN),
+    ]
 
 
 def _padded(A: NDArray[Any], multiple: int | None = None) -> NDArray[Any]:

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.batched import slices
+from deep_nrsfm_ros.lifting.gravity import Upright
 from deep_nrsfm_ros.nrsfm.bones import Bones, relative_lengths
 from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, random_cameras, rotation_from_camera
 
@@ -55,10 +56,21 @@ class ErrorModel(NamedTuple):
     Attributes:
         covariance: (3p, 3p) second moment Sigma in the axes of S, in squared units of S.
         bones: lengths that the shape should have; None: lengths are not used.
+        upright: what gravity says; None: nothing.
     """
 
     covariance: Floats
     bones: Bones | None = None
+    upright: Upright | None = None
+
+    def of(self, objects: slice) -> ErrorModel:
+        """Return the prior of some of the objects."""
+        bones, upright = self.bones, self.upright
+        if bones is not None and bones.lengths.ndim == 2:
+            bones = bones._replace(lengths=bones.lengths[objects], spread=bones.spread[objects])
+        if upright is not None:
+            upright = upright._replace(up=upright.up[objects])
+        return ErrorModel(self.covariance, bones, upright)
 
 
 def correct(
@@ -86,9 +98,11 @@ def correct(
     n, p, _ = S.shape
     noise = np.broadcast_to(noise, n)
     if n > _BLOCK:
-        parts = [correct(S[b], M[b], W[b], weight[b], errors, noise[b]) for b in slices(n, _BLOCK)]
+        parts = [
+            correct(S[b], M[b], W[b], weight[b], errors.of(b), noise[b]) for b in slices(n, _BLOCK)
+        ]
         return np.concatenate(parts)
-    covariance, bones = errors
+    covariance, bones, upright = errors
     M = (M if M.ndim == 4 else M[:, None]).astype(np.float64)
     H: Floats = np.zeros((n, p, 2, p, 3))
     H[:, range(p), :, range(p)] = np.broadcast_to(M, (n, p, 3, 2)).transpose(1, 0, 3, 2)
@@ -105,13 +119,18 @@ def correct(
     R = R.reshape(n, 2 * p, 2 * p)
     r = ((W - (S[..., None, :] @ M)[..., 0, :]) * shown[..., None]).reshape(n, 2 * p)
     E = _posterior_mean(covariance, H, R, r)
-    if bones is not None:
-        G, missing_length, length_covariance = bones.length_constraint(S + E.reshape(S.shape))
-        b = missing_length.shape[1]
-        R = np.pad(R, ((0, 0), (0, b), (0, b)))
-        R[:, 2 * p :, 2 * p :] = length_covariance + least * np.eye(b)
-        r = np.concatenate((r, missing_length + (G @ E[..., None])[..., 0]), 1)
-        E = _posterior_mean(covariance, np.concatenate((H, G), 1), R, r)
+    X = S + E.reshape(S.shape)
+    constraints = [] if bones is None else [bones.length_constraint(X)]
+    constraints += [] if upright is None else [upright.constraint(X)]
+    for G, missing, G_covariance in constraints:
+        k, more = len(r[0]), missing.shape[1]
+        R = np.pad(R, ((0, 0), (0, more), (0, more)))
+        R[:, k:, k:] = G_covariance + least * np.eye(more)
+        H = np.concatenate((H, G), 1)
+        # Linearised about X: the difference that remains there, and what E has done already.
+        r = np.concatenate((r, missing + (G @ E[..., None])[..., 0]), 1)
+    if constraints:
+        E = _posterior_mean(covariance, H, R, r)
     corrected: Floats = S + E.reshape(S.shape).astype(S.dtype)
     return corrected
 

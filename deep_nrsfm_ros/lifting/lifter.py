@@ -13,9 +13,11 @@ from deep_nrsfm_ros.kernel import supports
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
+from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.lifting.observation import from_arrays
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
+from deep_nrsfm_ros.lifting.own_bones import partner_bones
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -71,6 +73,7 @@ class Lifter:
         options: LiftingOptions | None = None,
         *,
         layout: KeypointLayout | str | None = None,
+        history: HistoryOptions | None = None,
     ) -> None:
         """Prepare a backend for the model.
 
@@ -80,6 +83,8 @@ class Lifter:
             layout: the detector's layout of q keypoints, as an object or by the name of a preset
                 or a layout file ("coco17"); its keypoints are mapped to the model's by name.
                 None: the model's layout.
+            history: what is remembered of identities, for lifts with a `Memory`; None: all
+                defaults.
 
         Raises:
             ValueError: the layout does not exist, or shares fewer than 4 keypoints with the
@@ -91,7 +96,9 @@ class Lifter:
             layout = find_layout("layout", layout)
         self.layout = layout or model.layout
         self._to_model = KeypointMap(self.layout, model.layout)
-        self.constants = _constants(model, self.options, self._to_model)
+        self.constants = _constants(
+            model, self.options, history or HistoryOptions(), self._to_model
+        )
         backend = CompiledBackend if supports(model.network) else NumpyBackend
         self.backend = backend(self.constants)
 
@@ -121,7 +128,14 @@ class Lifter:
         """
         return self._to_model.detected_count(trusted(keypoint_weight(confidence)))
 
-    def lift(self, points: Float32, confidence: Float32, *, perspective: bool = False) -> Lifted:
+    def lift(
+        self,
+        points: Float32,
+        confidence: Float32,
+        *,
+        perspective: bool = False,
+        context: Context | None = None,
+    ) -> Lifted:
         """Lift an observation in the model's layout, without the checks of a call.
 
         Keypoints that a map from this lifter's layout derives do not count for `min_visible`.
@@ -132,6 +146,8 @@ class Lifter:
             confidence: (n, p) float32 in [0, 1]; 0 is missing.
             perspective: whether the points are on the plane z = 1 of a camera that looks at the
                 object (see `perspective.virtual_views`); the correction uses the ray of each point.
+            context: what is remembered of the objects, and gravity; its states are updated. None:
+                the answer depends on this message alone.
 
         Raises:
             ValueError: the arrays do not fit each other or the model.
@@ -142,12 +158,14 @@ class Lifter:
                 f"points are {points.shape} and confidence {confidence.shape}; "
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
-        arrays, not_lifted = self.backend(points, confidence, perspective)
+        arrays, not_lifted = self.backend(points, confidence, perspective, context)
         lifted = Lifted(*arrays)
         return mark_not_lifted(lifted, not_lifted) if not_lifted.any() else lifted
 
 
-def _constants(model: Model, options: LiftingOptions, to_model: KeypointMap) -> LifterConstants:
+def _constants(
+    model: Model, options: LiftingOptions, history: HistoryOptions, to_model: KeypointMap
+) -> LifterConstants:
     """Return model and options in the form that a backend computes with."""
     p = len(model.layout)
     angles = 2 * np.pi * np.arange(options.test_time_rotations) / options.test_time_rotations
@@ -159,6 +177,8 @@ def _constants(model: Model, options: LiftingOptions, to_model: KeypointMap) -> 
     elif options.correction == "back_projection":
         covariance = np.eye(3 * p)
     pair = model.layout.reference
+    bones = model.bones if options.correction == "bones" else None
+    ends = np.zeros((2, 0), np.int32) if bones is None else bones.ends
     return LifterConstants(
         network=model.network,
         normaliser=model.normaliser,
@@ -166,7 +186,7 @@ def _constants(model: Model, options: LiftingOptions, to_model: KeypointMap) -> 
         test_time_rotations=np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy(),
         partners=model.layout.partners() if options.mirror else None,
         covariance=covariance,
-        bones=model.bones if options.correction == "bones" else None,
+        bones=bones,
         error_std=np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1)),
         noise=options.noise,
         refill=options.refill,
@@ -174,6 +194,9 @@ def _constants(model: Model, options: LiftingOptions, to_model: KeypointMap) -> 
         reference=pair and (model.layout.index(pair[0]), model.layout.index(pair[1])),
         min_visible=options.min_visible,
         derivations=to_model.derivations,
+        history=history,
+        bone_partners=partner_bones(ends, model.layout.sides()),
+        axis=model.layout.vertical_axis(),
     )
 
 

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.layouts.keypoint_map import detected_count
 from deep_nrsfm_ros.lifting.confidence import keypoint_confidence
 from deep_nrsfm_ros.lifting.correction import ErrorModel, correct
+from deep_nrsfm_ros.lifting.history import Context
+from deep_nrsfm_ros.lifting.options import HistoryOptions
+from deep_nrsfm_ros.lifting.past import Past
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.geometry import (
@@ -59,6 +62,9 @@ class LifterConstants(NamedTuple):
         reference: indices of the reference pair; None: the RMS radius is the reference.
         min_visible: objects with fewer detected keypoints are not lifted.
         derivations: (m, 2) keypoints that do not count as detected, as in `KeypointMap`.
+        history: time constants of what is remembered.
+        bone_partners: (b,) of each bone the one of the other side; see `own_bones`.
+        axis: (p,) from bottom to top; see `gravity`. None: the layout names neither.
     """
 
     network: Network
@@ -75,6 +81,9 @@ class LifterConstants(NamedTuple):
     reference: tuple[int, int] | None
     min_visible: int
     derivations: NDArray[np.int32]
+    history: HistoryOptions
+    bone_partners: NDArray[np.int32]
+    axis: NDArray[np.float64] | None
 
 
 class Keypoints(NamedTuple):
@@ -84,11 +93,13 @@ class Keypoints(NamedTuple):
         points: (n, p, 2).
         weight: (n, p) in [0, 1]; 0 = missing.
         trusted: (n, p) whether the network reads the keypoint.
+        perspective: whether the correction uses the ray of each point.
     """
 
     points: Float32
     weight: NDArray[np.float64]
     trusted: NDArray[np.bool_]
+    perspective: bool
 
 
 class NumpyBackend:
@@ -104,7 +115,11 @@ class NumpyBackend:
         self._partners = None if constants.partners is None else np.array(constants.partners)
 
     def __call__(
-        self, points: Float32, confidence: Float32, perspective: bool
+        self,
+        points: Float32,
+        confidence: Float32,
+        perspective: bool,
+        context: Context | None = None,
     ) -> tuple[tuple[Float32, ...], NDArray[np.bool_]]:
         """Return the fields of `Lifted`, and which of the n objects cannot be lifted.
 
@@ -112,31 +127,38 @@ class NumpyBackend:
             points: (n, p, 2) as in `Lifter.lift`; the shape is not checked again.
             confidence: (n, p) in [0, 1], 0 = missing.
             perspective: as in `Lifter.lift`.
+            context: as in `Lifter.lift`.
         """
         weight = keypoint_weight(confidence)
         visible = trusted(weight)
-        seen = Keypoints(points, weight, visible)
+        seen = Keypoints(points, weight, visible, perspective)
+        not_lifted = on_one_line(points, visible)
+        not_lifted |= (
+            detected_count(visible, self.constants.derivations) < self.constants.min_visible
+        )
+        past = None
+        if context is not None and self.constants.covariance is not None:
+            past = Past(self.constants, context, not_lifted)
         mask = visible[..., None].astype(np.float32)
         complete = np.ones_like(mask)
-        solution = self._solve(points, mask, seen, perspective)
-        if not visible.all():
-            for _ in range(self.constants.refill):
+        rounds = 0 if visible.all() else self.constants.refill
+        solution = self._solve(points, mask, seen, past, rounds == 0)
+        if rounds:
+            for number in range(1, rounds + 1):
                 S, _, _, unit, origin = solution
                 reprojected = unit * S[..., :2] + origin
                 if perspective:
                     reprojected /= np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
                 filled = np.where(visible[..., None], points, reprojected)
-                solution = self._solve(filled, complete, seen, perspective)
+                solution = self._solve(filled, complete, seen, past, number == rounds)
+        if past:
+            past.write()
         S, R, residual, _, _ = solution
         S = centre(S)
         believed = np.where(visible, confidence, np.float32(0))
         probability = self.keypoint_confidence(believed, residual, S)
         S *= self.constants.reference_length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
-        not_lifted = on_one_line(points, visible)
-        not_lifted |= (
-            detected_count(visible, self.constants.derivations) < self.constants.min_visible
-        )
         return (S, R, scale, translation, residual, probability), not_lifted
 
     def keypoint_confidence(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
@@ -160,25 +182,37 @@ class NumpyBackend:
         return relative
 
     def _solve(
-        self, points: Float32, mask: Float32, seen: Keypoints, perspective: bool
+        self, points: Float32, mask: Float32, seen: Keypoints, past: Past | None, last: bool
     ) -> tuple[Float32, Float32, Float32, Float32, Float32]:
         """Return S in camera axes, R, residual (n,), and unit and origin of S in the image.
 
         The network reads all points of mask (n, p, 1); the correction those of positive weight.
+        The last round smooths, and remembers what it finds.
         """
-        constants, visible = self.constants, seen.trusted
+        constants, visible, perspective = self.constants, seen.trusted, seen.perspective
         W, gain, unit, origin = normalise(constants.network, constants.normaliser, points, mask)
         S, M, residual = self._average(gain * W, W, visible, unit if perspective else None)
         R = rotation_from_camera(M)
         if constants.covariance is not None:
             shown = visible[..., None]
             size = np.sqrt((W * W * shown).sum((1, 2)) / np.maximum(2 * shown.sum((1, 2)), 1))
-            errors = ErrorModel(constants.covariance, constants.bones)
             doubtful = ((seen.weight > 0) & ~visible)[..., None]
             W = np.where(doubtful, (seen.points - origin) / unit, W)
             points = np.where(doubtful, seen.points, points)
+            S = S @ R
+            if past and last:
+                S, R = past.smoothed(S, R, visible)
+                M = R.swapaxes(1, 2)[..., :2]
             cameras = M[:, None] - R[:, None, 2, :, None] * points[:, :, None] if perspective else M
-            S = correct(S @ R, cameras, W, seen.weight, errors, constants.noise * size)
+            errors = ErrorModel(constants.covariance, constants.bones)
+            noise = constants.noise * size
+            if past:
+                if last:
+                    first_stage = ErrorModel(constants.covariance)
+                    X = correct(S, cameras, W, seen.weight, first_stage, noise)
+                    past.learn(X, R, seen.weight * visible)
+                errors = past.errors(R)
+            S = correct(S, cameras, W, seen.weight, errors, noise)
             S = S @ R.swapaxes(1, 2)
         return S, R, residual, unit, origin
 

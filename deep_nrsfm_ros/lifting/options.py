@@ -63,3 +63,44 @@ class LiftingOptions:
         low=0.0,
         high=1e6,
     )
+
+
+@dataclass(frozen=True)
+class HistoryOptions:
+    """Lifting over time."""
+
+    enabled: bool = option(
+        True,
+        "whether an object is lifted with what its last frames have shown: the shape and the "
+        "rotation that the network finds are smoothed before the keypoints correct them, which has "
+        "no lag in the image, and the lengths of its bones are learned. An answer depends on the "
+        "object's last seconds; false: on its own message alone",
+    )
+    shape_time: float = option(
+        0.1,
+        "time constant in s with which the shape that the network finds is smoothed before the "
+        "correction; 0 = off, 0.1 typical, 0.3 strong",
+        low=0.0,
+        high=10.0,
+    )
+    hidden_time: float = option(
+        1.0,
+        "time constant in s with which a keypoint that is missing in the image forgets where it "
+        "was relative to the object; 0 = off, 1 typical",
+        low=0.0,
+        high=10.0,
+    )
+    rotation_time: float = option(
+        0.05,
+        "time constant in s with which the rotation that the network finds is smoothed before the "
+        "correction; 0 = off, 0.05 typical, 0.2 strong",
+        low=0.0,
+        high=10.0,
+    )
+    bones_time: float = option(
+        0.3,
+        "seconds of sight after which the lengths of an object's bones count as much as those of "
+        "the model; 0 = bone lengths are not learned, 0.3 typical, 2 slow",
+        low=0.0,
+        high=60.0,
+    )

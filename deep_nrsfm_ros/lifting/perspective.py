@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, mark_not_lifted
 from deep_nrsfm_ros.lifting.numpy_backend import Float32
@@ -65,7 +66,11 @@ def virtual_views(intrinsics: Intrinsics, points: Float32, confidence: Float32) 
 
 
 def lift_perspective(
-    lifter: Lifter, intrinsics: Intrinsics, points: Float32, confidence: Float32
+    lifter: Lifter,
+    intrinsics: Intrinsics,
+    points: Float32,
+    confidence: Float32,
+    context: Context | None = None,
 ) -> Lifted:
     """Lift keypoints to shapes at their positions in the camera's optical frame.
 
@@ -78,12 +83,15 @@ def lift_perspective(
         intrinsics: of the camera.
         points: (n, p, 2) pixels in the model's layout.
         confidence: (n, p) in [0, 1], 0 = missing.
+        context: as in `Lifter.lift`, in the camera's axes.
 
     Raises:
         ValueError: the shapes do not fit the model.
     """
     views = virtual_views(intrinsics, points, confidence)
-    lifted = lifter.lift(views.points, views.confidence, perspective=True)
+    if context:
+        context = context._replace(to_view=np.ascontiguousarray(views.rotations))
+    lifted = lifter.lift(views.points, views.confidence, perspective=True, context=context)
     visible = trusted(keypoint_weight(views.confidence))
     position = solve_translation(lifted.shapes, views.points, visible)
     not_lifted = ~(position[:, 2] > 0)

@@ -17,6 +17,7 @@ from safetensors.numpy import load, save_file
 
 from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, weight_shapes
@@ -297,16 +298,24 @@ def _layout(header: dict[str, Any]) -> KeypointLayout:
     handedness = header["handedness"] or []
     if handedness and isinstance(handedness[0], str):  # the one of an older file
         handedness = [handedness]
-    header = {"rigid": []} | header | {"handedness": handedness}  # as older files have none
+    header = {"rigid": [], **_ends(header)} | header | {"handedness": handedness}  # of older files
     _check_names(header)
     return KeypointLayout(**_tuples(header))
+
+
+def _ends(header: dict[str, Any]) -> dict[str, Any]:
+    """Return top and bottom of the preset that a header has the keypoints of."""
+    same = LAYOUTS.get(str(header["name"]))
+    if same is None or list(same.keypoints) != header["keypoints"]:
+        return {"top": [], "bottom": []}
+    return {"top": list(same.top), "bottom": list(same.bottom)}
 
 
 def _check_names(layout: dict[str, Any]) -> None:
     """Raise ValueError unless every name in the header's layout is a text."""
     derived = layout["derived"]
     pairs = [*layout["edges"], *layout["rigid"], layout["reference"]]
-    lists = [layout["keypoints"], *pairs, *layout["handedness"]]
+    lists = [layout["keypoints"], *pairs, *layout["handedness"], layout["top"], layout["bottom"]]
     for names in ([layout["name"]], [*derived], *derived.values(), *lists):
         if not isinstance(names, (list, type(None))) or any(
             type(n) is not str for n in names or ()

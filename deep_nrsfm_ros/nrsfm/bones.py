@@ -26,8 +26,9 @@ class Bones(NamedTuple):
 
     Attributes:
         ends: (2, b) int32, the keypoints at the ends of each bone.
-        lengths: (b,) mean lengths, relative to the sum of all; 0.05 typical.
-        spread: (b,) standard deviations of the lengths, in the same unit.
+        lengths: (b,) mean lengths, relative to the sum of all; 0.05 typical. (n, b) where each of
+            n objects has its own.
+        spread: (b,) or (n, b) standard deviations of the lengths, in the same unit.
     """
 
     ends: NDArray[np.int32]
@@ -46,20 +47,23 @@ class Bones(NamedTuple):
             Jacobian G (n, b, 3 p) of the lengths, residual r (n, b) = expected - measured length in
             the unit of X, and covariance (n, b, b) of the residual.
         """
-        (i, j), L = self.ends, self.lengths
+        i, j = self.ends
         n, p, _ = X.shape
+        b = len(i)
+        L, spread = np.broadcast_to(self.lengths, (n, b)), np.broadcast_to(self.spread, (n, b))
         edges = X[:, i] - X[:, j]  # (n, b, 3)
         measured = np.linalg.norm(edges, axis=2)  # (n, b)
-        weight = (L / self.spread) ** 2
-        size = (measured / L) @ weight / weight.sum()  # (n,)
-        G = np.zeros((n, len(L), p, 3))
+        weight = (L / spread) ** 2
+        size = (measured / L * weight).sum(1) / weight.sum(1)  # (n,)
+        G = np.zeros((n, b, p, 3))
         directions = edges / np.maximum(measured, 1e-9)[..., None]
-        G[:, range(len(L)), i] = directions
-        G[:, range(len(L)), j] = -directions
+        G[:, range(b), i] = directions
+        G[:, range(b), j] = -directions
         # The outer product is the variance of the unknown size of the object.
-        covariance = np.diag(self.spread**2) + np.outer(L, L)
+        covariance = L[:, :, None] * L[:, None]
+        covariance[:, range(b), range(b)] += spread**2
         residual = size[:, None] * L - measured
-        return G.reshape(n, len(L), 3 * p), residual, size[:, None, None] ** 2 * covariance
+        return G.reshape(n, b, 3 * p), residual, size[:, None, None] ** 2 * covariance
 
 
 def relative_lengths(S: Floats, pairs: Sequence[tuple[int, int]]) -> Floats:

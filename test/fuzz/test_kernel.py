@@ -24,6 +24,7 @@ COMPILED: Any = kernel._kernel  # the calls break its signatures
 REFUSALS = (TypeError, ValueError, RuntimeError)
 HUGE = (2**31 - 1, 2**32, 2**60, 2**62, 2**63 - 1, 2**63, -(2**63), 2**70, -(2**70))
 OBJECTS: tuple[Any, ...] = (None, "x", b"", 1.5, object(), [], (), 10**400, datetime.datetime_CAPI)
+PAST = 17  # constants of what is remembered
 GUARD, GUARDED = 64, 77  # items before and after an output, and their value
 
 Arguments = list[Any]
@@ -83,6 +84,7 @@ def plan(spoiler: Spoiler, network: Sizes | None = None) -> Arguments:
     header += [derivations]
     header += [*widths, *spoiler.sample(range(p), p)]
     header += [spoiler.randrange(p) for _ in range(2 * (bones + derivations))]
+    header += [spoiler.randrange(bones) for _ in range(bones)]
     panels, last = COMPILED.FLOATS, widths[-1]
     wide, even = lined(p, panels), lined(p, COMPILED.DOUBLES)
     n = 2 * p * wide + 6 * lined(last, panels) * lined(last, panels) + last + p + 9 * even * even
@@ -90,7 +92,8 @@ def plan(spoiler: Spoiler, network: Sizes | None = None) -> Arguments:
         before, filled = widths[i - 1], lined(width, panels)
         to, back = (filled, lined(before, panels)) if i else (3 * filled, 3 * wide)
         n += (before if i else p) * to + filled + (width + 1) * back
-    doubles = [*floats(spoiler, p * p + 4 * rotations + 14), *[0.5] * (2 * bones + 8)]
+    doubles = [*floats(spoiler, p * p + 4 * rotations + 14), *[0.5] * (2 * bones)]
+    doubles += [*np.nan_to_num(floats(spoiler, p), posinf=1, neginf=1), *[0.5] * (PAST + 8)]
     return [np.array(header, np.int32), floats(spoiler, n), np.array(doubles, np.float64)]
 
 
@@ -101,8 +104,25 @@ def lift(spoiler: Spoiler, network: Sizes | None = None, made: object = None) ->
     confidence = np.abs(floats(spoiler, n, p))
     outputs = [output(n, p, 3), output(n, 3, 3), output(n), output(n, 2), output(n), output(n, p)]
     arrays = [*outputs, output(n, dtype=np.bool_)]
-    made = made or COMPILED.plan(*plan(spoiler, network))
-    return [made, floats(spoiler, n, p, 2), confidence, spoiler.choice((False, True)), *arrays]
+    context = None
+    if made is None:
+        arguments = plan(spoiler, network)
+        made = COMPILED.plan(*arguments)
+        context = spoiler.choice((None, past(spoiler, n, p, int(arguments[0][11]))))
+    perspective = spoiler.choice((False, True))
+    return [made, floats(spoiler, n, p, 2), confidence, perspective, context, *arrays]
+
+
+def past(spoiler: Spoiler, n: int, p: int, bones: int) -> tuple[Any, ...]:
+    """Return a context of n objects; some of its states are random, some of objects to come."""
+    capacity = spoiler.choice((0, 1, 5))
+    states = output(capacity, 12 + 3 * p + 2 * bones, dtype=np.float64)
+    states[:] = floats(spoiler, *states.shape)
+    states[: spoiler.randint(0, 5)] = np.nan
+    rows = np.array([spoiler.randrange(-1, capacity) for _ in range(n)], np.int32)
+    up = spoiler.choice((None, floats(spoiler, 3).astype(float)))
+    views = spoiler.choice((None, floats(spoiler, n, 3, 3).astype(float)))
+    return states, rows, spoiler.choice((0.0, 0.3, 1e9)), up, views
 
 
 def decode_keypoints(spoiler: Spoiler) -> Arguments:
@@ -241,7 +261,8 @@ def names() -> set[str]:
 
 def called(name: str, arguments: Arguments) -> Any:
     """Return the result of a call; raise AssertionError if it writes beyond its outputs."""
-    outputs = [a for a in arguments if isinstance(a, np.ndarray) and a.base is not None]
+    every = [b for a in arguments for b in (a if isinstance(a, tuple) else (a,))]
+    outputs = [a for a in every if isinstance(a, np.ndarray) and a.base is not None]
     guarded = [a for a in outputs if a.flags.writeable and guards_are_whole(a)]
     try:
         return getattr(COMPILED, name)(*arguments)

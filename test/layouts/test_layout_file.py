@@ -33,6 +33,8 @@ reference: [hinge_top, hinge_bottom]
 reference_length: 2
 derived:
   handle: [corner_top, corner_bottom]
+top: hinge_top
+bottom: [hinge_bottom, corner_bottom]
 """
 LEAST = "name: thing\nkeypoints: [a, b, c, d]\n"
 
@@ -61,6 +63,8 @@ def test_every_field_arrives(tmp_path: Path) -> None:
         reference=("hinge_top", "hinge_bottom"),
         derived={"handle": ("corner_top", "corner_bottom")},
         reference_length=2.0,
+        top=("hinge_top",),
+        bottom=("hinge_bottom", "corner_bottom"),
         rigid=(("hinge_top", "corner_bottom"),),
     )
 

@@ -11,14 +11,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from deep_nrsfm_ros.kernel import AVAILABLE, _kernel
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
+from deep_nrsfm_ros.lifting.history import Context, StateLayout
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.numpy_backend import NumpyBackend
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -120,6 +122,66 @@ def test_lifts_as_numpy_does(
             size = np.abs(numpy).max()
             at_most = 1e-4 * size + unsure.max() + 1e-6
             np.testing.assert_allclose(ours, numpy, rtol=0, atol=at_most)
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=each_vectors)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    layout=st.sampled_from([HUMAN17, NUMBERED]),
+    options=st.builds(
+        LiftingOptions,
+        correction=st.sampled_from(["bones", "bones", "learned", "none"]),
+        refill=st.integers(0, 2),
+        test_time_rotations=st.integers(1, 3),
+    ),
+    remembers=st.sampled_from([HistoryOptions(), HistoryOptions(shape_time=0, bones_time=0)]),
+    missing=st.sampled_from([0.0, 0.3]),
+    perspective=st.booleans(),
+    gravity=st.booleans(),
+)
+def test_remembers_as_numpy_does(
+    seed: int,
+    layout: KeypointLayout,
+    options: LiftingOptions,
+    remembers: HistoryOptions,
+    missing: float,
+    perspective: bool,
+    gravity: bool,
+) -> None:
+    made = model(seed, layout, (30, 20, 12), 1.0, "rms")
+    # As real ones are: lengths within a tenth of the mean.
+    lengths = made.bone_lengths.mean() * np.ones_like(made.bone_lengths) * [1, 0.1]
+    made = dataclasses.replace(made, bone_lengths=lengths.astype(np.float32))
+    lifter = Lifter(made, options, history=remembers)
+    by_numpy = NumpyBackend(lifter.constants)
+    rng, p, n = np.random.default_rng(seed), len(layout), MORE_THAN_A_BLOCK
+    own = StateLayout(p, len(layout.bone_indices()) if options.correction == "bones" else 0)
+    states = np.full((2, n + 2, own.size), np.nan)
+    points, confidence = objects(rng, n, p, 0.0, perspective)
+    views = Rotation.random(n, random_state=seed).as_matrix()
+    up = np.array([0.0, -0.6, 0.8]) if gravity else None
+    time = 0.0
+    for step in (0.0, 0.04, 0.04, 0.2, -0.1, 0.0, 0.3, 0.7, 0.04, -5.0, 0.04):
+        time += step
+        points = points + 0.02 * rng.standard_normal(points.shape).astype(np.float32)
+        shown = confidence * (rng.random((n, p)) >= missing)
+        rows = rng.permutation(n + 2)[:n].astype(np.int32) - 1
+        context = Context(states[0].copy(), rows, time, up, views if perspective else None)
+        arrays, lost = lifter.backend(points, shown, perspective, context)
+        expected, _ = by_numpy(points, shown, perspective, context._replace(states=states[0]))
+        # What the last digits of the input change: so much may the two differ, too.
+        near = points + 1e-6 * rng.standard_normal(points.shape).astype(np.float32)
+        again = Context(states[1], rows, time, up, context.to_view)
+        nearby, _ = by_numpy(near, shown, perspective, again)
+        for ours, numpy, unsure in zip(arrays, expected, nearby, strict=True):
+            for i in np.flatnonzero(~lost):
+                close = 1e-3 * np.abs(numpy[i]).max() + 10 * np.abs(unsure[i] - numpy[i]).max()
+                np.testing.assert_allclose(ours[i], numpy[i], rtol=0, atol=close + 1e-6)
+        np.testing.assert_array_equal(np.isnan(context.states), np.isnan(states[0]))
+        known = ~np.isnan(states[0])
+        close = 2e-3 + 10 * np.abs(states[1] - states[0])[known].max(initial=0)
+        np.testing.assert_allclose(context.states[known], states[0][known], atol=close)
+        states[1] = states[0]
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=each_vectors)
