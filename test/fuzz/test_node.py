@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
+import pytest
+import rclpy
 from rclpy.parameter import Parameter
 
 from deep_nrsfm_ros.configuration import options
-from deep_nrsfm_ros.data import bags
-from deep_nrsfm_ros.data.bags import frames
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
-from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
 from deep_nrsfm_ros.messages.options import InputOptions
-from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.model_files.model_file import save_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameter_bridge
@@ -29,6 +26,7 @@ from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.record import read_record, record_file
 from deep_nrsfm_ros.training.request import TrainingOptions, sandboxed
 from test.fuzz.conftest import Bench, Fuzz, Spoiler
+from test.node.conftest import own_domain
 
 PATHS = ("thing", "link", "link.safetensors", "/etc/passwd", "~", "~x/y.yaml", "coco17", "model",
          "thing.safetensors", "../" * 9, "numbered", "a.yaml", "x" * 5000)  # fmt: skip
@@ -49,25 +47,28 @@ def test_what_a_training_says_and_leaves_is_understood_or_not(fuzz: Fuzz, tmp_pa
     fuzz("training", one)
 
 
-def test_parameters_are_accepted_or_refused_and_leave_no_trace(
-    bench: Bench, fuzz: Fuzz, tmp_path: Path
-) -> None:
-    """As the lifter considers them, and as it makes a training request of them."""
+@pytest.fixture
+def lifter(bench: Bench, tmp_path: Path) -> Iterator[LifterNode]:
+    """A lifter with the model `thing`, in a folder that holds a link out of it."""
     save_model(tmp_path / "thing.safetensors", bench.model)
     (tmp_path / "link.safetensors").symlink_to("/etc/passwd")
-    inputs = InputOptions(model="thing", models_dir=str(tmp_path), bags_dir=str(tmp_path))
-    stub: Any = SimpleNamespace(get_parameter_or=lambda name, default: default)
-    stub._sandbox = PathSandbox(tmp_path, tmp_path, ["thing"])
-    stub._pipeline = Pipeline(bench.model, None, inputs, LiftingOptions(), SmoothingOptions())
-    stub._build_pipeline = lambda changes: LifterNode._build_pipeline(stub, changes)
-    stub._chosen = None
-    stub._assemble = lambda *given: LifterNode._assemble(stub, *given)
-    stub._layout_so_far = lambda model: LifterNode._layout_so_far(stub, model)
-    stub._training_parameters = lambda changes: LifterNode._training_parameters(stub, changes)
-    p = len(bench.layout)
-    points = np.random.default_rng(0).uniform(50, 600, (1, p, 2))
-    valid = bags._ENCODERS[POINT_CLOUD](next(frames(points, np.ones((1, p)))))
-    expected = bench.lift(stub._pipeline, valid, POINT_CLOUD)
+    settings = ("model:=thing", f"models_dir:={tmp_path}", f"bags_dir:={tmp_path}")
+    arguments = ["--ros-args", *(word for text in settings for word in ("-p", text))]
+    with own_domain() as domain:
+        rclpy.init(args=arguments, domain_id=domain)
+        try:
+            node = LifterNode()
+            yield node
+            node.close()
+        finally:
+            rclpy.try_shutdown()
+
+
+def test_parameters_are_accepted_or_refused_and_leave_no_trace(
+    bench: Bench, fuzz: Fuzz, lifter: LifterNode, tmp_path: Path
+) -> None:
+    """Set and set back on a lifter, and read as a request of a training."""
+    sandbox = PathSandbox(tmp_path, tmp_path, ["thing"])
     known: list[tuple[type[Any], str]] = [(c, "") for c in (InputOptions, LiftingOptions)]
     known += [(c, "train.") for c in (TrainingOptions, Recipe, Limits, Curation)]
     known += [(SmoothingOptions, "smoothing.")]
@@ -87,28 +88,28 @@ def test_parameters_are_accepted_or_refused_and_leave_no_trace(
             spoiler.choice(("", "/")).join(spoiler.choices(bits, k=spoiler.choice((1, 1, 2, 3))))
             for _ in range(spoiler.randrange(1, 4))
         ]
+        # A client cannot send half of a surrogate pair: a message is UTF-8.
+        words = [word.encode(errors="replace").decode() for word in words]
         return words if isinstance(default, tuple) else words[0]
+
+    start = lifter.get_parameters([name for name, _ in defaults])
 
     def one(spoiler: Spoiler) -> str:
         chosen = spoiler.choices(defaults, k=spoiler.choice((1, 1, 2, 5)))
         changes = [Parameter(name, value=value(spoiler, default)) for name, default in chosen]
-        result = LifterNode._validate_parameters(stub, changes)
+        before = lifter.get_parameters([change.name for change in changes])
+        result = lifter.set_parameters_atomically(changes)
         assert result.successful != bool(result.reason)
         assert "internal error" not in result.reason, result.reason
-        given = {change.name: change.value for change in changes}
-        stub.get_parameter_or = lambda name, default: (
-            Parameter(name, value=given[name]) if name in given else default
-        )
+        if not result.successful:
+            assert lifter.get_parameters([p.name for p in before]) == before
+            return "refused"
         try:
-            sandboxed(parameter_bridge.read(stub, TrainingOptions, "train."), stub._sandbox)
+            sandboxed(parameter_bridge.read(lifter, TrainingOptions, "train."), sandbox)
         except (ValueError, OSError) as refusal:
             assert str(refusal)
-        finally:
-            stub.get_parameter_or = lambda name, default: default
-        if spoiler.random() < 0.02:
-            again = bench.lift(stub._pipeline, valid, POINT_CLOUD)
-            for old, new in zip(expected, again, strict=True):
-                np.testing.assert_array_equal(old, new)
-        return "accepted" if result.successful else "refused"
+        assert lifter.set_parameters_atomically(before).successful
+        return "accepted"
 
     fuzz("parameters", one)
+    assert lifter.get_parameters([parameter.name for parameter in start]) == start

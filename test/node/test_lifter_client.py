@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from array import array
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,7 @@ from deep_nrsfm_ros.data.recording import Recording
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
 from deep_nrsfm_ros.node.lifter_client import LifterClient, LifterTopics
+from test.node.conftest import DEADLINE
 
 KEYPOINTS = 17
 TOPICS = LifterTopics("/lifter", "/keypoints", HUMAN17, HUMAN17, 0.1)
@@ -76,21 +78,27 @@ def test_keypoints_and_answers_are_joined(
 
 @pytest.mark.parametrize("wrong", ["fields", "width"])
 def test_odd_points_are_complained_of(
-    domain: int, wrong: str, monkeypatch: pytest.MonkeyPatch
+    domain: int, wrong: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     shown: list[Recording] = []
     client_node = LifterClient(TOPICS, shown.append, context)
-    complaints: list[str] = []
-    monkeypatch.setattr(client_node, "_warn", complaints.append)
+    publisher = client_node.create_publisher(PointCloud2, "/lifter/points", 10)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(client_node)
     odd = message(1)
     if wrong == "fields":
         odd.fields = odd.fields[:2]
     else:
         odd.width, odd.height = 34, 1
-    client_node._receive_points(odd)
-    client_node._flush()
-    assert not shown and len(complaints) == 1
+    log, end = "", time.monotonic() + DEADLINE
+    while "[lifter_client]" not in log and time.monotonic() < end:
+        publisher.publish(odd)
+        publisher.publish(odd)  # the one before is joined when the next one arrives
+        executor.spin_once(timeout_sec=0.1)
+        log += "".join(capfd.readouterr())
+    executor.shutdown()
     client_node.destroy_node()
     rclpy.shutdown(context=context)
+    assert not shown and ("fields" if wrong == "fields" else "34") in log

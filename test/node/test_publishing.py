@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from array import array
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +15,22 @@ import rclpy
 from geometry_msgs.msg import QuaternionStamped
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
-from deep_nrsfm_ros.lifting.tracking import Tracker
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read_observation
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS as FIELDS
-from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
-from deep_nrsfm_ros.messages.serialised import Header, MessageReader
+from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.node import lifter, publishing
-from deep_nrsfm_ros.node.message_types import decoder
-from deep_nrsfm_ros.node.subscriptions import KeypointTopic
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
+from test.node.conftest import DEADLINE
 
 
 def lifted(n: int, p: int = 5, seed: int = 0) -> Lifted:
@@ -148,52 +150,68 @@ def test_markers_of_a_loop_before_are_deleted() -> None:
     assert all(marker.action == Marker.ADD for marker in others)
 
 
-def test_markers_are_not_made_when_nobody_listens(
-    domain: int, models: Path, monkeypatch: pytest.MonkeyPatch
+@contextmanager
+def lifter_in_process(domain: int, models: Path, *settings: str) -> Iterator[Node]:
+    """Yield a node that talks to a `LifterNode` of this process; spinning it spins both."""
+    rclpy.init(
+        args=["--ros-args", "-p", "model:=person", "-p", f"models_dir:={models}", *settings],
+        domain_id=domain,
+    )
+    try:
+        executor = SingleThreadedExecutor()
+        node, client = lifter.LifterNode(), Node("client", use_global_arguments=False)
+        executor.add_node(node)
+        executor.add_node(client)
+        yield client
+        executor.shutdown()
+        node.close()
+    finally:
+        rclpy.try_shutdown()
+
+
+def play(client: Node, topic: str, kind: type, seconds: Iterable[int]) -> list[Any]:
+    """Publish a message of one object for each stamp; return what arrives on a topic of the lifter.
+
+    The next message is published when the last one is answered.
+    """
+    heard: list[Any] = []
+    client.create_subscription(kind, topic, heard.append, 10)
+    publisher = client.create_publisher(PointCloud2, "keypoints", 10)
+    assert client.executor
+    for second in seconds:
+        raw, before = publishing.point_cloud(Header(second), lifted(1, len(HUMAN17))), len(heard)
+        end = time.monotonic() + DEADLINE
+        while len(heard) == before and time.monotonic() < end:
+            if publisher.get_subscription_count():
+                publisher.publish(raw)
+            client.executor.spin_once(timeout_sec=0.1)
+        assert len(heard) > before, f"no answer to the message of second {second}"
+    return heard
+
+
+@pytest.mark.parametrize("listening", [False, True])
+def test_markers_are_made_while_somebody_listens(
+    domain: int, models: Path, monkeypatch: pytest.MonkeyPatch, *, listening: bool
 ) -> None:
     made: list[object] = []
-    monkeypatch.setattr(publishing, "markers", lambda *arguments: made.append(arguments))
-    settings = ["-p", "model:=person", "-p", f"models_dir:={models}"]
-    rclpy.init(args=["--ros-args", *settings], domain_id=domain)
-    try:
-        node = lifter.LifterNode()
-        heard: list[bytes] = []
-        monkeypatch.setattr(node._points, "publish", heard.append)
-        node._lift(
-            KeypointTopic(
-                "/keypoints",
-                MessageReader(POINT_CLOUD, decoder(POINT_CLOUD)),
-                Tracker(),
-                DroppedMessages(),
-            ),
-            publishing.point_cloud(Header(), lifted(1, len(HUMAN17))),
-        )
-        assert heard and not made
-        node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
+    make = publishing.markers
+
+    def record(*arguments: Any, **options: Any) -> MarkerArray:
+        made.append(arguments)
+        return make(*arguments, **options)
+
+    monkeypatch.setattr(publishing, "markers", record)
+    with lifter_in_process(domain, models) as client:
+        if listening:
+            assert play(client, "lifter/markers", MarkerArray, (1,))
+        else:
+            assert play(client, "lifter/points", PointCloud2, (1, 2))
+    assert bool(made) == listening
 
 
-def test_stamps_that_go_back_begin_identities_and_filters_anew(
-    domain: int, models: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings = ["-p", "model:=person", "-p", f"models_dir:={models}"]
-    rclpy.init(args=["--ros-args", *settings, "-p", "smoothing.enabled:=true"], domain_id=domain)
-    try:
-        node, tracker = lifter.LifterNode(), Tracker()
-        reader = MessageReader(POINT_CLOUD, decoder(POINT_CLOUD))
-        source = KeypointTopic("/keypoints", reader, tracker, DroppedMessages())
-        names: list[str] = []
-        identify = Tracker.__call__
-
-        def record(*arguments: Any) -> tuple[str, ...]:
-            names.extend(result := identify(*arguments))
-            return result
-
-        monkeypatch.setattr(Tracker, "__call__", record)
-        for second in (10, 11, 12, 3, 4):
-            node._lift(source, publishing.point_cloud(Header(second), lifted(1, len(HUMAN17))))
-        assert names == ["object1"] * 3 + ["object2"] * 2
-        node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
+def test_stamps_that_go_back_begin_identities_anew(domain: int, models: Path) -> None:
+    with lifter_in_process(domain, models, "-p", "smoothing.enabled:=true") as client:
+        heard = play(client, "lifter/objects", MultiDOFJointState, (10, 11, 12, 3, 4))
+    identities = {m.header.stamp.sec: m.joint_names for m in heard}
+    names = [identities[second] for second in (10, 11, 12, 3, 4)]
+    assert names == [["object1"]] * 3 + [["object2"]] * 2
