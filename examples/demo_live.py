@@ -63,7 +63,7 @@ class Listener(Client):
         if detector.returncode:
             raise DemoError("the detector has failed")
         played = self._played(self._heard)
-        points, confidence, _ = zip(*self._seen, strict=True)
+        points, confidence, *_ = zip(*self._seen, strict=True)
         return played, Observation(np.concatenate(points), np.concatenate(confidence))
 
     def _wait_for_keypoints(self, detector: subprocess.Popen[bytes]) -> None:

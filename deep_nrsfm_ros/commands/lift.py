@@ -30,13 +30,13 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.options import LiftingOptions
-from deep_nrsfm_ros.lifting.sanity import Size, is_person
+from deep_nrsfm_ros.lifting.sanity import Finding, Size, is_person
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 
-_NODE_ONLY_OPTIONS = ("input_type", "topics", "bags_dir", "max_objects")
+_NODE_ONLY_OPTIONS = ("input_type", "topics", "bags_dir", "max_objects", "min_score")
 """Options of the node's input that mean nothing for a file."""
 _EXIT_DOUBTFUL = 3
 """Exit code of an answer that looks wrong."""
@@ -154,10 +154,22 @@ def read_camera(args: argparse.Namespace) -> Camera:
     return Camera(intrinsics, size or own)
 
 
-def read_objects(
-    args: argparse.Namespace, model: Model, layout: KeypointLayout | None
-) -> tuple[Detections, KeypointLayout]:
-    """Return the objects in the input, in pixels, and the layout of their keypoints.
+class Objects(NamedTuple):
+    """The objects in the input.
+
+    Attributes:
+        detections: keypoints in pixels.
+        layout: of the keypoints.
+        findings: what looks wrong about the layout.
+    """
+
+    detections: Detections
+    layout: KeypointLayout
+    findings: tuple[Finding, ...] = ()
+
+
+def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout | None) -> Objects:
+    """Return the objects in the input.
 
     Args:
         args: the command line.
@@ -182,10 +194,10 @@ def read_objects(
         warn(warning)
     chosen = detections.largest() if args.objects == "largest" else detections
     if detections.layout:
-        return chosen, detections.layout
-    layout, reason = resolve_layout(chosen, model)
+        return Objects(chosen, detections.layout)
+    layout, reason, ambiguity = resolve_layout(chosen, model)
     note(f"keypoint layout {layout.name}: {reason}")
-    return chosen, layout
+    return Objects(chosen, layout, (ambiguity,) if ambiguity else ())
 
 
 def lift_objects(
@@ -198,16 +210,26 @@ def lift_objects(
         return lift_recording(detections, source, lifter, on_progress, intrinsics)
 
 
-def summary_of(args: argparse.Namespace, model: Model, recording: Recording) -> Summary:
-    """Return the summary of a recording; raise ValueError if nothing in it is lifted."""
+def summary_of(
+    args: argparse.Namespace,
+    model: Model,
+    recording: Recording,
+    findings: tuple[Finding, ...] = (),
+) -> Summary:
+    """Return the summary of a recording, with findings of its input.
+
+    Raises:
+        ValueError: nothing in it is lifted.
+    """
     camera, min_visible = read_camera(args), override(LiftingOptions(), args).min_visible
     summary = summarise(recording, model, *camera, min_visible)
+    summary = dataclasses.replace(summary, findings=(*findings, *summary.findings))
     if not summary.total:
         raise ValueError(f"{args.input} has no object in its {summary.frames} frames")
     if not summary.lifted:
-        findings = "".join(f"; {finding}" for finding in summary.findings)
+        found = "".join(f"; {finding}" for finding in summary.findings)
         raise ValueError(
-            f"none of {summary.total} objects is lifted: {summary.left_out_text}{findings}"
+            f"none of {summary.total} objects is lifted: {summary.left_out_text}{found}"
         )
     return summary
 
@@ -241,9 +263,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         check_output(args.output)
         model, layout = read_model(args)
-        detections, source = read_objects(args, model, layout)
+        detections, source, findings = read_objects(args, model, layout)
         recording = lift_objects(args, model, source, detections)
-        summary = summary_of(args, model, recording)
+        summary = summary_of(args, model, recording, findings)
         write_recording(args.output, recording, model.name)
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)

@@ -125,9 +125,9 @@ def read_recording(
     if not args.input.exists():
         raise ValueError(f"{args.input} does not exist")
     if args.lift_again or not is_bag(args.input) or not has_lifted_messages(args.input):
-        detections, source = read_objects(args, model, layout)
+        detections, source, findings = read_objects(args, model, layout)
         recording = lift_objects(args, model, source, detections)
-        for finding in summary_of(args, model, recording).findings:
+        for finding in summary_of(args, model, recording, findings).findings:
             warn(str(finding))
         return recording, f"lifted with model {model.name}"
     if unused := given_options(args, LiftingOptions):
@@ -139,7 +139,7 @@ def read_recording(
         lifted = read_lifted_messages(args.input, on_progress, warn)
     try:
         recorded: Detections | None
-        recorded, source = read_objects(args, model, layout)
+        recorded, source, _ = read_objects(args, model, layout)
     except BagError as error:
         warn(f"showing the lifted points without keypoints: {error}")
         recorded, source = None, layout or model.layout

@@ -15,6 +15,7 @@ from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.keypoint_files import KINDS
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -44,7 +45,6 @@ def parser() -> argparse.ArgumentParser:
         action="append",
         help=f"keypoints beside the bags, of any kind that `lift` reads; repeatable: {KINDS}",
     )
-    data.add_argument("--topic", help="keypoint topic of the bags (default: the only one)")
     data.add_argument(
         "--keypoint-layout",
         help="order of the keypoints in bags and files (default: that of the object)",
@@ -107,6 +107,8 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--json-progress", action="store_true", default=False, help="one JSON object a line"
     )
+    # Time plays no role in a training, so --rate would have no effect.
+    add_arguments(parser, ReadOptions, without=("rate",))
     for config in (Recipe, LayoutLossWeights, Limits, Architecture, Normaliser, Curation):
         add_arguments(parser, config)
     return parser

@@ -20,7 +20,12 @@ from deep_nrsfm_ros.data.dataset import Dataset, DatasetBuilder
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.observation import MessageError
+from deep_nrsfm_ros.lifting.observation import (
+    MessageError,
+    Observation,
+    left_out_sentences,
+    without_value,
+)
 from deep_nrsfm_ros.messages.decoding import (
     MULTI_ARRAY,
     POINT_CLOUD,
@@ -37,6 +42,9 @@ from deep_nrsfm_ros.messages.serialised import MessageReader
 STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
 Progress = Callable[[int, int], None]
 """Called with the number of items done and their total number."""
+
+NO_SCORES = "gives no object a score (a field mapping can name it): leave out min_score"
+"""Why `min_score` cannot act on a bag."""
 
 _SAMPLE = 256  # messages of a bag that `keypoint_count` looks at
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -87,6 +95,8 @@ def read_bags(
     """
     builder, warnings = DatasetBuilder(KeypointMap(source, target), options.min_confidence), []
     messages, unreadable, reason = 0, 0, ""
+    left_out: list[str] = []
+    has_scores = False
     if not paths:
         raise BagError("no bag to read; name at least one")
     failures: list[BagError] = []
@@ -105,7 +115,9 @@ def read_bags(
                 for raw in bag.messages(topic):
                     messages += 1
                     try:
-                        _add(builder, reader, raw, len(source), options)
+                        read_one = _add(builder, reader, raw, len(source), options)
+                        left_out += read_one.left_out
+                        has_scores |= bool(read_one.scores)
                     except Exception as error:  # damaged bytes fail in many ways; read the others
                         unreadable += 1
                         reason = reason or _reason(error)
@@ -126,6 +138,9 @@ def read_bags(
         raise BagError(
             f"no readable message in {names} ({messages} found); {reason or 'its end is lost'}"
         )
+    if options.min_score and not has_scores:
+        raise BagError(f"bag {names} {NO_SCORES}")
+    warnings += left_out_sentences(left_out)
     if on_progress:
         on_progress(messages, messages)
     dataset = builder.dataset(f"bags {names}")
@@ -134,12 +149,22 @@ def read_bags(
 
 def _add(
     builder: DatasetBuilder, reader: MessageReader, raw: bytes, keypoints: int, options: ReadOptions
-) -> None:
-    """Add the objects of a serialised message of `keypoints` keypoints to a dataset."""
-    if known_format := reader.find_format(raw, keypoints):
+) -> Observation:
+    """Add the objects of a serialised message of `keypoints` keypoints to a dataset.
+
+    Returns:
+        The message as it was read; without objects where it is of a known format.
+    """
+    known_format = reader.find_format(raw, keypoints)
+    if known_format and options.missing_value is None:
         builder.add_serialised(known_format, raw)
-    else:
-        builder.add(reader(raw, keypoints, options.min_confidence, options.image_size)[1])
+        return _NOTHING
+    _, observation = reader(raw, keypoints, options.min_confidence, options.image_size)
+    builder.add(without_value(observation.above(options.min_score), options.missing_value))
+    return observation
+
+
+_NOTHING = Observation(np.empty((0, 0, 2), np.float32), np.empty((0, 0), np.float32))
 
 
 def keypoint_count(paths: Sequence[Path], options: ReadOptions = DEFAULT_READ_OPTIONS) -> int:

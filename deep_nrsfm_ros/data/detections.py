@@ -138,7 +138,15 @@ def gather(
         np.asarray(_identities(frames) if identities is None else identities, str),
         np.asarray(stamps, np.int64),
         frame_id,
+        scores=_scores(frames),  # type: ignore[arg-type]  # None = all 1
     )
+
+
+def _scores(observations: Sequence[Observation]) -> NDArray[np.float32] | None:
+    """Return the score (m,) of each object; None if one has none."""
+    if any(len(each.scores) != len(each.confidence) for each in observations):
+        return None
+    return np.array([score for each in observations for score in each.scores], np.float32)
 
 
 def _identities(observations: Sequence[Observation]) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from deep_nrsfm_ros.data.bag_files import SUFFIXES, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
-from deep_nrsfm_ros.data.bags import Progress, keypoint_count
+from deep_nrsfm_ros.data.bags import NO_SCORES, Progress, keypoint_count
 from deep_nrsfm_ros.data.detections import Detections, gather
 from deep_nrsfm_ros.data.formats.arrays import read_npy, read_npz
 from deep_nrsfm_ros.data.formats.builder import DetectionsBuilder, KeypointFileError
@@ -27,7 +27,12 @@ from deep_nrsfm_ros.data.formats.tables import read_csv, read_h5, read_trc
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
-from deep_nrsfm_ros.lifting.observation import Observation, without_border
+from deep_nrsfm_ros.lifting.observation import (
+    Observation,
+    left_out_sentences,
+    without_border,
+    without_value,
+)
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.messages.decoding import implied_layout
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
@@ -76,7 +81,7 @@ def read_keypoints(
         raise KeypointFileError(f"{path} does not exist")
     try:
         if is_bag(path):
-            _refuse(options, ("category", "min_score", "rate"), "a bag")
+            _refuse(options, ("category", "rate"), "a bag")
             return _finish(read_bag(path, options, on_progress), options)
         _refuse(options, ("topic", "mapping"), "a file that is no bag")
         form = _format_of(path)
@@ -113,10 +118,9 @@ def _refuse(options: ReadOptions, names: tuple[str, ...], kind: str) -> None:
 def _finish(detections: Detections, options: ReadOptions) -> Detections:
     """Return detections in pixels, without marks of missing keypoints."""
     points, confidence = detections.points, detections.confidence
-    if options.missing_value is not None:
-        marked = (points == np.float32(options.missing_value)).any(-1) & (confidence > 0)
-        points, confidence = points.copy(), confidence.copy()
-        points[marked], confidence[marked] = 0, 0
+    present = without_value(Observation(points, confidence), options.missing_value)
+    if present.points is not points:
+        points, confidence = present.points, present.confidence
         detections = dataclasses.replace(detections, points=points, confidence=confidence)
     pixels = to_pixels(points, confidence, options.image_size)
     if pixels is not points:
@@ -310,6 +314,8 @@ def read_bag(
     """
     observations, stamps, times, reason, camera, count = [], [], [], "", "", 0
     warnings: list[str] = []
+    left_out: list[str] = []
+    has_scores, below = False, 0
     layout = options.layout or options.fallback or _implied_by_type(path, options)
     keypoints = len(layout) if layout else keypoint_count([path], options)
     with closing(open_bag(path)) as bag:
@@ -322,7 +328,11 @@ def read_bag(
                     header, observation = reader(
                         record.raw, keypoints, options.min_confidence, options.image_size
                     )
-                    observations.append(observation)
+                    left_out += observation.left_out
+                    has_scores |= bool(observation.scores)
+                    kept = observation.above(options.min_score)
+                    below += len(observation.confidence) - len(kept.confidence)
+                    observations.append(kept)
                     stamps.append(header.stamp if header else 0)
                     times.append(record.time)
                     camera = camera or (header.frame_id if header else "")
@@ -338,6 +348,13 @@ def read_bag(
         warnings.append(
             f"{count - len(observations)} of {count} messages could not be read: {reason}"
         )
+    if options.min_score and not has_scores:
+        raise KeypointFileError(f"{path} {NO_SCORES}")
+    if below:
+        warnings.append(
+            f"left out: {below} objects with a score below --min-score {options.min_score:g}"
+        )
+    warnings += left_out_sentences(left_out)
     on_one_clock, clock_warnings = one_clock(stamps, times)
     order = np.argsort(on_one_clock, kind="stable")
     ordered = [observations[i] for i in order]

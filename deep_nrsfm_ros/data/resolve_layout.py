@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.layout_fit import LayoutFit, choose_layout, fit_layouts
-from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL
+from deep_nrsfm_ros.lifting.layout_fit import LayoutFit, ambiguity, choose_layout, fit_layouts
+from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.model_files.model_file import Model
 
 
-def resolve_layout(detections: Detections, model: Model) -> tuple[KeypointLayout, str]:
-    """Return the layout in which the keypoints fit best, and a sentence that says why.
+class ResolvedLayout(NamedTuple):
+    """The layout of keypoints of which nothing says it.
+
+    Attributes:
+        layout: the layout that fits best.
+        reason: why it is taken, in words.
+        ambiguity: the finding that another one may be meant; None if it is certain.
+    """
+
+    layout: KeypointLayout
+    reason: str
+    ambiguity: Finding | None = None
+
+
+def resolve_layout(detections: Detections, model: Model) -> ResolvedLayout:
+    """Return the layout in which the keypoints fit best.
 
     The model's own layout is taken unless another one fits clearly better.
 
@@ -24,12 +40,12 @@ def resolve_layout(detections: Detections, model: Model) -> tuple[KeypointLayout
     fits = fit_layouts(detections.points, detections.confidence, model)
     q = detections.confidence.shape[1]
     chosen = choose_layout(fits, model.layout)
-    if chosen and chosen.residual >= POOR_RESIDUAL:
-        return chosen.layout, f"taken although no layout fits well; {_ranking(chosen, fits)}"
     if chosen:
-        return chosen.layout, _ranking(chosen, fits)
+        rivals = ambiguity(detections.points, detections.confidence, model, fits, chosen)
+        poor = "taken although no layout fits well; " * (chosen.residual >= POOR_RESIDUAL)
+        return ResolvedLayout(chosen.layout, poor + _ranking(chosen, fits), rivals)
     if q == len(model.layout):
-        return model.layout, f"the order of the model, {q} keypoints"
+        return ResolvedLayout(model.layout, f"the order of the model, {q} keypoints")
     raise ValueError(
         f"the objects have {q} keypoints; no layout of {q} keypoints is known that model "
         f"{model.name!r} ({len(model.layout)} keypoints) can lift: name one with --keypoint-layout"

@@ -91,6 +91,56 @@ def choose_layout(fits: list[LayoutFit], preferred: KeypointLayout) -> LayoutFit
     return best if current is None or _is_clearly_better(best, current.residual) else current
 
 
+def ambiguity(
+    points: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    model: Model,
+    fits: list[LayoutFit],
+    chosen: LayoutFit,
+) -> Finding | None:
+    """Return the finding that another layout may be meant as well as the chosen one.
+
+    Another one may be meant if the chosen one does not fit clearly better, or if too few keypoints
+    are visible to try it. A layout that gives the model the same keypoints is no other one: coco17
+    and posetrack18_17 differ in the face only.
+
+    Args:
+        points: as in `fit_layouts`.
+        confidence: as in `fit_layouts`.
+        model: as in `fit_layouts`.
+        fits: as `fit_layouts` returns them.
+        chosen: one of them.
+    """
+    visible = np.asarray((confidence > 0).any(0))
+    own = _mapped_places(chosen.layout, model, visible)
+    residuals = {fit.layout.keypoints: fit.residual for fit in fits}
+    rivals = []
+    for layout in _candidates(confidence.shape[1], model, [fit.layout for fit in fits]):
+        if _mapped_places(layout, model, visible) == own:
+            continue
+        residual = residuals.get(layout.keypoints)
+        if residual is None:
+            rivals.append(f"{layout.name} (too few visible keypoints to try it)")
+        elif not chosen.residual < _CLEAR_RATIO * residual:
+            rivals.append(f"{layout.name} ({residual:.2f})")
+    if not rivals:
+        return None
+    return Finding(
+        "ambiguous-layout",
+        f"the keypoint layout is ambiguous: {chosen.layout.name} is taken, which fits "
+        f"{chosen.residual:.2f}, but {' or '.join(rivals)} may be meant: name the keypoint layout",
+    )
+
+
+def _mapped_places(layout: KeypointLayout, model: Model, visible: NDArray[np.bool_]) -> bytes:
+    """Return which visible keypoints of a layout become which keypoints of the model."""
+    q = len(layout)
+    numbers = np.arange(1, q + 1, dtype=np.float32)
+    pairs = np.stack([numbers, numbers**2], -1)[None]
+    mapped, confidence = KeypointMap(layout, model.layout)(pairs, visible[None].astype(np.float32))
+    return mapped.tobytes() + confidence.tobytes()
+
+
 def better_layout(
     fits: list[LayoutFit], current: KeypointLayout, residual: float
 ) -> Finding | None:

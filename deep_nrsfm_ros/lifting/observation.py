@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -37,11 +39,44 @@ class Observation(NamedTuple):
         confidence: (n, q) float32 in (0, 1]; 0 where missing.
         identities: n, as the detector gives them; None for an object without one, () if the
             detector gives none at all.
+        scores: n, of the objects, in the detector's own scale; () if it gives none.
+        left_out: a reason for each object or keypoint of the message that is left out.
     """
 
     points: NDArray[np.float32]
     confidence: NDArray[np.float32]
     identities: Identities = ()
+    scores: tuple[float, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    def above(self, min_score: float) -> Observation:
+        """Return the objects with a score of at least `min_score`; all if none has a score."""
+        if not min_score or not self.scores:
+            return self
+        kept = [i for i, score in enumerate(self.scores) if score >= min_score]
+        if len(kept) == len(self.scores):
+            return self
+        return Observation(
+            self.points[kept],
+            self.confidence[kept],
+            tuple(self.identities[i] for i in kept) if self.identities else (),
+            tuple(self.scores[i] for i in kept),
+            self.left_out,
+        )
+
+
+def left_out_sentences(reasons: Iterable[str], most: int = 3) -> list[str]:
+    """Return a sentence for each reason why objects or keypoints of messages are left out.
+
+    Args:
+        reasons: `left_out` of all observations.
+        most: reasons that are told one by one, the frequent ones first.
+    """
+    counts = Counter(reasons)
+    sentences = [f"{reason} ({count} times)" for reason, count in counts.most_common(most)]
+    if others := counts.total() - sum(count for _, count in counts.most_common(most)):
+        sentences.append(f"{others} more objects or keypoints are left out for other reasons")
+    return sentences
 
 
 def to_observation(
@@ -86,7 +121,7 @@ def without_border(observation: Observation, size: tuple[int, int]) -> Observati
         observation: n objects in pixels.
         size: width and height of the image in pixels.
     """
-    points, confidence, identities = observation
+    points, confidence = observation.points, observation.confidence
     half = np.array(size, np.float32) / 2
     inner = half - np.maximum(np.float32(1), np.float32(2 * _BORDER) * half)
     outside = (np.abs(points - half + _HALF_PIXEL) >= inner).any(-1)
@@ -97,7 +132,26 @@ def without_border(observation: Observation, size: tuple[int, int]) -> Observati
     if far.sum() > _FAR * visible.sum():
         return observation
     points = np.where(outside[..., None], _MISSING, points)
-    return Observation(points, np.where(outside, _MISSING, confidence), identities)
+    confidence = np.where(outside, _MISSING, confidence)
+    return observation._replace(points=points, confidence=confidence)
+
+
+def without_value(observation: Observation, value: float | None) -> Observation:
+    """Return the observation with keypoints of which x or y is `value` as missing.
+
+    Args:
+        observation: n objects.
+        value: what the detector writes for a missing coordinate, -1 typical; None: nothing.
+    """
+    if value is None:
+        return observation
+    marked = (observation.points == np.float32(value)).any(-1) & (observation.confidence > 0)
+    if not marked.any():
+        return observation
+    points = np.where(marked[..., None], _MISSING, observation.points)
+    return observation._replace(
+        points=points, confidence=np.where(marked, _MISSING, observation.confidence)
+    )
 
 
 def from_arrays(

@@ -92,8 +92,9 @@ def read_observation(
     mapping = _mapping(input_type)
     try:
         if mapping:
-            values, identities = mapping(message, keypoints, size)
-            return to_observation(values, min_confidence, identities)
+            values, identities, scores, left_out = mapping(message, keypoints, size)
+            observation = to_observation(values, min_confidence, identities)
+            return observation._replace(scores=scores, left_out=left_out)
         if isinstance(input_type, str) and (reader := _READERS.get(input_type)):
             return to_observation(reader(message, keypoints), min_confidence)
     except MessageError:

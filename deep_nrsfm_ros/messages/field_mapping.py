@@ -6,13 +6,12 @@ here; others are read from YAML, see `config/mappings/`.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +27,23 @@ Size = tuple[int, int]
 """Width and height of an image in pixels."""
 
 _MAX_KEYPOINTS = 1000  # keypoint numbers above are refused while the layout is unknown
-_MAX_WARNINGS = 100  # warnings that a process writes
 _MISFITS = (AttributeError, TypeError, ValueError, IndexError, KeyError, OverflowError)
-_LOG = logging.getLogger(__name__)
+
+
+class MappedObjects(NamedTuple):
+    """The n objects of a message that fit a mapping.
+
+    Attributes:
+        values: (n, q, 2) x and y in pixels, or (n, q, 3) with confidence, NaN where missing.
+        identities: n, None for an object without one.
+        scores: n, of the objects; () if the mapping names no score.
+        left_out: a reason for each object or keypoint that is left out.
+    """
+
+    values: NDArray[np.floating]
+    identities: Identities
+    scores: tuple[float, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -53,6 +66,8 @@ class FieldMapping:
         where: a field of an object; those where it is false, 0 or empty are left out; "": none are.
         identity: the identity of an object, in the object, or with "/" a list with one for each
             object; "": there is none.
+        score: of an object, in the object, or with "/" a list with one for each object; "": there
+            is none.
         keypoints: see above. An object with an empty list is left out.
         count: the number of keypoints in the list, in the object; the places behind them are not
             used; "": all of them.
@@ -88,34 +103,30 @@ class FieldMapping:
     count: str = ""
     counts: tuple[tuple[int, int], ...] = ()
     max_confidence: float = 1.0
+    score: str = ""
 
-    def __call__(
-        self, message: Any, keypoints: int, size: Size | None = None
-    ) -> tuple[NDArray[np.floating], Identities]:
-        """Return the keypoints of n objects and their identities.
+    def __call__(self, message: Any, keypoints: int, size: Size | None = None) -> MappedObjects:
+        """Return the keypoints of n objects, their identities and scores.
 
-        An object that does not fit the layout is left out, with a warning in the log, where
-        another one fits.
+        An object that does not fit the layout is left out, with the reason, where another one
+        fits.
 
         Args:
             message: of the type `type`, from rclpy or rosbags.
             keypoints: q, the number of keypoints of the detector's layout.
             size: of the image; needed where `units` is "normalised".
 
-        Returns:
-            (n, q, 2) x and y in pixels, or (n, q, 3) with confidence, NaN where missing; and n
-            identities.
-
         Raises:
             MessageError: keypoints that do not fit the layout, an unknown size of the image, or
                 fields that the message does not have.
         """
         try:
-            values, identities = self._read(message, keypoints)
+            objects = self._read(message, keypoints)
         except MessageError:
             raise
         except _MISFITS as error:
             raise misfit(self, message, error) from None
+        values = objects.values
         xy = values[..., :2]
         if self.missing == NEGATIVE:
             values[(xy < 0).any(-1)] = np.nan
@@ -124,7 +135,7 @@ class FieldMapping:
         if self.max_confidence != 1:
             values[..., 2:] /= self.max_confidence
         if self.units == PIXELS:
-            return values, identities
+            return objects
         scaled = (1, 1) if isinstance(self.units, str) else self.units
         if not size:
             unit = "normalised" if scaled == (1, 1) else f"pixels of {scaled[0]} x {scaled[1]}"
@@ -134,7 +145,7 @@ class FieldMapping:
             )
         with np.errstate(over="ignore"):  # infinite coordinates are marked as missing later
             xy *= np.array(size) / scaled
-        return values, identities
+        return objects
 
     def keypoint_count(self, message: Any) -> int:
         """Return the number of keypoints of the objects, 0 if there is no object.
@@ -183,11 +194,6 @@ class FieldMapping:
     def _where(self) -> Callable[[Any], Any]:
         """Return the getter of what says whether an object has keypoints."""
         return self.path("where").value
-
-    @cached_property
-    def _identity(self) -> Callable[[Any], Any]:
-        """Return the getter of the identity of an object."""
-        return self.path("identity").value
 
     @cached_property
     def _values(self) -> Callable[[Any], Any]:
@@ -240,53 +246,75 @@ class FieldMapping:
         """Return the index in the layout of each name."""
         return {name: i for i, name in enumerate(self.names)}
 
-    def _read(self, message: Any, keypoints: int) -> tuple[NDArray[np.floating], Identities]:
-        """Return the values of all objects, and their identities."""
+    def _read(self, message: Any, keypoints: int) -> MappedObjects:
+        """Return the values of all objects, their identities and scores."""
         rows: list[Any] = []
         identities: list[str | None] = []
+        scores: list[float] = []
+        left_out: list[str] = []
         refused: MessageError | None = None
         items = self.items(message)
-        identity = self._identity_of(message, len(items))
+        identity = self._of_object("identity", message, len(items))
+        score = self._of_object("score", message, len(items))
         for i, item in enumerate(items):
             if self.where and not self._where(item):
                 continue
             try:
-                row = self._row(message, item, keypoints)
+                row = self._row(message, item, keypoints, left_out)
             except MessageError as error:
                 refused = refused or error
+                left_out.append(f"an object is left out: {error}")
                 continue
             if row is not None:
                 rows.append(row)
                 identities.append(_identity_text(identity(i, item)) if identity else None)
+                if score:
+                    scores.append(float(score(i, item)))
         if refused and not rows:
             raise refused
-        if refused:
-            warn_once(f"{self.type}: an object is left out: {refused}")
+        others = tuple(identities), tuple(scores), tuple(left_out)
         width = len(self.columns)
         shape = (len(rows), keypoints, width)
         if rows and isinstance(rows[0], list):  # twice as fast as np.array
             numbers = chain.from_iterable(chain.from_iterable(rows))
-            return np.fromiter(numbers, np.float64).reshape(shape), tuple(identities)
-        values = np.array(rows, np.float64).reshape(shape)
-        return values, tuple(identities)
+            return MappedObjects(np.fromiter(numbers, np.float64).reshape(shape), *others)
+        return MappedObjects(np.array(rows, np.float64).reshape(shape), *others)
 
-    def _identity_of(self, message: Any, objects: int) -> Callable[[int, Any], Any] | None:
-        """Return the function of index and object that returns the identity; None: none has one."""
-        if not self.identity:
+    def _of_object(self, key: str, message: Any, objects: int) -> Callable[[int, Any], Any] | None:
+        """Return the function of index and object that returns a value of the object.
+
+        Args:
+            key: the attribute with its path, "identity" or "score".
+            message: of the type `type`.
+            objects: number of objects in the message.
+
+        Returns:
+            None if the attribute is "".
+        """
+        text = getattr(self, key)
+        if not text:
             return None
-        if not self.identity.startswith("/"):
-            return lambda _, item: self._identity(item)
-        listed = self.path("identity").values(message)
+        if not text.startswith("/"):
+            get = self._getters[key]
+            return lambda _, item: get(item)
+        listed = self.path(key).values(message)
         if len(listed) != objects:
             raise MessageError(
-                f"identity ({self.identity}) has {len(listed)}; the message has {objects} objects"
+                f"{key} ({text}) has {len(listed)}; the message has {objects} objects"
             )
         return lambda i, _: listed[i]
 
-    def _row(self, message: Any, item: Any, keypoints: int) -> Any:
+    @cached_property
+    def _getters(self) -> dict[str, Callable[[Any], Any]]:
+        """The getters of the values of an object."""
+        keys = ("identity", "score")
+        return {key: self.path(key).value for key in keys if getattr(self, key)}
+
+    def _row(self, message: Any, item: Any, keypoints: int, left_out: list[str]) -> Any:
         """Return (x, y[, confidence]) of each keypoint of one object, in the layout's order.
 
-        None if the object has no keypoints.
+        None if the object has no keypoints. Reasons for keypoints that are left out are added to
+        `left_out`.
         """
         if self.keypoints and not self.count:  # most messages
             points = self._keypoints(item)
@@ -316,7 +344,7 @@ class FieldMapping:
             problem = f"{self.keypoint_id} is {name!r}; the mapping names {known}"
             if not any(i is not None for i in places):
                 raise MessageError(problem)
-            warn_once(f"{self.type}: a keypoint is left out: {problem}")
+            left_out.append(f"a keypoint is left out: {problem}")
         return row
 
     def _check_count(self, row: Any, keypoints: int) -> None:
@@ -446,11 +474,12 @@ def explain(mapping: FieldMapping, message: Any) -> None:
         objects = _follow(mapping, "objects", message, "the message", _LIST)
     for item in objects:
         place = "the object" if mapping.objects else "the message"
-        for key in ("where", "identity", "count"):
+        for key in ("where", "identity", "score", "count"):
             if text := getattr(mapping, key):
                 root, where = (message, "the message") if text[0] == "/" else (item, place)
-                kind = _LIST if key == "identity" and text[0] == "/" else _VALUE
-                _follow(mapping, key, root, where, _NUMBER if key == "count" else kind)
+                kind = _NUMBER if key in ("count", "score") else _VALUE
+                listed = key in ("identity", "score") and text[0] == "/"
+                _follow(mapping, key, root, where, _LIST if listed else kind)
         kinds = dict.fromkeys(mapping.columns, _NUMBER)
         if mapping.keypoint_id:
             kinds["keypoint_id"] = _VALUE
@@ -516,20 +545,11 @@ def _number(value: Any) -> bool:
     return True
 
 
-_warned: set[str] = set()
-
-
-def warn_once(text: str) -> None:
-    """Write a warning to the log unless it has been written."""
-    if text not in _warned and len(_warned) < _MAX_WARNINGS:
-        _warned.add(text)
-        _LOG.warning(text)
-
-
 YOLO = FieldMapping(
     "yolo_msgs/DetectionArray",
     objects="detections",
     identity="id",
+    score="score",
     keypoints="keypoints.data",
     x="point.x",
     y="point.y",

@@ -22,6 +22,7 @@ _PATHS = (
     "objects",
     "where",
     "identity",
+    "score",
     "keypoints",
     "count",
     "x",
@@ -125,7 +126,9 @@ def _check_paths(paths: dict[str, str | tuple[str, ...]]) -> None:
                     f"{name} is {brief_repr(value)}, which is no field of one keypoint: leave out "
                     "keypoints where x and y are lists of the object"
                 )
-            one = name in ("where", "count") or name == "identity" and not path.from_message
+            one = name in ("where", "count") or (
+                name in ("identity", "score") and not path.from_message
+            )
             if path.is_list and (one or len(several) > 1):
                 raise ValueError(f"{name} is {path.text!r}; it must lead to one value, without []")
     if isinstance(keypoints, tuple):

@@ -77,6 +77,12 @@ class InputOptions:
         low=0,
         high=1,
     )
+    min_score: float = option(
+        0.0,
+        "score of an object below which it is left out, in the detector's own scale; 0 = keep all, "
+        "0.3 typical",
+        low=0,
+    )
 
     @property
     def image_size(self) -> Size | None:

@@ -33,6 +33,7 @@ class Pipeline:
         edges: pairs of keypoint indices of the model's layout, to draw.
         tolerances: (p,) of the keypoints of the model's layout, for identities.
         min_confidence: detector confidence below which a keypoint is missing.
+        min_score: detector's score of an object below which it is left out.
         image_size: width and height of the image in pixels that the options give; None: unknown.
     """
 
@@ -63,6 +64,7 @@ class Pipeline:
         self._map = KeypointMap(self.source, model.layout)
         self._lifter = Lifter(model, lifting, layout=self.source)
         self.min_confidence = inputs.min_confidence
+        self.min_score = inputs.min_score
         self.image_size = inputs.image_size
         self._min_visible, self._max_objects = lifting.min_visible, inputs.max_objects
         self._smoothing = smoothing
@@ -87,7 +89,8 @@ class Pipeline:
         """
         size = size or self.image_size
         header, observation = reader(raw, len(self.source), self.min_confidence, size)
-        points, confidence, identities = observation
+        observation = observation.above(self.min_score)
+        points, confidence = observation.points, observation.confidence
         if len(confidence) > self._max_objects:
             raise MessageError(
                 f"message has {len(confidence)} objects; expected at most "
@@ -95,8 +98,8 @@ class Pipeline:
             )
         points = to_pixels(points, confidence, size)
         if size:
-            points, confidence, _ = without_border(Observation(points, confidence), size)
-        return header, Observation(*self._map(points, confidence), identities)
+            points, confidence, *_ = without_border(Observation(points, confidence), size)
+        return header, Observation(*self._map(points, confidence), observation.identities)
 
     @property
     def needs_identities(self) -> bool:

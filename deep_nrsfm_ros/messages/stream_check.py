@@ -17,9 +17,15 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.layout_fit import LayoutFit, better_layout, choose_layout, fit_layouts
+from deep_nrsfm_ros.lifting.layout_fit import (
+    LayoutFit,
+    ambiguity,
+    better_layout,
+    choose_layout,
+    fit_layouts,
+)
 from deep_nrsfm_ros.lifting.lifter import Lifted
-from deep_nrsfm_ros.lifting.observation import Observation
+from deep_nrsfm_ros.lifting.observation import Observation, left_out_sentences
 from deep_nrsfm_ros.lifting.sanity import (
     POOR_RESIDUAL,
     Finding,
@@ -52,11 +58,21 @@ class Choice(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """The objects of the kept messages of one topic, in pixels, and their stamps in ns."""
+    """The objects of the kept messages of one topic, in pixels, and what the messages say of them.
+
+    Attributes:
+        points: (n, q, 2).
+        confidence: (n, q).
+        stamps: (f,) in ns.
+        left_out: sentences about objects and keypoints that are left out.
+        has_scores: objects have scores.
+    """
 
     points: NDArray[np.float32]
     confidence: NDArray[np.float32]
     stamps: NDArray[np.int64]
+    left_out: list[str]
+    has_scores: bool
 
 
 class StreamCheck:
@@ -75,6 +91,7 @@ class StreamCheck:
         self.searching = search
         self._recent: deque[tuple[str, MessageReader, bytes]] = deque(maxlen=_MESSAGES)
         self._lifted: Lifted | None = None
+        self._ambiguity: tuple[KeypointLayout, Finding] | None = None
         self._with_objects = 0
 
     def restart(self, *, search: bool) -> None:
@@ -133,6 +150,10 @@ class StreamCheck:
             fits = fit_layouts(sample.points, sample.confidence, model, layouts)
             chosen = choose_layout(fits, implied or model.layout)
             if chosen:
+                rivals = ambiguity(sample.points, sample.confidence, model, fits, chosen)
+                if implied and chosen.layout.keypoints == implied.keypoints:
+                    rivals = None
+                self._ambiguity = (chosen.layout, rivals) if rivals else None
                 return Choice(chosen.layout, _reason(chosen, fits, implied, reader))
             if q == len(model.layout):
                 return Choice(model.layout, "the order of the model")
@@ -167,8 +188,19 @@ class StreamCheck:
             sample.stamps,
             self._lifted,
         )
+        findings += [Finding("left-out", text) for text in sample.left_out]
+        if pipeline.min_score and not sample.has_scores:
+            findings.append(
+                Finding(
+                    "min-score",
+                    f"min_score is {pipeline.min_score:g} and has no effect: the messages on "
+                    f"{topic} give no object a score (a field mapping can name it)",
+                )
+            )
         # Poor fit and low confidence are rated by the diagnostics, over all objects of a second.
         findings = [f for f in findings if f.code not in ("poor-fit", "low-confidence")]
+        if self._ambiguity and self._ambiguity[0].keypoints == pipeline.source.keypoints:
+            findings.insert(0, self._ambiguity[1])
         if self._lifted is not None and is_person(pipeline.model.layout):
             findings += orientation(self._lifted.rotations)
         if residual >= POOR_RESIDUAL:
@@ -195,7 +227,7 @@ class StreamCheck:
                 header, observation = reader(raw, q, pipeline.min_confidence, size)
             except Exception:  # damaged bytes fail in many ways; the hot path has reported it
                 continue
-            observations.append(observation)
+            observations.append(observation.above(pipeline.min_score))
             if header:
                 stamps.append(header.stamp)
         if not observations:
@@ -203,7 +235,9 @@ class StreamCheck:
         points = np.concatenate([observation.points for observation in observations])
         confidence = np.concatenate([observation.confidence for observation in observations])
         points = to_pixels(points, confidence, size).astype(np.float32, copy=False)
-        return _Sample(points, confidence, np.array(stamps, np.int64))
+        left_out = left_out_sentences(r for each in observations for r in each.left_out)
+        has_scores = any(each.scores for each in observations)
+        return _Sample(points, confidence, np.array(stamps, np.int64), left_out, has_scores)
 
 
 def _implied(reader: MessageReader, model: Model) -> KeypointLayout | None:

@@ -442,6 +442,7 @@ class LifterNode(Node):
             keypoint_layout=self._sandbox.layout("keypoint_layout", layout),
             model=self._sandbox.model("model", inputs.model),
             min_confidence=inputs.min_confidence,
+            min_score=inputs.min_score,
             mapping=inputs.input_type if inputs.input_type.endswith(MAPPING_SUFFIXES) else "",
             image_width=inputs.image_width,
             image_height=inputs.image_height,

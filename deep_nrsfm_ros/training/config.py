@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
+from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.network import Architecture
@@ -38,6 +39,7 @@ class DataConfig:
             the layout of the model.
         min_confidence: keypoints of less confidence count as missing, 0 to 1.
         mapping: field mapping (.yaml) for messages of other types; "" is none.
+        missing_value, min_score, category: as in `ReadOptions`, for bags and files.
         image_width, image_height: pixels, for keypoints given as shares of the image; 0 unknown.
         cmu: folder of the CMU motion capture (NN/NN.asf, NN/*.amc); None for keypoints.
         subjects: folders of the CMU subjects.
@@ -52,6 +54,9 @@ class DataConfig:
     keypoint_layout: str = ""
     min_confidence: float = 0.1
     mapping: str = ""
+    missing_value: float | None = DEFAULT_READ_OPTIONS.missing_value
+    min_score: float = DEFAULT_READ_OPTIONS.min_score
+    category: str = DEFAULT_READ_OPTIONS.category
     image_width: int = 0
     image_height: int = 0
     cmu: Path | None = None
@@ -250,6 +255,7 @@ PARAMETERS = OptionNames(
         "min_confidence": "min_confidence",
         "image_width": "image_width",
         "image_height": "image_height",
+        "min_score": "min_score",
         "data": "train.bags",
     },
 )

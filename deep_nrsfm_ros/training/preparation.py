@@ -59,6 +59,9 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
         mapping=read_field_mapping(data.mapping),
         image_size=data.image_size,
         max_frames=config.limits.max_frames,
+        missing_value=data.missing_value,
+        min_score=data.min_score,
+        category=data.category,
     )
     if config.object == NUMBERED:
         source = target = _numbered(data, options)
@@ -143,9 +146,9 @@ def _read_inputs(
 
 
 def _options_for(path: Path, options: ReadOptions) -> ReadOptions:
-    """Return the options for a file: only a bag has a topic and a mapping."""
+    """Return the options for a file: only a bag has a topic and a mapping, and no category."""
     if path.exists() and is_bag(path):
-        return options
+        return dataclasses.replace(options, category="")
     return dataclasses.replace(options, topic="", mapping=None)
 
 

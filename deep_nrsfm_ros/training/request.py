@@ -92,6 +92,7 @@ class LifterInput:
         min_confidence: keypoints of less confidence count as missing, 0 to 1.
         mapping: field mapping (.yaml) of its messages, or "".
         image_width, image_height: pixels, 0 where unknown.
+        min_score: objects of less score are left out.
     """
 
     topic: str
@@ -101,6 +102,7 @@ class LifterInput:
     mapping: str = ""
     image_width: int = 0
     image_height: int = 0
+    min_score: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,7 @@ def training_request(
             mapping=lifter.mapping,
             image_width=lifter.image_width,
             image_height=lifter.image_height,
+            min_score=lifter.min_score,
         ),
         object=target,
         recipe=parameters.recipe,

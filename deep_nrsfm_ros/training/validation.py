@@ -9,6 +9,7 @@ from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.keypoint_files import is_bag
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -23,7 +24,10 @@ from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
 
 _NUMBERED_LAYOUT = KeypointLayout(NUMBERED, ())  # its points are counted when the bags are read
 
-_OF_BAGS = ("topic", "keypoint_layout", "min_confidence", "mapping", "image_width", "image_height")
+_OF_BAGS = (
+    *("topic", "keypoint_layout", "min_confidence", "mapping", "image_width", "image_height"),
+    *("missing_value", "min_score", "category"),
+)
 _OF_CMU = ("subjects", "all_trials", "stride", "camera_seed")
 
 
@@ -84,6 +88,9 @@ def _check_ranges(config: TrainingConfig, names: OptionNames) -> None:
     for part in (*config.preset, config.layout_loss, config.curation, config.limits):
         for field, _, option in options(type(part)):
             option.check(names(field.name), getattr(part, field.name))
+    for field, _, option in options(ReadOptions):
+        if hasattr(config.data, field.name):
+            option.check(names(field.name), getattr(config.data, field.name))
     for name, value, least in (
         ("min_confidence", config.data.min_confidence, 0),
         ("stride", config.data.stride, 1),
@@ -113,6 +120,8 @@ def _check_data(config: TrainingConfig, names: OptionNames) -> None:
         for path in getattr(data, field):
             if not path.expanduser().exists():
                 raise ValueError(f"{names(field)} names {path}, which does not exist")
+    if data.category and not any(not is_bag(p.expanduser()) for p in data.inputs):
+        raise ValueError(f"{names('category')} has no effect on bags: leave it out")
     if data.topic and not (data.bags or data.cmu or any(map(is_bag, data.inputs))):
         raise ValueError(f"{names('topic')} is {data.topic!r}, but there is no bag; leave it out")
 

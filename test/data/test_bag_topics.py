@@ -292,3 +292,69 @@ def test_the_type_of_messages_implies_the_layout(tmp_path: Path, recorded: Any) 
     found = read_keypoints(bag)
     assert found.layout is COCO17 and found.points.shape[1:] == (17, 2)
     assert read_keypoints(bag, ReadOptions(layout=HUMAN17)).layout is HUMAN17
+
+
+def test_scores_of_objects_in_a_bag(tmp_path: Path, recorded: Any) -> None:
+    """`min_score` leaves out objects, for `lift` and `train`; the largest is no ghost."""
+    big, small = people(1, 17)[0], people(1, 17)[0]
+    small[:, :2] = small[:, :2] / 4 + 300
+    found = [
+        {"id": "1", "points": big, "seen": range(17), "score": 0.2},
+        {"id": "2", "points": small, "seen": range(17), "score": 0.9},
+    ]
+    messages = [recorded.detections(found)] * 3
+    bag = write(tmp_path / "bag", recorded, {"/yolo": ("yolo_msgs/DetectionArray", messages)})
+    every = read_keypoints(bag, ReadOptions())
+    assert every.scores.tolist() == [np.float32(0.2), np.float32(0.9)] * 3
+    assert every.largest().identities.tolist() == ["2"] * 3
+    kept = read_keypoints(bag, ReadOptions(min_score=0.5))
+    assert kept.identities.tolist() == ["2"] * 3
+    assert kept.warnings == ("left out: 3 objects with a score below --min-score 0.5",)
+    to_human = KeypointMap(COCO17, HUMAN17)
+    reading = read_bags([bag], to_human.source, to_human.target, ReadOptions(min_score=0.5))
+    assert len(reading.dataset) == 3
+    cloud = point_cloud_bag(tmp_path / "cloud", recorded)
+    with pytest.raises(ValueError, match="gives no object a score .*: leave out min_score"):
+        read_keypoints(cloud, ReadOptions(min_score=0.5, layout=COCO17))
+    with pytest.raises(BagError, match="gives no object a score"):
+        read_bags([cloud], COCO17, HUMAN17, ReadOptions(min_score=0.5))
+
+
+def test_marks_of_missing_keypoints_in_a_bag(tmp_path: Path, recorded: Any) -> None:
+    points = people(4, 17)
+    points[:, 3, :2] = -1
+    bag = write(
+        tmp_path / "bag",
+        recorded,
+        {"/k": ("sensor_msgs/PointCloud2", [cloud_of(recorded, p) for p in points])},
+    )
+    for read in (
+        read_keypoints(bag, ReadOptions(layout=COCO17, missing_value=-1)).confidence > 0,
+        read_bags([bag], COCO17, COCO17, ReadOptions(missing_value=-1)).dataset.visible,
+    ):
+        assert not read[:, 3].any() and read[:, :3].all()
+
+
+def test_objects_that_are_left_out_are_said(tmp_path: Path, recorded: Any) -> None:
+    found = [
+        {"id": "1", "points": people(1, 17)[0], "seen": range(17)},
+        {"id": "2", "points": people(1, 25)[0], "seen": range(25)},
+    ]
+    messages = [recorded.detections(found)] * 3
+    bag = write(tmp_path / "bag", recorded, {"/yolo": ("yolo_msgs/DetectionArray", messages)})
+    reading = read_bags([bag], COCO17, COCO17)
+    expected = "an object is left out: id of a keypoint is 25; the 17 of the keypoint layout are"
+    assert any(text.startswith(expected) and "(3 times)" in text for text in reading.warnings)
+    assert any(text.startswith(expected) for text in read_keypoints(bag).warnings)
+
+
+def cloud_of(maker: Any, points: np.ndarray) -> Any:
+    """Return a PointCloud2 of one object (q, 3)."""
+    header = maker.make("std_msgs/Header")
+    return point_cloud(header, points[None, :, :2], points[None, :, 2])
+
+
+def point_cloud_bag(path: Path, maker: Any) -> Path:
+    """Write a bag of one person, whose messages have no score of the person."""
+    messages = [cloud_of(maker, p) for p in people(3, 17)]
+    return write(path, maker, {"/k": ("sensor_msgs/PointCloud2", messages)})

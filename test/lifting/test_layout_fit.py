@@ -8,7 +8,12 @@ import pytest
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17, LAYOUTS
-from deep_nrsfm_ros.lifting.layout_fit import better_layout, choose_layout, fit_layouts
+from deep_nrsfm_ros.lifting.layout_fit import (
+    ambiguity,
+    better_layout,
+    choose_layout,
+    fit_layouts,
+)
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from test.fixtures.walking import in_layout
 
@@ -51,3 +56,20 @@ def test_a_layout_of_the_caller(human: Model) -> None:
     turned = KeypointLayout("turned", COCO17.keypoints[::-1])
     fits = fit_layouts(*KeypointMap(COCO17, turned)(points, confidence), human, [turned])
     assert fits[0].layout is turned
+
+
+def test_two_layouts_that_may_be_meant_are_ambiguous(human: Model) -> None:
+    points, confidence = in_layout(COCO17, 40)
+    fits = fit_layouts(points, confidence, human)
+    chosen = choose_layout(fits, HUMAN17)
+    assert chosen and chosen.layout.name == "coco17"
+    # posetrack18_17 fits alike and gives the model the same keypoints, so it is no other layout.
+    assert ambiguity(points, confidence, human, fits, chosen) is None
+    upper = confidence.copy()  # head and shoulders alone: three keypoints of the model
+    upper[:, [i for i, name in enumerate(COCO17.keypoints) if i > 6]] = 0
+    fits = fit_layouts(points, upper, human)
+    chosen = choose_layout(fits, HUMAN17)
+    assert chosen and chosen.layout.name != "coco17"
+    finding = ambiguity(points, upper, human, fits, chosen)
+    assert finding and finding.code == "ambiguous-layout"
+    assert "coco17 (too few visible keypoints to try it)" in finding.message

@@ -109,7 +109,7 @@ def polygon(values: np.ndarray) -> PolygonStamped:
 def test_point_cloud_of_any_make(origin: str, n: int, q: int, names: Any, **make: Any) -> None:
     values = keypoints(n, q)
     message = received(cloud(values, names=tuple(names), **make), POINT_CLOUD, origin)
-    points, confidence, _ = read_observation(message, POINT_CLOUD, q)
+    points, confidence, *_ = read_observation(message, POINT_CLOUD, q)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2])
     assert points.dtype == confidence.dtype == np.float32
@@ -128,7 +128,7 @@ def test_packed_points_read_back() -> None:
     message = PointCloud2(height=2, width=6, point_step=POINT_STEP, row_step=6 * POINT_STEP)
     message.fields = [PointField(name=n, offset=o, datatype=7, count=1) for n, o in POINT_FIELDS]
     message.data = array("B", pack_points(values[..., :2], values[..., 2]))
-    points, confidence, _ = read_observation(message, POINT_CLOUD, 6)
+    points, confidence, *_ = read_observation(message, POINT_CLOUD, 6)
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2])
 
@@ -141,7 +141,9 @@ def test_multi_array_by_its_layout(origin: str, shape: str, size: int) -> None:
     values = keypoints(n, q)
     sizes = {"p": (q, size), "n p": (n, q, size), "flat": (q * size,), "none": ()}[shape]
     message = multi_array(values[..., :size], sizes, offset=2)
-    points, confidence, _ = read_observation(received(message, MULTI_ARRAY, origin), MULTI_ARRAY, q)
+    points, confidence, *_ = read_observation(
+        received(message, MULTI_ARRAY, origin), MULTI_ARRAY, q
+    )
     np.testing.assert_array_equal(points, values[..., :2])
     np.testing.assert_array_equal(confidence, values[..., 2] if size == 3 else np.ones((n, q)))
 
@@ -149,7 +151,7 @@ def test_multi_array_by_its_layout(origin: str, shape: str, size: int) -> None:
 @BOTH
 def test_polygon_takes_z_for_confidence(origin: str) -> None:
     values = keypoints(1, 7)
-    points, confidence, _ = read_observation(
+    points, confidence, *_ = read_observation(
         received(polygon(values[0]), POLYGON, origin), POLYGON, 7
     )
     np.testing.assert_array_equal(points, values[..., :2])
@@ -182,7 +184,7 @@ def test_missing_keypoints(missing: tuple[float, float, float]) -> None:
     values[0, 3] = missing
     with np.errstate(all="raise", over="ignore"):
         message = cloud(values, datatypes=(PointField.FLOAT64,) * 3)
-        points, confidence, _ = read_observation(message, POINT_CLOUD, 5, min_confidence=0.3)
+        points, confidence, *_ = read_observation(message, POINT_CLOUD, 5, min_confidence=0.3)
     np.testing.assert_array_equal(confidence, [[0.5, 0.5, 0.5, 0, 0.5]])
     np.testing.assert_array_equal(points[0, 3], [0, 0])
     np.testing.assert_array_equal(points[0, :3], values[0, :3, :2].astype(np.float32))
@@ -286,7 +288,7 @@ def test_malformed_multi_array(sizes: tuple[int, ...], expected: str) -> None:
 )
 def test_arbitrary_point_cloud_is_read_or_refused(**message: Any) -> None:
     try:
-        points, confidence, _ = read_observation(SimpleNamespace(**message), POINT_CLOUD, 5)
+        points, confidence, *_ = read_observation(SimpleNamespace(**message), POINT_CLOUD, 5)
     except MessageError as refusal:
         assert str(refusal)
     else:
@@ -304,7 +306,7 @@ def test_arbitrary_multi_array_is_read_or_refused(
 ) -> None:
     layout = SimpleNamespace(data_offset=offset, dim=[SimpleNamespace(size=s) for s in sizes])
     try:
-        points, confidence, _ = read_observation(
+        points, confidence, *_ = read_observation(
             SimpleNamespace(layout=layout, data=data), MULTI_ARRAY, 5
         )
     except MessageError as refusal:

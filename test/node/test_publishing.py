@@ -54,7 +54,7 @@ def test_clouds_of_any_size_follow_each_other() -> None:
         values = np.frombuffer(message.data, "<f4").reshape(n, p, 4)
         np.testing.assert_array_equal(values[..., :3], wanted.shapes)
         np.testing.assert_array_equal(values[..., 3], wanted.confidence)
-        points, confidence, _ = read_observation(message, POINT_CLOUD, p)
+        points, confidence, *_ = read_observation(message, POINT_CLOUD, p)
         np.testing.assert_array_equal(points, wanted.shapes[..., :2])
         np.testing.assert_array_equal(confidence, wanted.confidence)
 

@@ -51,6 +51,9 @@ def changed(config: Any) -> Any:
     values = {}
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
+        if field.name == "missing_value":  # a number or None
+            values[field.name] = -1.0
+            continue
         values[field.name] = changed(value) if dataclasses.is_dataclass(value) else other(value)
     return type(config)(**values)
 
@@ -65,6 +68,7 @@ def test_the_command_line_reaches_every_option_of_the_parts() -> None:
     config = parsed(
         *("--bag", "a", "--bag", "b", "--topic", "/k", "--keypoint-layout", "coco17"),
         *("--min-confidence", "0.25", "--mapping", "m.yaml", "--image-width", "640"),
+        *("--missing-value", "-1", "--min-score", "0.5", "--category", "person"),
         *("--image-height", "480", "--stride", "2", "--camera-seed", "3", "--all-trials"),
         *("--subjects", "02", "03", "--object", "human17", "--name", "mine", "--output", "out"),
         *("--threads", "3", "--resume", "--steps", "7", "--widths", "8", "4", "--scale", "none"),
@@ -78,6 +82,9 @@ def test_the_command_line_reaches_every_option_of_the_parts() -> None:
             keypoint_layout="coco17",
             min_confidence=0.25,
             mapping="m.yaml",
+            missing_value=-1.0,
+            min_score=0.5,
+            category="person",
             image_width=640,
             image_height=480,
             subjects=("02", "03"),
