@@ -30,10 +30,13 @@ AZIMUTHS = (0.0, 120.0, 240.0)  # degrees, of the cameras around the person
 CMU_CAMERA = Intrinsics((900.0, 900.0), (640.0, 480.0))
 HEIGHT, DISTANCE = 1.4, 4.0  # m, of the camera and from it to the nearest point of the motion
 STILL_FRAMES, STILL_POSES = 45, 8  # frames that a pose is held, poses of a trial
-NOISE, NOISE_TIME = 0.04, 0.1  # of the RMS radius per coordinate; seconds that it stays alike
-DROPOUTS, DROPOUT_TIME = 0.05, 0.2  # share of the keypoints, mean duration in seconds
+NOISE, NEW_NOISE, NOISE_TIME = 0.032, 0.1, 0.4
+"""Of simulated detections: standard deviation of a coordinate in RMS radii, share of its variance
+that is new in each frame, seconds that the rest stays alike; as measured on shelf_dev, like the
+next two lines."""
+DROPOUTS, DROPOUT_TIME = 0.09, 0.37  # share of the keypoints, mean duration in seconds
+WRONG, WRONG_TIME, WRONG_STEP = 0.01, 0.2, 0.25  # the same, and their error in RMS radii
 _SIDES = ("left", "right")
-WRONG, WRONG_STEP = 0.01, 0.25  # share of wrong keypoints, and their error in RMS radii
 HUMANEVA15 = KeypointLayout(
     "humaneva15",
     (
@@ -90,7 +93,7 @@ def people_scenes(data: Path, output: Path, stride: int = 1) -> Iterator[tuple[s
     else:
         print(f"no {shelf}: no rows of {SHELF}")
     if humaneva.exists():
-        exact = list(humaneva_tracks(humaneva))[::stride]
+        exact = list(humaneva_tracks(humaneva, stride))
         yield HUMANEVA, exact
         yield HUMANEVA_NOISY, [noisy(track, seed) for seed, track in enumerate(exact)]
     else:
@@ -139,12 +142,12 @@ def shelf_tracks(file: Path) -> Iterator[Track]:
             )
 
 
-def humaneva_tracks(file: Path) -> Iterator[Track]:
-    """Yield each sequence in each view of a file of HumanEva."""
+def humaneva_tracks(file: Path, stride: int = 1) -> Iterator[Track]:
+    """Yield every stride-th sequence in each view of a file of HumanEva."""
     with np.load(file) as arrays:
         a = dict(arrays)
     limbs = [HUMANEVA15.index(joint) for joint in JOINTS]
-    for sequence in np.unique(a["sequence"]):
+    for sequence in np.unique(a["sequence"])[::stride]:
         frames = np.flatnonzero(a["sequence"] == sequence)
         for view in range(a["points"].shape[1]):
             yield Track(
@@ -231,19 +234,16 @@ def noisy(track: Track, seed: int) -> Track:
     f, q = track.confidence.shape
     steps = np.diff(track.seconds, prepend=track.seconds[0])
     size = np.sqrt(np.square(track.points - track.points.mean(1, keepdims=True)).sum(2).mean(1))
-    noise, scattered = np.zeros((f, q, 2)), rng.standard_normal((f, q, 2))
-    value, hidden = rng.standard_normal((q, 2)), rng.random(q) < DROPOUTS
-    missing = np.zeros((f, q), bool)
+    missing = _bursts(rng, steps, q, DROPOUTS, DROPOUT_TIME)
+    wrong = _bursts(rng, steps, q, WRONG, WRONG_TIME)
+    lasting, value = np.zeros((f, q, 2)), rng.standard_normal((q, 2))
     for i, step in enumerate(steps):
         kept = np.exp(-step / NOISE_TIME)
         value = kept * value + np.sqrt(1 - kept**2) * rng.standard_normal((q, 2))
-        noise[i] = (value + scattered[i]) / np.sqrt(2)  # half of its variance is new each frame
-        ends = 1 - np.exp(-step / DROPOUT_TIME)
-        begins = ends * DROPOUTS / (1 - DROPOUTS)
-        hidden = np.where(hidden, rng.random(q) >= ends, rng.random(q) < begins)
-        missing[i] = hidden
-    wrong = rng.random((f, q)) < WRONG
-    error = NOISE * noise + WRONG_STEP * wrong[..., None] * rng.standard_normal((f, q, 2))
+        lasting[i] = value
+    scattered = rng.standard_normal((f, q, 2))
+    error = np.sqrt(NEW_NOISE) * scattered + np.sqrt(1 - NEW_NOISE) * lasting
+    error *= np.where(wrong, WRONG_STEP, NOISE)[..., None]
     points: Floats = track.points + size[:, None, None] * error
     confidence = np.where(missing, 0, track.confidence)
     at = track.layout.index
@@ -253,6 +253,27 @@ def noisy(track: Track, seed: int) -> Track:
         confidence[:, at(middle)] = confidence[:, sides].min(1)
     shown = np.where(confidence[..., None] > 0, points, 0)
     return track._replace(points=shown, confidence=confidence)
+
+
+def _bursts(
+    rng: np.random.Generator, steps: Floats, q: int, share: float, duration: float
+) -> NDArray[np.bool_]:
+    """Return which of q keypoints are chosen at each of f frames, for a random time each.
+
+    Args:
+        rng: draws.
+        steps: (f,) seconds since the frame before.
+        q: number of keypoints.
+        share: mean share of the chosen ones.
+        duration: mean time in seconds for which a keypoint stays chosen.
+    """
+    chosen, state = np.zeros((len(steps), q), bool), rng.random(q) < share
+    for i, step in enumerate(steps):
+        ends = 1 - np.exp(-step / duration)
+        begins = ends * share / (1 - share)
+        state = np.where(state, rng.random(q) >= ends, rng.random(q) < begins)
+        chosen[i] = state
+    return chosen
 
 
 def _with_middles(limbs: Floats) -> Floats:

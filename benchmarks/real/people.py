@@ -28,11 +28,12 @@ from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17, MEDIAPIPE33, MPII16
-from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, LiftingOptions, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.observation import to_observation, without_border
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
-from deep_nrsfm_ros.messages.pipeline import InputOptions
+from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, rotation_vector
@@ -72,8 +73,8 @@ LEGEND = {
     "hearsay; the truth is triangulated",
     "humaneva_s1": "motion capture of subject 1 of HumanEva before 3 cameras, 60 Hz; keypoints by "
     "projection",
-    "noise": "4 % of the size, half of it new in each frame, 5 % of the joints missing for 0.2 s, "
-    "1 % wrong by 25 % of the size",
+    "noise": "like that of shelf_dev: 3.2 % of the size, of which little is new in each frame, 9 % "
+    "of the joints missing for 0.4 s, 1 % wrong by 25 % of the size",
     "clip": "pose2sim, 4 cameras, 60 Hz. Balancing: OpenPose BODY_25B, triangulated truth. "
     "Standing: MediaPipe's keypoints and truth triangulated from them",
     "CMU 03, 131": "motion capture that `human` was not trained on, before 3 simulated cameras 4 m "

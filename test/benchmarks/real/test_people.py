@@ -82,7 +82,7 @@ def test_noise_hides_and_moves_keypoints(walking: Any) -> None:
     limbs = shown[:, LIMBS]
     assert 1 - limbs.mean() == pytest.approx(people_scenes.DROPOUTS, rel=0.3)
     ends = (~limbs[:-1] & limbs[1:]).sum() / (~limbs).sum()
-    assert 1 / (ends * people_scenes.CMU_RATE) == pytest.approx(0.2, rel=0.3)
+    assert 1 / (ends * people_scenes.CMU_RATE) == pytest.approx(people_scenes.DROPOUT_TIME, rel=0.3)
     size = np.sqrt(np.square(exact.points - exact.points.mean(1, keepdims=True)).sum(2).mean(1))
     error = ((track.points - exact.points) / size[:, None, None])[:, LIMBS][limbs]
     assert np.sqrt(np.median(error**2) / 0.455) == pytest.approx(people_scenes.NOISE, rel=0.1)
