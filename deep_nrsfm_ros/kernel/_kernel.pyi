@@ -62,7 +62,7 @@ def network_forward(
     Args:
         pool: as `worker_pool` returned it.
         weights: float32, in the order of `Network.trainable_weights`.
-        x: (n, p, 2) float32, the network's input.
+        x: (n, 2, p) float32, the network's input.
         activations: output (n, activations_per_frame) float32.
         S: output (n, 3, p) float32.
         M_T: output (n, 2, 3) float32.

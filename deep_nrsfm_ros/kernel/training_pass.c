@@ -156,7 +156,7 @@ static void forward_block(Worker *w, int n, const float *x, float *memory, float
     const int p = sizes->p, wide = sizes->wide, layers = sizes->layers, *filled = sizes->filled;
     float *rows = sizes->whitened ? w->spare[0] : kept.x;
     for (int row = 0; row < 2 * n; row++)
-        for (int i = 0; i < p; i++) rows[row * wide + i] = x[2 * (row / 2 * p + i) + row % 2];
+        memcpy(rows + row * wide, x + row * p, p * sizeof(float));
     if (sizes->whitened) product(2 * n, rows, wide, w->L, NULL, 0, kept.x);
     product(2 * n, kept.x, wide, w->encoder[0], w->b[0], 1, kept.Psi[0]);
     for (int i = 1; i < layers; i++)

@@ -2,7 +2,7 @@
    autograd finds it. Symbols as in the legend of deep_nrsfm_ros.nrsfm; X_bar is the gradient of the loss by X.
 
    Codes of n frames are rows of a matrix, Psi_i (6 n, k_i) and psi_i (n, k_i). Shapes have the points last,
-   S (n, 3, p), and so has the input inside, (n, 2, p). All k_i and p are padded to a multiple of FLOATS, p to `wide`.
+   S (n, 3, p), and so has the input, (n, 2, p). All k_i and p are padded to a multiple of FLOATS, p to `wide`.
    The padding of matrices, biases and gradients is 0: memory starts as zeros and nothing writes there.
 */
 #ifndef TRAINING_PASS_H
@@ -67,7 +67,7 @@ unsigned long long worker_lay_out(Worker *w, const NetworkSizes *sizes, char *at
 /* Set L and its inverse (p, p). */
 void worker_set_whitening(Worker *w, const float *L, const float *L_inverse);
 
-/* Forward pass of input x (n, p, 2): set S (n, 3, p), M^T (n, 2, 3) and the activations, n * sizes.activations floats.
+/* Forward pass of input x (n, 2, p): set S (n, 3, p), M^T (n, 2, 3) and the activations, n * sizes.activations floats.
    The weights are in the order of `Network.trainable_weights`. */
 void network_forward(WorkerPool *pool, const float *weights, ptrdiff_t n, const float *x, float *activations, float *S,
                      float *M_T);

@@ -86,12 +86,12 @@ def centre(X: Floats) -> Floats:
 
 def visible_count(mask: Array) -> Array:
     """Return the number (..., 1, 1) of visible points of a mask (..., p, 1), but at least 1."""
-    return mask.sum(-2)[..., None, :].clip(1)
+    return mask.sum(-2, keepdims=True).clip(1)
 
 
 def visible_mean(X: Array, mask: Array) -> Array:
     """Return the mean (..., 1, d) of the visible points of X (..., p, d), mask (..., p, 1)."""
-    return (X * mask).sum(-2)[..., None, :] / visible_count(mask)
+    return (X * mask).sum(-2, keepdims=True) / visible_count(mask)
 
 
 def centre_visible(X: Array, mask: Array) -> Array:
@@ -109,7 +109,7 @@ def rms_radius(X: Array, mask: Array) -> Array:
         X: (..., p, d) centred points, 0 where missing; see `centre_visible`.
         mask: (..., p, 1).
     """
-    return ((X * X).sum((-2, -1))[..., None, None] / visible_count(mask)) ** 0.5
+    return ((X * X).sum((-2, -1), keepdims=True) / visible_count(mask)) ** 0.5
 
 
 def back_project(S: Array, M: Array, W: Array, fraction: float = 1.0) -> Array:

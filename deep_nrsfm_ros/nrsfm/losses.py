@@ -12,10 +12,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deep_nrsfm_ros.nrsfm.geometry import polar, spectral_norm
+from deep_nrsfm_ros.nrsfm.geometry import centre_visible, polar, spectral_norm
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Network, forward
-from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
+from deep_nrsfm_ros.nrsfm.normalisation import Normalised, Normaliser, normalise
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 
 
@@ -36,27 +36,20 @@ class Batch(NamedTuple):
 
 
 class Task(NamedTuple):
-    """The network's input of a batch, and the output that the losses compare with."""
+    """The network's input of a batch, and the output that the losses compare with.
+
+    Targets have the points last, as the network computes.
+    """
 
     x: Tensor  # (b + c, p, 2) input: b frames, then c known shapes seen by random cameras
-    W: Tensor  # (b, p, 2) target of S M of the frames, centred on the visible points
-    mask: Tensor  # (b, p, 1)
-    T: Tensor | None = None  # (c, p, 3) the known shapes, targets of S
+    W: Tensor  # (b, 2, p) target of M^T S of the frames, centred on the visible points
+    mask: Tensor | None  # (b, 1, p), 1 visible, 0 missing; None: every point is visible
+    T: Tensor | None = None  # (c, 3, p) the known shapes, centred: targets of S
 
 
 def frobenius(X: Tensor) -> Tensor:
     """Return the Frobenius norm (b,) of X (b, p, d), with a finite gradient at zero."""
     return ((X * X).sum((-2, -1)) + 1e-12).sqrt()
-
-
-def visible_centre(X: Tensor, mask: Tensor) -> Tensor:
-    """Return X (b, p, d) less its mean over the visible points, and 0 where a point is missing."""
-    return (X - visible_share(mask).mT @ X) * mask
-
-
-def visible_share(mask: Tensor) -> Tensor:
-    """Return the weights (b, p, 1) of the points in the mean over the visible ones."""
-    return mask / mask.sum(-2, keepdim=True).clamp(min=1)
 
 
 class Objective:
@@ -105,17 +98,26 @@ class Objective:
 
         Args and `generator` as in `__call__`; only the whitening of `net` is used.
         """
-        if not self.recipe.cycle:
-            known = None
-        b = len(batch.points)
-        if known is not None:
-            Q = polar(torch.randn(len(known), 2, 3, generator=generator, device=known.device))
-            replay = known @ Q.mT, torch.ones_like(known[..., :1])
-            batch = Batch(*(torch.cat(pair) for pair in zip(batch, replay, strict=True)))
-        x, W, unit = self._observe(net, batch, generator)
-        mask = batch.mask[:b]
-        T = None if known is None else known / unit[b:]
-        return Task(x, visible_centre(W[:b], mask), mask, T)
+        b, points, mask = len(batch.points), batch.points, batch.mask
+        complete = bool(mask.all())
+        if complete:
+            mask = mask[:1]  # serves all objects
+        T = known.mT.contiguous() if known is not None and self.recipe.cycle else None
+        if T is not None:
+            points = torch.cat((points.mT, _random_cameras(T, generator) @ T)).mT
+            mask = mask if complete else torch.cat((mask, torch.ones_like(T[:, :1]).mT))
+        visible = self._observe(net, Batch(points, mask), generator)
+        unit = visible.unit.expand(len(points), 1, 1)
+        if complete and not (self.recipe.noise or self.recipe.mask):
+            W = visible.W[:b]  # the target is the input
+        else:
+            W = centre_visible((points[:b] - visible.origin[:b]) / unit[:b], mask[:b])
+        return Task(
+            visible.W * visible.gain,
+            W.mT,
+            None if complete else mask[:b].mT,
+            None if T is None else T / unit[b:],
+        )
 
     def losses(self, net: Network, task: Task, S: Tensor, M: Tensor) -> Losses:
         """Return the losses of the network's output S (b + c, p, 3) and M (b + c, 3, 2) of a task.
@@ -126,62 +128,70 @@ class Objective:
         # the number of operations is the time.
         b = len(task.W)
         frames, again = torch.split(S.mT, [b, len(S) - b])
-        M, W = M[:b], task.W.mT
-        projected = M.mT @ frames  # (b, 2, p)
-        mean = projected @ visible_share(task.mask)
-        residual = torch.addcmul(W, projected - mean, task.mask.mT, value=-1)
-        total = reprojection = self._relative_error(net, residual, W)
+        M = M[:b]
+        difference = torch.baddbmm(task.W, M.mT, frames, beta=-1)  # M^T S - W, (b, 2, p)
+        if task.mask is not None:
+            difference = centre_visible(difference.mT, task.mask.mT).mT
+        total = reprojection = self._relative_error(
+            net, difference, task.W, centred=task.mask is not None
+        )
         if net.architecture.camera == "free":
             total = total + self.recipe.spectral * spectral_norm(M.mT).mean()
         cycle = torch.zeros_like(reprojection)
         if task.T is not None:
-            T = task.T.mT
-            cycle = self._relative_error(net, again - again.mean(-1, keepdim=True) - T, T)
-            total = total + self.recipe.cycle * cycle
+            cycle = self._relative_error(net, again - task.T, task.T, centred=False)
+            total = torch.add(total, cycle, alpha=self.recipe.cycle)
         if self.layout_loss:
             total = total + self.layout_loss(frames.mT, M)
         with torch.no_grad():
-            shapes = frames + M @ residual
-            # Contiguous, as a checkpoint keeps it: the layout decides the last bit of a product.
-            shapes = (shapes - shapes.mean(-1, keepdim=True)).mT.contiguous()
+            shapes = torch.baddbmm(frames, M, difference, alpha=-1)
+            shapes = (shapes - shapes.mean(-1, keepdim=True)).mT
         return Losses(reprojection, cycle, total, shapes)
 
-    def _relative_error(self, net: Network, difference: Tensor, X: Tensor) -> Tensor:
-        """Return the mean of ||difference|| / ||X||, both (b, d, p) and weighed."""
-        error, size = self._weighed_norm(net, difference), self._weighed_norm(net, X)
+    def _relative_error(
+        self, net: Network, difference: Tensor, X: Tensor, *, centred: bool
+    ) -> Tensor:
+        """Return the mean of ||C difference|| / ||X||, both (b, d, p) and weighed.
+
+        C subtracts the mean of all points, unless the difference is `centred` on the visible ones.
+        """
+        error, size = self._weighed_norm(net, difference, centred), self._weighed_norm(net, X, True)
         # A frame without an extent has no error either.
         return (error / size.clamp(min=1e-6)).mean()
 
-    def _weighed_norm(self, net: Network, X: Tensor) -> Tensor:
-        """Return ||L X^T|| (b,), or ||X||, for X (b, d, p)."""
+    def _weighed_norm(self, net: Network, X: Tensor, centred: bool) -> Tensor:
+        """Return ||L C X^T|| (b,), or ||C X^T||, for X (b, d, p); C as in `_relative_error`."""
         rows = X.reshape(-1, X.shape[-1])
         if self.whitened and net.architecture.whitening:
-            rows = rows @ net.L
+            rows = rows @ (net.L if centred else net.L - net.L.mean(0))
+        elif not centred:
+            rows = rows - rows.mean(-1, keepdim=True)
         norm: Tensor = torch.linalg.vector_norm(rows.reshape(len(X), -1), dim=1)
         return norm
 
-    def _observe(
-        self, net: Network, batch: Batch, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the network's input, the target of its reprojection, and the unit (b, 1, 1).
+    def _observe(self, net: Network, batch: Batch, generator: torch.Generator) -> Normalised:
+        """Return the network's input, noisy and incomplete by the recipe.
 
-        The input is noisy and incomplete by the recipe; the target is the frame itself.
+        A mask (1, p, 1) serves all objects.
         """
         points, mask = batch
         device = points.device
         if self.recipe.noise:
             noise = torch.randn(points.shape, generator=generator, device=device)
             level = torch.rand(len(points), generator=generator, device=device)
-            size = frobenius(visible_centre(points, mask)) / frobenius(noise)
+            size = frobenius(centre_visible(points, mask)) / frobenius(noise)
             points = points + (self.recipe.noise * level * size)[:, None, None] * noise
         if self.recipe.mask:
             level = self.recipe.mask * torch.rand(
                 (len(points), 1, 1), generator=generator, device=device
             )
-            mask = mask * (torch.rand(mask.shape, generator=generator, device=device) >= level)
-        visible = normalise(net, self.normaliser, points, mask)
-        return (
-            visible.W * visible.gain,
-            (batch.points - visible.origin) / visible.unit,
-            visible.unit,
-        )
+            hidden = torch.rand((*points.shape[:2], 1), generator=generator, device=device) < level
+            mask = mask * ~hidden
+        return normalise(net, self.normaliser, points, mask)
+
+
+def _random_cameras(like: Tensor, generator: torch.Generator) -> Tensor:
+    """Return a uniformly random M^T (c, 2, 3) for each of c objects, on the device of `like`."""
+    A = torch.randn(len(like), 2, 3, generator=generator, device=like.device)
+    # NumPy needs half of torch's time for arrays this small.
+    return torch.from_numpy(polar(A.numpy())) if A.device.type == "cpu" else polar(A)

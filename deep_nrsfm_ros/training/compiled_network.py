@@ -64,7 +64,7 @@ class CompiledNetwork:
             ValueError: the shapes are not those of the network.
             RuntimeError: another call is running.
         """
-        S, M_T = NetworkFunction.apply(weights, W, self)  # type: ignore[no-untyped-call]
+        S, M_T = NetworkFunction.apply(weights, W.mT, self)  # type: ignore[no-untyped-call]
         return S.mT, M_T.mT
 
 
@@ -77,13 +77,13 @@ class NetworkFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, weights: Tensor, W: Tensor, network: CompiledNetwork
+        ctx: Any, weights: Tensor, W_T: Tensor, network: CompiledNetwork
     ) -> tuple[Tensor, Tensor]:
-        """Return S (b, 3, p) and M^T (b, 2, 3)."""
-        b, p = W.shape[:2]
-        S, M_T = W.new_empty(b, 3, p), W.new_empty(b, 2, 3)
-        activations = W.new_empty(b, network.activations_per_frame)
-        arrays = (_array(tensor) for tensor in (weights, W, activations, S, M_T))
+        """Return S (b, 3, p) and M^T (b, 2, 3) of W^T (b, 2, p)."""
+        b, p = len(W_T), W_T.shape[-1]
+        S, M_T = W_T.new_empty(b, 3, p), W_T.new_empty(b, 2, 3)
+        activations = W_T.new_empty(b, network.activations_per_frame)
+        arrays = (_array(tensor) for tensor in (weights, W_T, activations, S, M_T))
         _kernel.network_forward(network.pool, *arrays)
         ctx.network = network
         ctx.save_for_backward(weights, activations)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.nrsfm.geometry import centre_visible
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
-from deep_nrsfm_ros.nrsfm.losses import visible_centre
 from deep_nrsfm_ros.nrsfm.network import Network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
@@ -288,7 +288,7 @@ def _frames_with_extent(points: NDArray[np.float32], visible: NDArray[np.bool_])
     frames = FrameStore.of(points, visible)
     extent, done = np.zeros(len(frames), np.float32), 0
     for block, mask in frames.batches():
-        norms = visible_centre(block, mask).norm(dim=(-2, -1))
+        norms = centre_visible(block, mask).norm(dim=(-2, -1))
         rounding = _ROUNDING * (block * mask).abs().amax(dim=(-2, -1))
         extent[done : done + len(norms)] = torch.where(norms > rounding, norms, 0.0).numpy()
         done += len(norms)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.losses import Batch, Losses, Objective
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, complete, forward, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -103,6 +104,27 @@ def test_a_whitened_net_weighs_differences_by_its_whitening(scale: str) -> None:
     found = losses(net, (points, visible), PLAIN, scale, whitened=False).reprojection.item()
     assert found == pytest.approx(np.mean(plain), rel=1e-4)
     assert abs(np.mean(plain) - np.mean(whitened)) > 1e-3
+
+
+@both_scales
+@pytest.mark.parametrize("whitened", [False, True])
+def test_frames_without_a_gap_have_the_losses_of_a_mask_of_ones(scale: str, whitened: bool) -> None:
+    net = network(whitening=1.0).map(torch.from_numpy)
+    points, visible = (torch.from_numpy(array) for array in batch(incomplete=False))
+    known = torch.from_numpy(centre(np.random.default_rng(2).standard_normal((BATCH, P, 3))))
+    objective = Objective(Normaliser(scale), Recipe(), whitened=whitened)
+    frames = Batch(points.float(), visible[..., None].float())
+    single = net.map(torch.Tensor.float)
+    task = objective.task(single, frames, known.float(), torch.Generator().manual_seed(5))
+    assert task.mask is None and task.T is not None
+    task = task._replace(x=task.x.double(), W=task.W.double(), T=task.T.double())
+    outputs = [output.requires_grad_() for output in forward(net, task.x)]
+    results = []
+    for mask in (None, torch.ones(BATCH, 1, P, dtype=torch.float64)):
+        found = objective.losses(net, task._replace(mask=mask), *outputs)
+        results.append((*found, *torch.autograd.grad(found.total, outputs)))
+    for fast, masked in zip(*results, strict=True):
+        torch.testing.assert_close(fast, masked)
 
 
 def test_what_a_missing_point_holds_does_not_matter() -> None:

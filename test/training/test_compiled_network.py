@@ -59,10 +59,10 @@ def random_task(p: int, b: int, c: int, missing: float, seed: int) -> Task:
     """Return a task of b frames and c known shapes."""
     generator = torch.Generator().manual_seed(seed)
     x, W, T = (
-        torch.randn(*shape, generator=generator) for shape in ((b + c, p, 2), (b, p, 2), (c, p, 3))
+        torch.randn(*shape, generator=generator) for shape in ((b + c, p, 2), (b, 2, p), (c, 3, p))
     )
-    mask = (torch.rand((b, p, 1), generator=generator) >= missing).float()
-    return Task(x, W * mask, mask, T if c else None)
+    mask = (torch.rand((b, 1, p), generator=generator) >= missing).float()
+    return Task(x, W * mask, mask if missing else None, T if c else None)
 
 
 def layout(p: int) -> KeypointLayout:
