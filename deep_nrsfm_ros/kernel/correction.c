@@ -151,15 +151,17 @@ static void add_rows(Plan *k, const Object *o, double size, const double *uprigh
         }
         const int *ends = k->bone_ends + 2 * b;
         const double *bone = o->bones + 2 * b, *g = k->bone_directions + 4 * b;
-        double spread = size * bone[1], shortfall = size * bone[0] - g[3];
+        const double *correlation = k->bone_correlation + (size_t)k->bones * b;
+        double shortfall = size * bone[0] - g[3];
         for (int r = 0; r < 3; r++) shortfall += g[r] * (k->E[r * p + ends[0]] - k->E[r * p + ends[1]]);
         for (int c = b; c < k->bones; c++) {
             const int *other_ends = k->bone_ends + 2 * c;
             const double *h = k->bone_directions + 4 * c;
-            row[c] = size * size * bone[0] * o->bones[2 * c];
+            const double *other = o->bones + 2 * c;
+            row[c] = size * size * (bone[0] * other[0] + correlation[c] * bone[1] * other[1]);
             for (int r = 0; r < 3; r++) row[c] += h[r] * (along[r * p + other_ends[0]] - along[r * p + other_ends[1]]);
         }
-        row[b] += spread * spread + 1e-12 * k->unknown_variance;
+        row[b] += 1e-12 * k->unknown_variance;
         row[wide] = shortfall;
     }
 }

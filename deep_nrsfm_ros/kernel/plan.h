@@ -67,6 +67,7 @@ typedef struct {
     const float *error_std, *covariance;                                 /* (p), (p, 3, 3, p) in DOUBLES */
     const double *completion, *image_rotations, *object_frame;           /* (p, p), (rotations, 2, 2), (3, 3) */
     const double *calibration, *bone_lengths;                            /* (5), (bones, 2) length and deviation */
+    const double *bone_correlation;                                      /* (bones, bones), symmetric */
     const double *axis;                                                  /* (p) from bottom to top */
     Past past;
     double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, residual_offset,

@@ -7,6 +7,9 @@
 /* Rows of a product, at most: the codes of more do not stay in the cache. */
 #define MAX_ROWS 144
 
+/* Of two lengths; rounding may take the 1 of a length with itself a little above it. */
+#define MAX_CORRELATION 1.001
+
 #define HEADER_LENGTH 13
 
 static int in_range(int value, int first, int last) { return first <= value && value <= last; }
@@ -101,6 +104,7 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     k->object_frame = d, d += take(&d_items, 9, 1);
     k->calibration = d, d += take(&d_items, 5, 1);
     k->bone_lengths = d, d += take(&d_items, k->bones, 2);
+    k->bone_correlation = d, d += take(&d_items, k->bones, k->bones);
     k->axis = d, d += take(&d_items, p, 1);
     const double *past = d;
     d += take(&d_items, PAST_NUMBERS, 1);
@@ -122,6 +126,8 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     }
     for (int i = 0; i < 2 * k->bones; i++)
         if (!(k->bone_lengths[i] > 0 && k->bone_lengths[i] < INFINITY)) return "the length of a bone is not positive and finite";
+    for (size_t i = 0; i < (size_t)k->bones * k->bones; i++)
+        if (!(fabs(k->bone_correlation[i]) <= MAX_CORRELATION)) return "a correlation of bones is above 1";
     return NULL;
 }
 

@@ -66,7 +66,10 @@ class CompiledBackend:
         floats += [rows]
         doubles = [completion_matrix(net), constants.test_time_rotations, constants.object_frame]
         axis = np.zeros(p) if constants.axis is None else constants.axis
-        doubles += [CALIBRATED, np.stack(bones[1:], 1), axis, _past_constants(constants.history)]
+        correlation = bones.correlation
+        doubles += [CALIBRATED, np.stack((bones.lengths, bones.spread), 1)]
+        doubles += [np.eye(len(bones.lengths)) if correlation is None else correlation]
+        doubles += [axis, _past_constants(constants.history)]
         doubles += [
             constants.noise,
             constants.reference_length,

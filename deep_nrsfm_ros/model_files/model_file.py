@@ -65,6 +65,7 @@ class Model:
         bone_lengths: (b, 2) mean and standard deviation of the length of each bone of the
             layout, as shares of the sum of all lengths (see `nrsfm/bones.py`); (0, 2) if they
             were not measured.
+        bone_correlation: (b, b) of these lengths; (0, 0): they vary independently.
     """
 
     name: str
@@ -76,6 +77,9 @@ class Model:
     quality: dict[str, Any] = field(default_factory=dict)
     error_covariance: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     bone_lengths: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    bone_correlation: NDArray[np.float32] = field(
+        default_factory=lambda: np.zeros((0, 0), np.float32)
+    )
 
     def __post_init__(self) -> None:
         """Set the error covariance to the identity if it is empty."""
@@ -89,7 +93,10 @@ class Model:
         if not len(self.bone_lengths):
             return None
         ends = np.array(self.layout.bone_indices(), np.int32).T
-        return Bones(ends, *self.bone_lengths.astype(np.float64).T)
+        correlation = (
+            self.bone_correlation.astype(np.float64) if self.bone_correlation.size else None
+        )
+        return Bones(ends, *self.bone_lengths.astype(np.float64).T, correlation)
 
 
 def save_model(path: Path, model: Model) -> None:
@@ -107,6 +114,8 @@ def save_model(path: Path, model: Model) -> None:
     weights["error_covariance"] = np.ascontiguousarray(model.error_covariance, np.float32)
     if len(model.bone_lengths):
         weights["bone_lengths"] = np.ascontiguousarray(model.bone_lengths, np.float32)
+    if model.bone_correlation.size:
+        weights["bone_correlation"] = np.ascontiguousarray(model.bone_correlation, np.float32)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -236,7 +245,10 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     p = len(layout)
     shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
     if "bone_lengths" in weights:  # older files have none
-        shapes["bone_lengths"] = (len(layout.bone_indices()), 2)
+        b = len(layout.bone_indices())
+        shapes["bone_lengths"] = (b, 2)
+        if "bone_correlation" in weights:  # models that did not measure it have none
+            shapes["bone_correlation"] = (b, b)
     for name, shape in shapes.items():
         weight = weights[name]
         if weight.shape != shape or weight.dtype != np.float32:
@@ -259,6 +271,14 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     bone_lengths = weights.get("bone_lengths", np.zeros((0, 2), np.float32))
     if not (bone_lengths > _SMALLEST).all():
         raise ValueError(f"bone_lengths are not all above {_SMALLEST:g}")
+    correlation = weights.get("bone_correlation", np.zeros((0, 0), np.float32))
+    if correlation.size:
+        if not (np.abs(correlation - correlation.T) <= 1e-5).all():
+            raise ValueError("bone_correlation is not symmetric")
+        if not (np.abs(correlation.diagonal() - 1) <= 1e-4).all():
+            raise ValueError("bone_correlation is not 1 on its diagonal")
+        if not np.linalg.eigvalsh(correlation)[0] > 0:
+            raise ValueError("bone_correlation is not positive definite")
     return Model(
         str(header["name"]),
         Network.from_named_weights(architecture, weights),
@@ -269,6 +289,7 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
         dict(header["quality"]),
         covariance,
         bone_lengths,
+        correlation if "bone_lengths" in weights else correlation[:0, :0],
     )
 
 

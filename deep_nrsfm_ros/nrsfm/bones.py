@@ -29,11 +29,14 @@ class Bones(NamedTuple):
         lengths: (b,) mean lengths, relative to the sum of all; 0.05 typical. (n, b) where each of
             n objects has its own.
         spread: (b,) or (n, b) standard deviations of the lengths, in the same unit.
+        correlation: (b, b) of the lengths: a person with a long left shin has a long right one.
+            None: they are independent.
     """
 
     ends: NDArray[np.int32]
     lengths: NDArray[np.float64]
     spread: NDArray[np.float64]
+    correlation: NDArray[np.float64] | None = None
 
     def length_constraint(self, X: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the linearised bone-length constraint G e = r for a correction e of each shape.
@@ -59,9 +62,10 @@ class Bones(NamedTuple):
         directions = edges / np.maximum(measured, 1e-9)[..., None]
         G[:, range(b), i] = directions
         G[:, range(b), j] = -directions
-        # The outer product is the variance of the unknown size of the object.
+        correlation = np.eye(b) if self.correlation is None else self.correlation
+        # The first product is the variance of the unknown size of the object.
         covariance = L[:, :, None] * L[:, None]
-        covariance[:, range(b), range(b)] += spread**2
+        covariance += correlation * spread[:, :, None] * spread[:, None]
         residual = size[:, None] * L - measured
         return G.reshape(n, b, 3 * p), residual, size[:, None, None] ** 2 * covariance
 

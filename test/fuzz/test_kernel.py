@@ -92,7 +92,7 @@ def plan(spoiler: Spoiler, network: Sizes | None = None) -> Arguments:
         before, filled = widths[i - 1], lined(width, panels)
         to, back = (filled, lined(before, panels)) if i else (3 * filled, 3 * wide)
         n += (before if i else p) * to + filled + (width + 1) * back
-    doubles = [*floats(spoiler, p * p + 4 * rotations + 14), *[0.5] * (2 * bones)]
+    doubles = [*floats(spoiler, p * p + 4 * rotations + 14), *[0.5] * (2 * bones + bones * bones)]
     doubles += [*np.nan_to_num(floats(spoiler, p), posinf=1, neginf=1), *[0.5] * (PAST + 8)]
     return [np.array(header, np.int32), floats(spoiler, n), np.array(doubles, np.float64)]
 

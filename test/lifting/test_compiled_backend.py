@@ -52,10 +52,13 @@ def model(
     covariance = (0.01 * np.eye(3 * p) + 0.003 * B @ B.T / p).astype(np.float32)
     b = len(layout.bone_indices())
     lengths, spread = rng.uniform(0.01, 0.2, (2, b))
+    together = np.c_[np.eye(b), rng.standard_normal((b, 3))]
+    together /= np.linalg.norm(together, axis=1, keepdims=True)
     return Model(
         *("random", network, layout, Normaliser(scale), frame),
         error_covariance=covariance,
         bone_lengths=np.stack((lengths, spread), 1).astype(np.float32),
+        bone_correlation=(together @ together.T).astype(np.float32),
     )
 
 

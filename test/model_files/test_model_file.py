@@ -197,6 +197,41 @@ def test_bones_have_a_length(file: Path, value: float) -> None:
     assert "bone_lengths are not all above" in refused(file)
 
 
+def correlation(value: float) -> np.ndarray:
+    """Return the correlation of the bones of HUMAN17, `value` between each two."""
+    b = len(HUMAN17.bone_indices())
+    return (value + (1 - value) * np.eye(b)).astype(np.float32)
+
+
+def test_the_correlation_of_bones_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "mine.safetensors"
+    save_model(path, dataclasses.replace(model(), bone_correlation=correlation(0.5)))
+    bones = load_model(path).bones
+    assert bones is not None and bones.correlation is not None
+    np.testing.assert_array_equal(bones.correlation, correlation(0.5))
+    save_model(path, model())
+    without = load_model(path).bones
+    assert without is not None and without.correlation is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (correlation(0.5)[:3, :3], "bone_correlation is float32 (3, 3)"),
+        (correlation(0.5) + np.triu(np.full_like(correlation(0), 0.1), 1), "is not symmetric"),
+        (2 * correlation(0.5), "is not 1 on its diagonal"),
+        (correlation(1.0), "is not positive definite"),
+        (correlation(0.5) * np.float32(np.nan), "has a number that is not below"),
+    ],
+)
+def test_a_damaged_correlation_is_refused(file: Path, wrong: np.ndarray, reason: str) -> None:
+    def change(header: Any, weights: Any, metadata: Any) -> None:
+        weights["bone_correlation"] = wrong
+
+    rewrite(file, change)
+    assert reason in refused(file)
+
+
 def test_a_file_that_knows_nothing_of_bones_is_read(file: Path) -> None:
     def change(header: Any, weights: Any, metadata: Any) -> None:
         del weights["bone_lengths"]

@@ -99,6 +99,21 @@ def test_lengths_tell_the_depth_that_the_network_has_flattened() -> None:
     np.testing.assert_allclose(wrong(100.0), without, atol=1e-3)  # no bones, these
 
 
+def test_a_correlation_lets_bones_grow_together() -> None:
+    """A long thigh is no surprise where the other one is long too."""
+    X = np.random.default_rng(0).standard_normal((1, P, 3))
+    bones = bones_of(X[0], 0.1)
+    together = np.eye(len(EDGES))
+    together[0, 1] = together[1, 0] = 0.9
+    _, _, alone = bones.length_constraint(X)
+    _, _, pair = bones._replace(correlation=together).length_constraint(X)
+    spread = 0.1 * lengths(X)[0]
+    both, opposite = np.array([1, 1, 0, 0]) * spread, np.array([1, -1, 0, 0]) * spread
+    surprise = [[x @ np.linalg.solve(C[0], x) for C in (alone, pair)] for x in (both, opposite)]
+    assert surprise[0][1] < 0.8 * surprise[0][0]
+    assert surprise[1][1] > 5 * surprise[1][0]
+
+
 def test_points_in_one_place_have_no_direction_and_do_no_harm() -> None:
     S, M = np.zeros((1, P, 3)), random_cameras(1, np.random.default_rng(0))
     bones = bones_of(np.random.default_rng(0).standard_normal((P, 3)))
