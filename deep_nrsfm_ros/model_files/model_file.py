@@ -93,10 +93,9 @@ class Model:
         if not len(self.bone_lengths):
             return None
         ends = np.array(self.layout.bone_indices(), np.int32).T
-        correlation = (
-            self.bone_correlation.astype(np.float64) if self.bone_correlation.size else None
-        )
-        return Bones(ends, *self.bone_lengths.astype(np.float64).T, correlation)
+        lengths, spread = self.bone_lengths.astype(np.float64).T
+        correlation = self.bone_correlation.astype(np.float64)
+        return Bones(ends, lengths, spread, correlation if correlation.size else None)
 
 
 def save_model(path: Path, model: Model) -> None:
