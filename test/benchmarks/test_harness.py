@@ -144,8 +144,13 @@ def test_goes_on_where_it_stopped(
     ids=["seed", "recipe", "architecture", "normaliser", "frames", "points", "visible"],
 )
 def test_another_training_is_another(
-    session: Session, dataset: Dataset, preset: Preset, change: Any
+    session: Session,
+    dataset: Dataset,
+    preset: Preset,
+    change: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(harness, "SNAPSHOTS", 1)
     session.trained("a title", dataset, preset)
     session.trained("a title", *change(dataset, preset))
     assert len(list(session.output.glob("models/a-title-*"))) == 2

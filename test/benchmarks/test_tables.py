@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks import harness
 from benchmarks.baselines import batches
 from benchmarks.harness import Session
 from benchmarks.paper import ablation, coherence, mirrored_frames, table1_cmu, table3_unseen
@@ -45,6 +46,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         small = dataclasses.replace(preset.architecture, widths=(8, 4))
         monkeypatch.setitem(PRESETS, name, preset._replace(architecture=small))
     monkeypatch.setattr(batches, "RANKS", (2,))
+    monkeypatch.setattr(harness, "SNAPSHOTS", 2)
     monkeypatch.setattr(table3_unseen, "TRAINED_ON", {"86": ("86",), "union": ("01", "86")})
 
 
