@@ -11,10 +11,11 @@ from typing import Any
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
+from deep_nrsfm_ros.node.gravity import GravitySources
 from deep_nrsfm_ros.node.parameter_bridge import parameter_name
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.limits import Limits
@@ -27,6 +28,9 @@ _GROUPS: tuple[tuple[str, type, str], ...] = (
     ("Model and input", InputOptions, ""),
     ("Lifting", LiftingOptions, ""),
     ("Camera", CameraOptions, ""),
+    ("Lifting over time", HistoryOptions, "history."),
+    ("Gravity", GravityOptions, "gravity."),
+    ("Gravity: sources", GravitySources, "gravity."),
     ("Smoothing", SmoothingOptions, "smoothing."),
     ("Training: data and result", TrainingOptions, "train."),
     ("Training: recipe", Recipe, "train."),

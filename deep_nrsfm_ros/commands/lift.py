@@ -23,13 +23,14 @@ from deep_nrsfm_ros.data.camera_file import read_camera_file, read_image_size
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import KINDS, read_keypoints
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
+from deep_nrsfm_ros.data.over_time import CAUSAL, SMOOTH, OverTime
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, lift_recording
 from deep_nrsfm_ros.data.resolve_layout import resolve_layout
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import GravityOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import Finding, Size, is_person
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
@@ -102,6 +103,15 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     add_arguments(parser, ReadOptions)
     add_arguments(parser, InputOptions, without=_NODE_ONLY_OPTIONS)
     add_arguments(parser, LiftingOptions)
+    parser.add_argument(
+        "--smooth",
+        default=CAUSAL,
+        choices=SMOOTH,
+        help="how the frames of an object help each other: causal = those so far, as in the node; "
+        "both = those before and after, at three times the time; none = each frame by itself "
+        "(default: %(default)s)",
+    )
+    add_arguments(parser, GravityOptions)
 
 
 def read_model(args: argparse.Namespace) -> tuple[Model, KeypointLayout | None]:
@@ -206,8 +216,9 @@ def lift_objects(
     """Return the recording of the objects, lifted with the options of the command line."""
     lifter = Lifter(model, override(LiftingOptions(), args))
     intrinsics = read_camera(args).intrinsics
+    over_time = OverTime(args.smooth, override(GravityOptions(), args).direction)
     with progress("lifting") as on_progress:
-        return lift_recording(detections, source, lifter, on_progress, intrinsics)
+        return lift_recording(detections, source, lifter, on_progress, intrinsics, over_time)
 
 
 def summary_of(

@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.detections import Detections, gather
 from deep_nrsfm_ros.data.lifted_bags import LiftedMessage
+from deep_nrsfm_ros.data.over_time import NONE, OverTime, is_in_time, lift_stream, stream_of
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
-from deep_nrsfm_ros.nrsfm.geometry import centre, weak_perspective
+from deep_nrsfm_ros.lifting.tracking import keypoint_tolerances
+from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, weak_perspective
+
+_CAUSAL = OverTime()
 
 _MAX_DELAY = 50_000_000  # ns between the stamps of keypoints and points of one frame
 
@@ -51,8 +56,11 @@ def lift_recording(
     lifter: Lifter,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     intrinsics: Intrinsics | None = None,
+    over_time: OverTime = _CAUSAL,
 ) -> Recording:
     """Lift all objects of a recording.
+
+    Frames that do not follow each other, as unrelated images, are lifted each by itself.
 
     Args:
         detections: 2D keypoints in pixels.
@@ -61,6 +69,7 @@ def lift_recording(
         on_progress: called with the number of objects done and their total number.
         intrinsics: of the camera, so that shapes are at their position in front of it; None =
             each shape is centred at the origin.
+        over_time: how the frames help each other.
 
     Raises:
         ValueError: too few keypoints of the layout are keypoints of the model.
@@ -68,14 +77,25 @@ def lift_recording(
     target = lifter.model.layout
     to_model = KeypointMap(source, target)
     if lifter.layout != source:
-        lifter = Lifter(lifter.model, lifter.options, layout=source)
-    lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter.lift
-    lifted = lift_all(
-        lambda points, confidence: lift(*to_model(points, confidence)),
-        detections.points,
-        detections.confidence,
-        on_progress,
-    )
+        history = lifter.constants.history
+        lifter = Lifter(lifter.model, lifter.options, layout=source, history=history)
+    points, confidence = to_model(detections.points, detections.confidence)
+    if over_time.smooth != NONE or over_time.up is not None:
+        stream = stream_of(detections, points, confidence, keypoint_tolerances(target))
+        if not is_in_time(stream):
+            over_time = over_time._replace(smooth=NONE)
+    if not len(detections) or (over_time.smooth == NONE and over_time.up is None):
+        lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter.lift
+        return Recording(
+            source, target, detections, lift_all(lift, points, confidence, on_progress)
+        )
+
+    def lift_frame(points: Floats, confidence: Floats, context: Context) -> Lifted:
+        if intrinsics:
+            return lift_perspective(lifter, intrinsics, points, confidence, context)
+        return lifter.lift(points, confidence, context=context)
+
+    lifted = lift_stream(lift_frame, lifter.memory(), stream, over_time, on_progress)
     return Recording(source, target, detections, lifted)
 
 

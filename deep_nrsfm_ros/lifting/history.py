@@ -109,15 +109,18 @@ class Memory:
         """Return the number of identities that are remembered."""
         return len(self._rows)
 
-    def __call__(self, identities: tuple[str, ...], time: float) -> Context:
+    def __call__(
+        self, identities: tuple[str, ...], time: float, up: Floats | None = None
+    ) -> Context:
         """Return the context of the objects of a message.
 
         Args:
             identities: n; "": unknown, nothing is remembered.
             time: of the message in seconds.
+            up: as in `Context`.
         """
         if identities == self._last[0]:  # as in most messages
-            return Context(self._states, self._last[1], time)
+            return Context(self._states, self._last[1], time, up)
         get = self._rows.get
         rows = [get(identity, -1) for identity in identities]
         if -1 in rows:
@@ -127,12 +130,18 @@ class Memory:
                     if rows[i] < 0:
                         rows[i] = self._add(identity, identities, time)
         self._last = identities, np.array(rows, np.int32)
-        return Context(self._states, self._last[1], time)
+        return Context(self._states, self._last[1], time, up)
 
     def row(self, identity: str) -> Floats | None:
         """Return the numbers that are remembered of an identity; None: it is not known."""
         row = self._rows.get(identity)
         return None if row is None else self._states[row]
+
+    def latest(self, most: int) -> list[str]:
+        """Return the identities that were lifted last, at most `most`, the last one first."""
+        times = {name: self._states[row, 0] for name, row in self._rows.items()}
+        lifted = [name for name, time in times.items() if time == time]
+        return sorted(lifted, key=lambda name: -times[name])[:most]
 
     def _add(self, identity: str, present: tuple[str, ...], time: float) -> int:
         """Return a row for a new identity."""

@@ -13,11 +13,11 @@ from deep_nrsfm_ros.kernel import supports
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
-from deep_nrsfm_ros.lifting.history import Context
+from deep_nrsfm_ros.lifting.history import Context, Memory, StateLayout
 from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.lifting.observation import from_arrays
 from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
-from deep_nrsfm_ros.lifting.own_bones import partner_bones
+from deep_nrsfm_ros.lifting.own_bones import Learned, own_bones, partner_bones
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -127,6 +127,42 @@ class Lifter:
             confidence: (n, p) as in `lift`.
         """
         return self._to_model.detected_count(trusted(keypoint_weight(confidence)))
+
+    def memory(self) -> Memory:
+        """Return an empty memory, for the identities of one stream."""
+        bones = self.constants.bones
+        return Memory(StateLayout(len(self.model.layout), len(bones.lengths) if bones else 0))
+
+    def learned_lengths(self, memory: Memory, identity: str) -> tuple[dict[str, float], float]:
+        """Return what is learned of an object's bones.
+
+        Args:
+            memory: of this lifter.
+            identity: of the object.
+
+        Returns:
+            The length of each bone in units of the reference length, by the names of its ends; a
+            bone of the right side has the length of the left one and is left out. And the seconds
+            of sight behind the best known length; 0: nothing is learned.
+        """
+        bones, row = self.constants.bones, memory.row(identity)
+        if bones is None or row is None or np.isnan(row[0]):
+            return {}, 0.0
+        state = StateLayout(len(self.model.layout), len(bones.lengths)).split(row[None])
+        learned = Learned(state.growth, state.evidence, state.misfit)
+        lengths = own_bones(bones, learned, self.constants.history.bones_time).lengths[0]
+        pairs = bones.ends.T.tolist()
+        reference = self.constants.reference
+        for pair, length in zip(pairs, lengths, strict=True):
+            if reference and set(pair) == set(reference):
+                lengths = lengths * (self.constants.reference_length / length)
+        names = self.model.layout.keypoints
+        shown = {
+            f"{names[a]}-{names[b]}": float(length)
+            for i, ((a, b), length) in enumerate(zip(pairs, lengths, strict=True))
+            if self.constants.bone_partners[i] >= i
+        }
+        return shown, float(state.evidence.max(initial=0))
 
     def lift(
         self,

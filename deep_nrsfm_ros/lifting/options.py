@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
 
@@ -104,3 +108,27 @@ class HistoryOptions:
         low=0.0,
         high=60.0,
     )
+
+
+@dataclass(frozen=True)
+class GravityOptions:
+    """Gravity."""
+
+    up: tuple[float, float, float] = option(
+        (0.0, 0.0, 0.0),
+        "direction against gravity in the camera's optical frame, x right, y down, z forward, of "
+        "any length: an object whose layout names top and bottom is lifted as upright as the image "
+        "allows; 0 -1 0 = a level camera, 0 -0.94 -0.34 = one that looks down by 20 degrees; a "
+        "wrong direction is worse than none; 0 0 0 = unknown",
+    )
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless `up` is three finite numbers."""
+        if len(self.up) != 3 or not all(math.isfinite(x) for x in self.up):
+            raise ValueError(f"up is {self.up}; it must be three numbers, as in 0 -1 0")
+
+    @property
+    def direction(self) -> NDArray[np.float64] | None:
+        """The unit vector (3,) against gravity; None: unknown."""
+        length = math.hypot(*self.up)
+        return np.array(self.up) / length if length else None

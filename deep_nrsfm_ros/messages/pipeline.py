@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.history import Memory
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation, without_border
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
@@ -20,11 +22,13 @@ from deep_nrsfm_ros.messages.serialised import Header, MessageReader
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.model_file import Model
 
+_DEFAULT_HISTORY = HistoryOptions()
+
 
 class Pipeline:
     """Immutable per-configuration pipeline, swapped atomically on a parameter change.
 
-    Only the filters of smoothing change from message to message.
+    Only what is remembered of identities changes from message to message.
 
     Attributes:
         model: lifts.
@@ -44,6 +48,7 @@ class Pipeline:
         inputs: InputOptions,
         lifting: LiftingOptions,
         smoothing: SmoothingOptions,
+        history: HistoryOptions = _DEFAULT_HISTORY,
     ) -> None:
         """Prepare a model and its input.
 
@@ -52,7 +57,8 @@ class Pipeline:
             detector: layout that `inputs.keypoint_layout` names; None: the model's own.
             inputs: how messages are read.
             lifting: how keypoints are lifted.
-            smoothing: how shapes are smoothed.
+            smoothing: how shapes are filtered after the correction.
+            history: what is remembered of identities.
 
         Raises:
             ValueError: the layouts of model and detector do not fit each other.
@@ -62,7 +68,9 @@ class Pipeline:
         self.edges = model.layout.edge_indices()
         self.tolerances = keypoint_tolerances(model.layout)
         self._map = KeypointMap(self.source, model.layout)
-        self._lifter = Lifter(model, lifting, layout=self.source)
+        self._lifter = Lifter(model, lifting, layout=self.source, history=history)
+        self._remembers = history.enabled and lifting.correction != "none"
+        self._memories: dict[str, Memory] = {}
         self.min_confidence = inputs.min_confidence
         self.min_score = inputs.min_score
         self.image_size = inputs.image_size
@@ -103,12 +111,28 @@ class Pipeline:
 
     @property
     def needs_identities(self) -> bool:
-        """Whether `lift` needs the identities of objects: smoothing is enabled."""
-        return self._smoothing.enabled
+        """Whether `lift` needs the identities of objects: something is remembered of them."""
+        return self._smoothing.enabled or self._remembers
 
     def restart(self, topic: str) -> None:
-        """Delete the filters of a topic, as when its stamps begin anew."""
+        """Forget all identities of a topic, as when its stamps begin anew."""
         self._smoothers.pop(topic, None)
+        self._memories.pop(topic, None)
+
+    def learned_bones(self, most: int = 8) -> dict[str, str]:
+        """Return the bone lengths that are learned of each identity, as text for diagnostics.
+
+        Args:
+            most: identities, those lifted last; 8 typical.
+        """
+        learned: dict[str, str] = {}
+        for memory in self._memories.values():
+            for identity in memory.latest(most - len(learned)):
+                lengths, seconds = self._lifter.learned_lengths(memory, identity)
+                if seconds:
+                    bones = ", ".join(f"{name} {length:.3f}" for name, length in lengths.items())
+                    learned[identity] = f"{seconds:.1f} s of sight: {bones}"
+        return learned
 
     def lift(
         self,
@@ -117,6 +141,7 @@ class Pipeline:
         identities: tuple[str, ...],
         topic: str,
         moment: Moment,
+        up: NDArray[np.float64] | None = None,
     ) -> tuple[Lifted, tuple[str, ...]]:
         """Return the lifted objects of a message, smoothed if so configured, and their identities.
 
@@ -129,15 +154,24 @@ class Pipeline:
             identities: n, unique on the topic; "" if unknown.
             topic: of the message; each topic has its own filters.
             moment: time of the message.
+            up: (3,) unit vector against gravity in the camera's axes; None: unknown.
 
         Raises:
             MessageError: there are objects, and none can be lifted.
         """
         points, confidence = observation.points, observation.confidence
+        context = None
+        if self._remembers:
+            memory = self._memories.get(topic)
+            if memory is None:
+                memory = self._memories[topic] = self._lifter.memory()
+            context = memory(identities, moment.seconds, up)
+        elif up is not None:
+            context = self._lifter.memory()(("",) * len(points), moment.seconds, up)
         if intrinsics:
-            lifted = lift_perspective(self._lifter, intrinsics, points, confidence)
+            lifted = lift_perspective(self._lifter, intrinsics, points, confidence, context)
         else:
-            lifted = self._lifter.lift(points, confidence)
+            lifted = self._lifter.lift(points, confidence, context=context)
         smoother = self._smoothers.get(topic)
         if smoother is None:
             smoother = self._smoothers[topic] = Smoother(self._smoothing)

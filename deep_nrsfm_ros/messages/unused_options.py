@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
 
+_DEFAULT_HISTORY = HistoryOptions()
+
 
 def unused_options(
-    inputs: InputOptions, lifting: LiftingOptions, smoothing: SmoothingOptions
+    inputs: InputOptions,
+    lifting: LiftingOptions,
+    smoothing: SmoothingOptions,
+    history: HistoryOptions = _DEFAULT_HISTORY,
 ) -> dict[str, str]:
     """Return a warning for each parameter of the lifter that has no effect, by its name."""
     warnings: dict[str, str] = {}
@@ -29,4 +34,11 @@ def unused_options(
                 name = f"smoothing.{field.name}"
                 text = f"{name} is {value:g} and has no effect, since smoothing.enabled is false"
                 warnings[name] = text
+    if not history.enabled or lifting.correction == "none":
+        reason = "history.enabled is false" if not history.enabled else "correction is 'none'"
+        for field in fields(HistoryOptions):
+            value = getattr(history, field.name)
+            if value != field.default and field.name != "enabled":
+                name = f"history.{field.name}"
+                warnings[name] = f"{name} is {value:g} and has no effect, since {reason}"
     return warnings

@@ -39,7 +39,7 @@ from visualization_msgs.msg import MarkerArray
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
@@ -55,6 +55,7 @@ from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameter_bridge, publishing
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
+from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
 from deep_nrsfm_ros.node.training_service import TrainingService
@@ -71,6 +72,8 @@ from deep_nrsfm_ros.training.request import (
 )
 
 _SMOOTHING = "smoothing."
+_HISTORY = "history."
+_GRAVITY = "gravity."
 _TRAIN = "train."
 _REPORT_PERIOD = 1.0  # seconds
 _FRAME_LOG_PERIOD = 60.0  # seconds
@@ -95,7 +98,10 @@ class LifterNode(Node):
         self._inputs = parameter_bridge.declare(self, InputOptions)
         parameter_bridge.declare(self, LiftingOptions)
         camera = parameter_bridge.declare(self, CameraOptions)
+        parameter_bridge.declare(self, HistoryOptions, _HISTORY)
         parameter_bridge.declare(self, SmoothingOptions, _SMOOTHING)
+        self._up = parameter_bridge.declare(self, GravityOptions, _GRAVITY).direction
+        sources = parameter_bridge.declare(self, GravitySources, _GRAVITY)
         training = parameter_bridge.declare(self, TrainingOptions, _TRAIN)
         parameter_bridge.declare(self, Recipe, _TRAIN)
         parameter_bridge.declare(self, LayoutLossWeights, _TRAIN)
@@ -116,6 +122,7 @@ class LifterNode(Node):
 
         self._frame_id = camera.frame_id
         self._camera = CameraInfoSubscription(self, camera)
+        self._gravity = GravityDirection(self, sources)
         self._tf = TransformBroadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._lifter_diagnostics = LifterDiagnostics()
         self._points = self._quiet_publisher(PointCloud2, "~/points")
@@ -180,8 +187,9 @@ class LifterNode(Node):
             header = header or self._now()
             if not header.frame_id or (self._frame_id and header.frame_id != self._frame_id):
                 header = header._replace(frame_id=self._frame(source, header.frame_id))
+            up = self._gravity(self._up, header.frame_id)
             lifted, identities = self._pipeline.lift(
-                observation, intrinsics, identities, source.topic, moment
+                observation, intrinsics, identities, source.topic, moment, up
             )
         except Exception as problem:  # one bad message must not end the node
             self._reject(source, problem)
@@ -301,6 +309,9 @@ class LifterNode(Node):
         )
         model = self._pipeline.model
         values |= {"model": model.name, "topic": ", ".join(self._keypoint_topics.topics)}
+        values["gravity"] = self._gravity.status(self._up, self._frame_id or self._camera.frame)
+        for identity, bones in self._pipeline.learned_bones().items():
+            values[f"bones of {identity}"] = bones
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
         node = self.get_fully_qualified_name()
         lifting = status(f"{node}: lifting", level, message, values, node)
@@ -358,6 +369,7 @@ class LifterNode(Node):
         """Return the pipeline for the parameters after `changes`; raise ValueError if invalid."""
         inputs = parameter_bridge.read(self, InputOptions, changes=changes)
         self._training_parameters(changes)
+        parameter_bridge.read(self, GravityOptions, _GRAVITY, changes)
         # A file is read only when its parameter is set: it may have been deleted since.
         changed = {change.name for change in changes} or {"model", "keypoint_layout"}
         model: Model
@@ -387,6 +399,7 @@ class LifterNode(Node):
             parameter_bridge.read(self, InputOptions, changes=changes),
             parameter_bridge.read(self, LiftingOptions, changes=changes),
             parameter_bridge.read(self, SmoothingOptions, _SMOOTHING, changes),
+            parameter_bridge.read(self, HistoryOptions, _HISTORY, changes),
         )
 
     def _layout_so_far(self, model: Model) -> KeypointLayout | None:
@@ -416,6 +429,7 @@ class LifterNode(Node):
             self._auto, self._chosen = search, None
             self._stream.restart(search=search)
         self._pipeline = self._proposed
+        self._up = parameter_bridge.read(self, GravityOptions, _GRAVITY).direction
         for warning in self._unused_options(changes):
             self.get_logger().warning(warning)
 
@@ -425,6 +439,7 @@ class LifterNode(Node):
             parameter_bridge.read(self, InputOptions, changes=changes or ()),
             parameter_bridge.read(self, LiftingOptions, changes=changes or ()),
             parameter_bridge.read(self, SmoothingOptions, _SMOOTHING, changes or ()),
+            parameter_bridge.read(self, HistoryOptions, _HISTORY, changes or ()),
         )
         if changes is not None:
             names = {change.name for change in changes}

@@ -8,6 +8,7 @@ A parameter's default, range and description stand in the dataclass: `lifting/op
 from __future__ import annotations
 
 import difflib
+from array import array
 from collections.abc import Sequence
 from dataclasses import Field
 from typing import Any, TypeVar
@@ -97,7 +98,8 @@ def _descriptor(default: Any, opt: Option) -> ParameterDescriptor:
     """Return the descriptor that `ros2 param describe` and tools show."""
     descriptor = ParameterDescriptor(description=opt.description, read_only=opt.read_only)
     # Users write `0` for `0.0`; only a parameter of dynamic type accepts it (see _from_ros).
-    descriptor.dynamic_typing = isinstance(default, float)
+    numbers = isinstance(default, tuple) and bool(default) and isinstance(default[0], float)
+    descriptor.dynamic_typing = isinstance(default, float) or numbers
     if opt.choices:
         descriptor.additional_constraints = "one of " + ", ".join(opt.choices)
     elif opt.low is None or opt.high is None:  # a range in ROS has both ends
@@ -118,6 +120,12 @@ def _to_ros(value: Any) -> Any:
 
 def _from_ros(name: str, value: Any, default: Any) -> Any:
     """Return the value of a parameter as that of an option whose default is `default`."""
+    if isinstance(default, tuple) and default and isinstance(default[0], float):
+        if not isinstance(value, (list, tuple, array)) or any(
+            isinstance(item, bool) or not isinstance(item, (int, float)) for item in value
+        ):
+            raise ValueError(f"{name} is {value!r}; it must be numbers, as in {list(default)}")
+        return tuple(map(float, value))
     if isinstance(default, tuple):
         return tuple(item for item in value if item != "")
     if isinstance(default, float):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,12 +12,14 @@ from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import MessageError, Observation
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.model_file import load_model
+from test.fixtures.walking import in_layout
 
 HUMAN = load_model("human")
 CAMERA = Intrinsics((1000.0, 1000.0), (640.0, 360.0))
@@ -55,3 +59,64 @@ def test_min_visible_counts_detected_keypoints(
     assert np.isnan(lifted.shapes).all() and not lifted.confidence.any()
     with pytest.raises(MessageError, match=f"at most {detected} detected .* min_visible is 4"):
         pipeline.lift(mapped, intrinsics, ("",), "topic", Moment(0.0))
+
+
+def walked(history: HistoryOptions, **changes: Any) -> list[np.ndarray]:
+    """Return the shapes of a person who walks, as a stream gives them."""
+    layout = LAYOUTS["coco17"]
+    pipeline = Pipeline(
+        HUMAN, layout, InputOptions(), LiftingOptions(**changes), SmoothingOptions(), history
+    )
+    to_model = KeypointMap(layout, HUMAN.layout)
+    shapes = []
+    for i, (points, confidence) in enumerate(zip(*in_layout(layout, 30), strict=True)):
+        seen = Observation(*to_model(points[None], confidence[None]))
+        lifted, _ = pipeline.lift(seen, CAMERA, ("someone",), "topic", Moment(i / 30))
+        shapes.append(lifted.shapes[0])
+    assert bool(pipeline.learned_bones()) == (history.enabled and not changes)
+    return shapes
+
+
+def test_an_answer_depends_on_history_unless_it_is_off() -> None:
+    points, confidence = in_layout(LAYOUTS["coco17"], 30)
+    lifter = Lifter(HUMAN, layout="coco17")
+    to_model = KeypointMap(lifter.layout, HUMAN.layout)
+    alone = lift_perspective(lifter, CAMERA, *to_model(points, confidence)).shapes
+    on, off = walked(HistoryOptions()), walked(HistoryOptions(enabled=False))
+    np.testing.assert_allclose(off, alone, atol=1e-5)
+    np.testing.assert_allclose(on[0], alone[0], atol=1e-5)
+    assert np.abs(on[-1] - alone[-1]).max() > 1e-3
+    np.testing.assert_allclose(
+        walked(HistoryOptions(), correction="none"),
+        walked(HistoryOptions(enabled=False), correction="none"),
+    )
+
+
+def test_a_stream_that_restarts_has_no_history() -> None:
+    layout = LAYOUTS["coco17"]
+    pipeline = Pipeline(HUMAN, layout, InputOptions(), LiftingOptions(), SmoothingOptions())
+    points, confidence = in_layout(layout, 30)
+    mapped = KeypointMap(layout, HUMAN.layout)(points, confidence)
+
+    def shape(i: int, moment: float) -> np.ndarray:
+        seen = Observation(mapped[0][i : i + 1], mapped[1][i : i + 1])
+        return pipeline.lift(seen, None, ("a",), "topic", Moment(moment))[0].shapes[0]
+
+    first = shape(0, 0.0)
+    for i in range(1, 30):
+        shape(i, i / 30)
+    assert np.abs(shape(0, 1.1) - first).max() > 1e-3
+    pipeline.restart("topic")
+    np.testing.assert_array_equal(shape(0, 0.0), first)
+
+
+def test_learned_bones_are_shown_in_units_of_the_reference_length() -> None:
+    layout = LAYOUTS["coco17"]
+    pipeline = Pipeline(HUMAN, layout, InputOptions(), LiftingOptions(), SmoothingOptions())
+    mapped = KeypointMap(layout, HUMAN.layout)(*in_layout(layout, 30))
+    for i in range(30):
+        seen = Observation(mapped[0][i : i + 1], mapped[1][i : i + 1])
+        pipeline.lift(seen, CAMERA, ("a",), "topic", Moment(i / 30))
+    assert pipeline.learned_bones(0) == {}
+    (text,) = pipeline.learned_bones().values()
+    assert "s of sight: " in text and "neck-mid_hip 1.000" in text and "right_knee" not in text

@@ -1,0 +1,134 @@
+"""The direction of gravity in the camera's axes, from a parameter, an IMU or /tf."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+
+from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.messages.frame_tree import FrameTree
+from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
+
+_STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+_STATIC = QoSProfile(
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+_GRAVITY = 9.81  # m/s^2
+_MAX_ACCELERATION = 3.0  # m/s^2 beside gravity, above which a measurement is left out
+_AVERAGED = 0.5  # s, time constant of the mean of the measurements
+_MAX_AGE = 5.0  # s after which the last measurement is no longer used
+
+
+@dataclass(frozen=True)
+class GravitySources:
+    """Sources of the direction of gravity."""
+
+    imu: str = option(
+        "",
+        "topic of a sensor_msgs/Imu that is fixed to the camera: its mean acceleration of half a "
+        "second is the direction against gravity; its frame is turned to that of the keypoints by "
+        "/tf, or is taken as the camera's optical frame where there is no /tf; empty = no IMU",
+        read_only=True,
+    )
+    frame: str = option(
+        "",
+        "frame on /tf whose z axis points up, such as map, odom or base_link: gives the direction "
+        "against gravity in the frame of the keypoints; needs tf2_msgs; empty = no frame",
+        read_only=True,
+    )
+
+
+class GravityDirection:
+    """Keeps the direction against gravity; a frame comes before an IMU, and both before `up`."""
+
+    def __init__(self, node: Node, sources: GravitySources) -> None:
+        """Subscribe to what the options name.
+
+        Raises:
+            ValueError: the package tf2_msgs is needed and is not installed.
+        """
+        self._sources, self._node = sources, node
+        self._tree = FrameTree()
+        self._mean: NDArray[Any] | None = None
+        self._imu_frame, self._measured = "", -math.inf
+        if sources.imu:
+            node.create_subscription(Imu, sources.imu, self._receive_imu, _STREAM)
+        if sources.imu or sources.frame:
+            self._listen_to_frames(required=bool(sources.frame))
+
+    def __call__(self, up: NDArray[np.float64] | None, frame: str) -> NDArray[np.float64] | None:
+        """Return the unit vector (3,) against gravity in the axes of `frame`; None: unknown.
+
+        Args:
+            up: what the parameter says; None: nothing.
+            frame: optical frame of the keypoints.
+        """
+        sources = self._sources
+        if sources.frame and frame:
+            R = self._tree.rotation(frame, sources.frame)
+            if R is not None:
+                return np.ascontiguousarray(R[:, 2])
+        if self._mean is not None and self._now() - self._measured <= _MAX_AGE:
+            R = self._tree.rotation(frame, self._imu_frame)
+            turned = self._mean if R is None else R @ self._mean
+            return np.asarray(turned / np.linalg.norm(turned), np.float64)
+        return up
+
+    def status(self, up: NDArray[np.float64] | None, frame: str) -> str:
+        """Return the state as text, for diagnostics."""
+        direction = self(up, frame)
+        if direction is not None:
+            return "up is {:.2f} {:.2f} {:.2f} in the camera's axes".format(*direction)
+        waits = [f"frame {self._sources.frame} on /tf"] if self._sources.frame else []
+        waits += [f"IMU on {self._sources.imu}"] if self._sources.imu else []
+        return f"waiting for {' or '.join(waits)}" if waits else "unknown"
+
+    def _listen_to_frames(self, *, required: bool) -> None:
+        """Subscribe to /tf and /tf_static."""
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ModuleNotFoundError:
+            if not required:
+                return
+            raise ValueError(
+                f"gravity.frame is {self._sources.frame!r} and the package tf2_msgs is missing; "
+                "install it (apt install ros-jazzy-tf2-msgs), or set gravity.up or gravity.imu"
+            ) from None
+        for topic, qos in (("/tf", QoSProfile(depth=100)), ("/tf_static", _STATIC)):
+            self._node.create_subscription(TFMessage, topic, self._receive_frames, qos)
+
+    def _receive_frames(self, message: Any) -> None:
+        """Keep the rotations of a TFMessage."""
+        for each in message.transforms:
+            q = each.transform.rotation
+            self._tree.add(each.header.frame_id, each.child_frame_id, (q.x, q.y, q.z, q.w))
+
+    def _receive_imu(self, message: Imu) -> None:
+        """Average the acceleration of an Imu, or take its orientation if it has none."""
+        a = message.linear_acceleration
+        measured, q = np.array([a.x, a.y, a.z]), message.orientation
+        if not measured.any() and message.orientation_covariance[0] >= 0 and (q.x or q.y or q.z):
+            quaternion = np.array([q.x, q.y, q.z, q.w])
+            measured = _GRAVITY * rotation_from_quaternion(quaternion)[2]
+        if not abs(float(np.linalg.norm(measured)) - _GRAVITY) <= _MAX_ACCELERATION:
+            return
+        now = self._now()
+        passed = max(now - self._measured, 0.0)
+        if self._mean is None or passed > _MAX_AGE:
+            self._mean = measured
+        else:
+            self._mean = self._mean + (1 - math.exp(-passed / _AVERAGED)) * (measured - self._mean)
+        self._imu_frame, self._measured = message.header.frame_id, now
+
+    def _now(self) -> float:
+        """Return the time in seconds."""
+        return 1e-9 * float(self._node.get_clock().now().nanoseconds)
