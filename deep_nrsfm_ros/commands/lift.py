@@ -204,10 +204,11 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
         warn(warning)
     chosen = detections.largest() if args.objects == "largest" else detections
     if detections.layout:
-        return Objects(chosen, detections.layout)
+        return Objects(chosen, detections.layout, detections.findings)
     layout, reason, ambiguity = resolve_layout(chosen, model)
     note(f"keypoint layout {layout.name}: {reason}")
-    return Objects(chosen, layout, (ambiguity,) if ambiguity else ())
+    found = (*detections.findings, *([ambiguity] if ambiguity else []))
+    return Objects(chosen, layout, found)
 
 
 def lift_objects(

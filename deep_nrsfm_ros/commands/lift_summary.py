@@ -10,7 +10,7 @@ from deep_nrsfm_ros.data.recording import Recording
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.layout_fit import better_layout, fit_layouts
-from deep_nrsfm_ros.lifting.sanity import Finding, Size, check, is_person, orientation
+from deep_nrsfm_ros.lifting.sanity import Finding, Size, check, facing, is_person, orientation
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import Model
 
@@ -86,6 +86,7 @@ def summarise(
             findings = [f for f in findings if f.code != "poor-fit"] + [better]
     if is_person(model.layout):
         findings += orientation(recording.lifted.rotations)
+        findings += facing(recording.lifted.rotations, detections.confidence, recording.source)
     if is_lifted.any() and is_lifted.mean() < _FEW_LIFTED:
         few = f"only {is_lifted.sum()} of {len(is_lifted)} objects are lifted"
         findings.append(Finding("few-lifted", few))

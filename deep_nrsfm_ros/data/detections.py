@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.data.openpose import largest
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
+from deep_nrsfm_ros.lifting.sanity import Finding
 
 _GHOST = 0.5  # of the best score in a frame: an object below it is not chosen for its size
 
@@ -44,7 +45,8 @@ class Detections:
         frames: numbers and names of the frames; None = numbered from 0, without names.
         scores: (m,) float32, score of the object in the detector's own scale; None = all 1.
         layout: layout in which the keypoints are given; None = nothing says it.
-        warnings: sentences about what was left out of the source or looks wrong.
+        warnings: sentences about what was left out of the source.
+        findings: what looks wrong in the source.
     """
 
     points: NDArray[np.float32]
@@ -57,6 +59,7 @@ class Detections:
     scores: NDArray[np.float32] = None  # type: ignore[assignment]
     layout: KeypointLayout | None = None
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise ValueError if the arrays do not match each other or frames are not ascending."""

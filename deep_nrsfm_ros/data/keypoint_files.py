@@ -19,7 +19,11 @@ from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.bags import NO_SCORES, Progress, keypoint_count
 from deep_nrsfm_ros.data.detections import Detections, gather
 from deep_nrsfm_ros.data.formats.arrays import read_npy, read_npz
-from deep_nrsfm_ros.data.formats.builder import DetectionsBuilder, KeypointFileError
+from deep_nrsfm_ros.data.formats.builder import (
+    DetectionsBuilder,
+    KeypointFileError,
+    index_in_frame,
+)
 from deep_nrsfm_ros.data.formats.frame_numbers import natural
 from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
 from deep_nrsfm_ros.data.formats.json_items import Readable
@@ -104,6 +108,11 @@ def _format_of(path: Path) -> Format:
     for form in FORMATS:
         if name.endswith(form.suffixes):
             return form
+    if name.endswith(_PICKLES):
+        raise KeypointFileError(
+            "it is a pickle, which could run code when it is read: load it yourself if you trust "
+            "it, and save np.savez(NEW, points=array (objects, q, 2), frame=array (objects,))"
+        )
     raise KeypointFileError(f"it is of no known kind; expected {KINDS}")
 
 
@@ -118,6 +127,8 @@ def _refuse(options: ReadOptions, names: tuple[str, ...], kind: str) -> None:
 def _finish(detections: Detections, options: ReadOptions) -> Detections:
     """Return detections in pixels, without marks of missing keypoints."""
     points, confidence = detections.points, detections.confidence
+    detections = _without_copies(detections)
+    points, confidence = detections.points, detections.confidence
     present = without_value(Observation(points, confidence), options.missing_value)
     if present.points is not points:
         points, confidence = present.points, present.confidence
@@ -128,6 +139,30 @@ def _finish(detections: Detections, options: ReadOptions) -> Detections:
     if options.image_size:
         detections = _without_border(detections, options.image_size)
     return detections
+
+
+def _without_copies(detections: Detections) -> Detections:
+    """Return detections without objects that are equal to another one in their frame.
+
+    Objects of which the input gives different identities are kept.
+    """
+    is_same_frame = np.diff(detections.frame) == 0
+    indices = index_in_frame(detections.frame).astype(str)
+    if not is_same_frame.any() or (detections.identities != indices).any():
+        return detections
+    m = len(detections)
+    columns = (detections.frame, *detections.points.reshape(m, -1).T, *detections.confidence.T)
+    first = np.unique(np.column_stack(columns), axis=0, return_index=True)[1]
+    is_kept = np.asarray(~(detections.confidence > 0).any(1))
+    is_kept[first] = True
+    if is_kept.all():
+        return detections
+    warning = (
+        f"left out: {(~is_kept).sum()} objects that are equal to another one in their frame: was "
+        "the file written twice?"
+    )
+    kept = detections[is_kept]
+    return dataclasses.replace(kept, warnings=(*kept.warnings, warning))
 
 
 def _without_border(detections: Detections, size: tuple[int, int]) -> Detections:
@@ -231,6 +266,16 @@ def _folder(path: Path, options: ReadOptions, on_progress: Progress) -> Detectio
             files.append(file)
         elif file.suffix.lower() not in _IMAGES:
             builder.leave_out("are no .json files", file.name)
+    if not files and any(file.suffix.lower() == ".txt" for file in path.iterdir()):
+        raise KeypointFileError(
+            "it holds .txt files: YOLO labels are not read; write JSON (results.to_json() of "
+            "Ultralytics), or an .npz with `points`"
+        )
+    if not files and (inner := [file.name for file in path.iterdir() if file.is_dir()]):
+        raise KeypointFileError(
+            f"it holds no .json files itself, but folders ({', '.join(sorted(inner)[:4])}): read "
+            "them one by one, each is a recording"
+        )
     if not files:
         raise KeypointFileError(f"it holds neither a bag nor .json files; expected {KINDS}")
 
@@ -253,6 +298,7 @@ def _read_frames(
             builder.leave_out("cannot be read", f"{frame.name}: {problem}")
 
 
+_PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 """Images beside the files of their keypoints are no keypoints, and usual."""
 _FOLDER = Format("a folder of .json files, one a frame", (), _folder, has_categories=True)

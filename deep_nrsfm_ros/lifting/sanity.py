@@ -32,6 +32,10 @@ _SIGNED = 0.05  # fraction of points with a negative coordinate, above which the
 _TINY = 3.0  # pixels; no detector finds keypoints of smaller objects
 _UPRIGHT = 0.7  # cosine between the up axis of a person and an axis of the image
 _NEARLY_ALL = 0.9  # fraction of people that makes an orientation suspicious
+_FACE = ("nose", "left_eye", "right_eye")
+_SEEN = 0.5  # confidence of a face that is seen
+_TURNED = 0.3  # cosine between the front of a person and the camera's axis: less is a profile
+_MIN_FACES = 5  # people, which are too few for a verdict on left and right
 _MIN_FOCAL = 10.0  # pixels; a smaller focal length belongs to normalised coordinates
 _MIN_REPEATS = 3  # points on one spot that may be a sentinel
 _OUTSIDE = 0.05  # fraction of points far outside the image that is too many
@@ -216,6 +220,36 @@ def orientation(rotations: Floats) -> list[Finding]:
             )
         ]
     return []
+
+
+def facing(
+    rotations: Floats, confidence: Floats, layout: KeypointLayout, least: float = _SEEN
+) -> list[Finding]:
+    """Return whether left and right look exchanged: faces are seen of people who face away.
+
+    A person with left and right exchanged is a person with mirrored depth, who fits as well. Only
+    the face tells them apart: nobody's nose and eyes are seen from behind.
+
+    Args:
+        rotations: (n, 3, 3) as in `orientation`.
+        confidence: (n, q) of the keypoints, in `layout`.
+        layout: of the keypoints.
+        least: confidence of nose and eyes from which on the face is seen.
+    """
+    face = [layout.index(name) for name in _FACE if name in layout.keypoints]
+    if "nose" not in layout.keypoints:
+        return []
+    front = rotations[:, 2, 0]
+    seen = (confidence[:, face] >= least).all(1) & (np.abs(front) > _TURNED)
+    if seen.sum() < _MIN_FACES or (away := (front[seen] > 0).mean()) <= _NEARLY_ALL:
+        return []
+    return [
+        Finding(
+            "handedness",
+            f"{away:.0%} of the {seen.sum()} people whose face is seen come out facing away: left "
+            "and right look exchanged; check the keypoint layout, and that images are not mirrored",
+        )
+    ]
 
 
 def _sentinel(spot: Floats, times: int, total: int) -> Finding:

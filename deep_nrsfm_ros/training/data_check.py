@@ -16,6 +16,7 @@ from deep_nrsfm_ros.lifting.sanity import (
     Finding,
     Size,
     check,
+    facing,
     orientation,
     quality,
     to_pixels,
@@ -64,4 +65,8 @@ def _findings(dataset: Dataset, source: KeypointLayout, image_size: Size | None)
         fits = fit_layouts(dataset.points, confidence, model, [source])
         better = better_layout(fits, source, float(np.nanmedian(lifted.residual)))
         poor = [better] if better else poor
-    return findings + poor + ([] if poor else orientation(lifted.rotations))
+    if poor:
+        return findings + poor
+    # A dataset has no confidence, only visible keypoints.
+    exchanged = facing(lifted.rotations, confidence[chosen], dataset.layout)
+    return findings + orientation(lifted.rotations) + exchanged

@@ -128,12 +128,12 @@ def _read_inputs(
             detections = read_keypoints(path, _options_for(path, options), reporter.reading)
             layout = detections.layout or keypoint_map.source
             to_target = KeypointMap(layout, keypoint_map.target)
-            if not len(detections):
+            if not len(detections) or not detections.confidence.any():
                 raise ValueError(f"{path}: it has no object with keypoints")
         except ValueError as error:  # of one file: the others may do
             failures.append(error)
             continue
-        for warning in detections.warnings:
+        for warning in (*detections.warnings, *map(str, detections.findings)):
             reporter.warn(f"{path.name}: {warning}")
         order = np.lexsort((detections.frame, detections.identities))
         points, confidence = to_target(detections.points[order], detections.confidence[order])

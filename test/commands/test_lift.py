@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.data.walking_person import CAMERA as WALKING_CAMERA
+from benchmarks.data.walking_person import DISTANCE, IMAGE, in_layout
 from deep_nrsfm_ros.commands.lift import arguments, main
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.keypoint_files import read_keypoints
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
 from deep_nrsfm_ros.lifting.options import LiftingOptions
-from test.fixtures.walking import CAMERA as WALKING_CAMERA
-from test.fixtures.walking import DISTANCE, IMAGE, in_layout
 
 HEIGHTS = {
     "nose": 0,
@@ -151,7 +151,7 @@ def lift(folder: Path, layout: str, *options: str, **arrays: np.ndarray) -> int:
     """Lift the walking person of a layout, with arrays changed; return the exit code."""
     points, confidence = in_layout(LAYOUTS[layout])
     path = folder / "keypoints.npz"
-    np.savez(path, **({"points": points, "confidence": confidence} | arrays))  # type: ignore[arg-type]
+    np.savez(path, **({"points": points, "confidence": confidence} | arrays))
     (folder / "camera.yaml").write_text(WALKING_CAMERA)
     try:
         main([str(path), "--output", str(folder / "out.npz"), *options])

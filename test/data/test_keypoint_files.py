@@ -209,7 +209,7 @@ def test_wrong_arrays_are_named(tmp_path: Path, arrays: dict[str, Any], expected
         ("a.npz", "no zip", "a.npz: "),
         ("a.txt", "", "a.txt: it is of no known kind; expected a bag"),
         ("a.mcap", "no bag", "a.mcap cannot be read"),
-        ("folder/a.txt", "", "folder: it holds neither a bag nor .json"),
+        ("folder/a.txt", "", "it holds .txt files: YOLO labels"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, name: str, text: str, expected: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.data.walking_person import in_layout
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17, LAYOUTS
@@ -15,7 +16,6 @@ from deep_nrsfm_ros.lifting.layout_fit import (
     fit_layouts,
 )
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
-from test.fixtures.walking import in_layout
 
 
 @pytest.fixture(scope="module")

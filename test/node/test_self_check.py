@@ -11,9 +11,9 @@ import pytest
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
+from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
 from deep_nrsfm_ros.node.lifter_client import running_layout
-from test.fixtures.walking import IMAGE, in_layout
 from test.node.conftest import Client, Connect, StartLifter
 from test.node.test_lifter import cloud, unpack
 

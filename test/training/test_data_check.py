@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.training.data_check import check_dataset
-from test.fixtures.walking import IMAGE, in_layout
 
 POINTS, CONFIDENCE = in_layout(COCO17)
 

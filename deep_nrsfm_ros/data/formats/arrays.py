@@ -140,7 +140,7 @@ def _detections(
         q = len(layout) if layout else "q"
         raise KeypointFileError(
             f"`points` is {points.shape}; (objects, {q}, 2), or 3 with the confidence, is "
-            "needed: x, y in the order of the keypoint layout"
+            f"needed: x, y in the order of the keypoint layout{_remedy(points.shape)}"
         )
     m, q = points.shape[:2]
     if layout and q != len(layout):
@@ -205,6 +205,21 @@ def _detections(
         layout=layout,
         warnings=tuple(warnings),
     )
+
+
+def _remedy(shape: tuple[int, ...]) -> str:
+    """Return how an array of another order becomes one of objects; "" if that is not clear."""
+    if len(shape) == 2 and shape[1] >= 8:
+        sizes = [size for size in (3, 2) if shape[1] % size == 0]
+        forms = " or ".join(f"({shape[0]}, {shape[1] // n}, {n})" for n in sizes)
+        return f"; if a row is an object, save points.reshape{forms}" if sizes else ""
+    if len(shape) == 3 and (axes := [i for i in (1, 0) if shape[i] in (2, 3)]):
+        first, second = [i for i in range(3) if i != axes[0]]
+        if axes[0] == 0 and shape[first] < shape[second]:  # more frames than keypoints
+            first, second = second, first
+        order = f"{first}, {second}, {axes[0]}"
+        return f"; save points.transpose({order}), if that is the order"
+    return ""
 
 
 def _numbers(

@@ -11,16 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.detections import Detections, Frames
-from deep_nrsfm_ros.data.formats.frame_numbers import MOST, natural, numbers_in, stamps_of
+from deep_nrsfm_ros.data.formats.frame_numbers import (
+    MOST,
+    natural,
+    numbers_in,
+    series_of,
+    stamps_of,
+)
 from deep_nrsfm_ros.data.formats.names import contradiction, layout_of_names
 from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.observation import to_observation
-from deep_nrsfm_ros.lifting.sanity import looks_normalised
+from deep_nrsfm_ros.lifting.sanity import Finding, looks_normalised
 
 NO_KEYPOINTS = "have no keypoints"
 _ROWS = 8192  # of a chunk: large enough that a freed one returns to the system
+_MEDIAPIPE = 33  # landmarks of MediaPipe Pose
+_FEW = 4  # keypoints, which are too few to be compared with a box
+_MANY = 0.5  # fraction of objects that makes a suspicion a warning
+UNITS = {"seconds": 10**9, "milliseconds": 10**6, "microseconds": 1000, "nanoseconds": 1}
+"""Units of time in ns."""
+TIMES = {
+    **dict.fromkeys(("timestamp", "time", "stamp", "ts", "t"), ""),
+    **dict.fromkeys(("timestamp_s", "time_s", "seconds"), "seconds"),
+    **dict.fromkeys(("timestamp_ms", "time_ms", "timestampMs"), "milliseconds"),
+    **dict.fromkeys(("timestamp_us", "time_us"), "microseconds"),
+    **dict.fromkeys(("timestamp_ns", "time_ns", "stamp_ns"), "nanoseconds"),
+}
+"""Names of the time of a frame -> its unit; "" if they do not say it."""
 _NAMED = 3  # places that a warning names
 
 
@@ -66,7 +85,8 @@ class DetectionsBuilder:
 
     Attributes:
         options: of reading.
-        warnings: sentences about what was left out or looks wrong.
+        warnings: sentences about what was left out.
+        findings: what looks wrong, by its code.
         is_mediapipe: the input is landmarks, which MediaPipe gives as fractions of the image's
             size.
     """
@@ -75,6 +95,7 @@ class DetectionsBuilder:
         """Start without frames."""
         self.options = options
         self.warnings: list[str] = []
+        self.findings: dict[str, str] = {}
         self.is_mediapipe = False
         self._groups: dict[tuple[Any, int], _Group] = {}
         self._frames: dict[Any, int] = {}
@@ -83,6 +104,10 @@ class DetectionsBuilder:
         self._numbers: list[int | None] = []
         self._stamps: list[int | None] = []
         self._order: list[int | None] = []
+        self._times: dict[int, float] = {}
+        self._time_unit = ""
+        self._not_confidence = 0
+        self._outside_box = self._with_box = 0
         self._listed = 0
         self._left_out: dict[str, list[str]] = {}
         self._left_out_counts: Counter[str] = Counter()
@@ -128,6 +153,17 @@ class DetectionsBuilder:
     def frame_name(self, index: int) -> str:
         """Return how the input calls a frame, for a warning."""
         return self._frame_names[index] or f"frame {self._keys[index]}"
+
+    def time(self, index: int, value: float, unit: str = "") -> None:
+        """Set the time of a frame as the input gives it.
+
+        Args:
+            index: of the frame.
+            value: its time.
+            unit: a key of `UNITS`; "" = the one in which frames are a plausible time apart.
+        """
+        self._times[index] = value
+        self._time_unit = unit
 
     @property
     def frames(self) -> int:
@@ -182,6 +218,8 @@ class DetectionsBuilder:
                 self._left_out_counts[reason] += 1
                 return
         q = len(values)
+        if ((values[:, 2] < 0) & (values[:, 2] != -1)).any():
+            self._not_confidence += 1
         group = self._groups.get((category, q))
         if group is None:
             group = self._groups[category, q] = _Group(q)
@@ -209,6 +247,8 @@ class DetectionsBuilder:
         group = self._group(layout)
         if not group.frame and (set(self._left_out_counts) - {NO_KEYPOINTS}):
             raise KeypointFileError("; ".join(["no object is left", *self.reasons()]))
+        self._stamp_frames()
+        self.warnings += self._looks_wrong(group)
         frame = np.array(group.frame, np.int64)
         points, confidence = group.arrays(options.min_confidence)
         is_normalised = self.is_mediapipe and looks_normalised(points, confidence > 0)
@@ -238,7 +278,65 @@ class DetectionsBuilder:
             scores=scores,
             layout=layout,
             warnings=(*self.warnings, *self.reasons()),
+            findings=tuple(Finding(code, text) for code, text in self.findings.items()),
         )
+
+    def in_box(self, values: NDArray[np.float64], box: Any) -> None:
+        """Compare the keypoints of an object with its box, [x, y, width, height] or two corners."""
+        try:
+            x, y, a, b = (float(number) for number in box)
+        except (TypeError, ValueError):
+            return
+        visible = values[(values[:, 2] > 0) & values[:, :2].any(1), :2]
+        if len(visible) < _FEW:
+            return
+        self._with_box += 1
+        low, high = visible.min(0), visible.max(0)
+        corners = ((x, y, x + a, y + b), (x, y, max(a, x), max(b, y)))
+        self._outside_box += not any(
+            (low <= (x2, y2)).all() and (high >= (x1, y1)).all() and _share(low, high, box_) > 0.3
+            for box_ in corners
+            for x1, y1, x2, y2 in (box_,)
+        )
+
+    def _looks_wrong(self, group: _Group) -> list[str]:
+        """Return what looks wrong in the objects; mend what can be mended."""
+        warnings = []
+        if self._not_confidence > _MANY * max(len(group.frame), 1):
+            for chunk in group.chunks:
+                chunk[..., 2] = 1
+            warnings.append(
+                f"the third number of a keypoint is negative in {self._not_confidence} of "
+                f"{len(group.frame)} objects: it is a depth and no confidence, so all keypoints "
+                "count as seen"
+            )
+        if self._outside_box > _MANY * max(self._with_box, 1):
+            self.findings["crop"] = (
+                f"the keypoints of {self._outside_box} of {self._with_box} objects are not in "
+                "their box: are they pixels of the box's crop? Pixels of the image are needed"
+            )
+        return warnings
+
+    def _stamp_frames(self) -> None:
+        """Set the stamps by the times of the input, if it gives all of them."""
+        if not self._times or len(self._times) < len(self._keys):
+            return
+        if self.options.rate:
+            raise KeypointFileError("it has times of its own: leave out --rate")
+        values = np.array([self._times[i] for i in range(len(self._keys))])
+        unit = self._time_unit or plausible_unit(values)
+        if not unit:
+            self.warnings.append(
+                f"its times ({values[0]:g}, ...) are not used: in no unit are frames 1 ms to 10 s "
+                f"apart; they follow each other at {DEFAULT_RATE:g} a second"
+            )
+            return
+        if not self._time_unit:
+            self.warnings.append(f"its times ({values[0]:g}, ...) are taken for {unit}")
+        # Relative to the first one: a float64 of seconds since 1970 has steps of 0.2 us.
+        stamps = np.round((values - values.min()) * UNITS[unit]).astype(np.int64)
+        stamps += round(float(values.min())) * UNITS[unit] if abs(values.min()) < 2**53 else 0
+        self._stamps = stamps.tolist()
 
     def reasons(self) -> list[str]:
         """Return a sentence for each reason for which entries were left out."""
@@ -357,9 +455,29 @@ class DetectionsBuilder:
             return numbers if len(np.unique(numbers)) == len(numbers) else None
         if all(self._frame_names) and (found := numbers_in(self._frame_names)) is not None:
             return found
+        if series := series_of(self._frame_names):
+            self.findings["series"] = (
+                f"the names of its frames are {len(series)} series ({', '.join(series[:4])}): are "
+                "they of several cameras or videos? Read each by itself"
+            )
         if all(isinstance(key, int) and abs(key) < 2**62 for key in keys):
             return np.array(keys, np.int64)
         return None
+
+
+def plausible_unit(times: NDArray[np.float64]) -> str:
+    """Return the largest unit in which frames are 1 ms to 10 s apart; "" if there is none."""
+    spacing = np.diff(np.unique(times))
+    if not len(spacing):
+        return ""
+    middle = float(np.median(spacing)) / 1e9
+    return next((name for name, ns in UNITS.items() if 0.001 <= middle * ns <= 10), "")
+
+
+def _share(low: NDArray[Any], high: NDArray[Any], box: tuple[float, ...]) -> float:
+    """Return the share of the area of keypoints from `low` to `high` that is in a box."""
+    inside = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
+    return float(np.prod(inside) / max(np.prod(high - low), 1e-9))
 
 
 def wrong_count(q: int, layout: KeypointLayout | None) -> str:
@@ -430,8 +548,8 @@ def index_in_frame(frame: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def as_identity(value: Any) -> str | None:
     """Return the identity that a field of a detector gives; None for none (-1, [-1], "", null)."""
-    if isinstance(value, list):
-        value = value[0] if len(value) == 1 else None
+    while isinstance(value, list):  # [3], [[3.0], [3.0]] of AlphaPose
+        value = value[0] if value and all(each == value[0] for each in value) else None
     if isinstance(value, bool) or value is None:
         return None
     if isinstance(value, (int, float)):
@@ -471,6 +589,10 @@ def as_values(keypoints: Any, scores: Any = None, expected: int | None = None) -
         values = values[0]
     if not values.size or values.ndim == 0:
         raise ValueError(NO_KEYPOINTS)
+    if values.ndim == 1 and values.size in (4 * (expected or 0), 4 * _MEDIAPIPE):
+        values = values.reshape(-1, 4)
+    if values.ndim == 2 and values.shape[1] == 4:  # x, y, z and visibility of MediaPipe
+        values = values[:, [0, 1, 3]]
     if values.ndim == 1:
         pairs = values.size % 3 != 0 or values.size == 2 * (expected or 0)
         if beside is not None and values.size != 3 * beside.size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,17 @@ def numbers_in(names: Sequence[str]) -> NDArray[np.int64] | None:
     if len(differing) != 1 or len(np.unique(numbers[:, differing[0]])) != len(names):
         return None
     return numbers[:, differing[0]]
+
+
+def series_of(names: Sequence[str]) -> list[str]:
+    """Return the patterns of names that are numbered each for itself: logi_*.json, osmo_*.json.
+
+    Returns:
+        [] unless there are several patterns, each of several names.
+    """
+    patterns = Counter(re.sub(r"\d+(?=\D*$)", "*", name) for name in names if name)
+    several = len(patterns) > 1 and min(patterns.values()) > 1 and all("*" in p for p in patterns)
+    return sorted(patterns) if several and sum(patterns.values()) == len(names) else []
 
 
 def stamps_of(numbers: NDArray[np.int64] | None, frames: int, rate: float) -> NDArray[np.int64]:

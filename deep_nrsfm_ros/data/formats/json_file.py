@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from deep_nrsfm_ros.data.formats.builder import (
     NO_KEYPOINTS,
+    TIMES,
     DetectionsBuilder,
     as_identity,
     as_score,
@@ -33,7 +34,7 @@ _LANDMARKS = ("landmarks", "landmark", "pose_landmarks", "poseLandmarks")
 _FRAME = ("image_id", "frame_id", "frame", "frame_number", "frame_index", "image", "file_name")
 _SCORES = ("keypoint_scores", "keypoints_scores", "keypoint_score", "scores", "confidence")
 _IDENTITY = ("person_id", "track_id", "idx", "instance_id")
-_SCORE = ("score", "bbox_score")
+_SCORE = ("score", "bbox_score", "confidence")
 _CONFIDENCE = ("visibility", "score", "confidence", "presence", "likelihood")
 
 
@@ -69,13 +70,20 @@ class JsonReader:
             ValueError: the document is no JSON, or ends early; what comes before is read.
         """
         known, landmarks = False, []
+        elements = 0
         keys: dict[str | None, None] = {}
         for key, value, is_element in json_items(file):
             keys[key] = None
             if key in _LANDMARKS and is_element and isinstance(value, dict):
                 landmarks.append(value)
             else:
-                known |= self._item(key, value, is_element, frame)
+                if is_element and _is_frame(key, value):
+                    # Frames without a name or number of their own follow one another.
+                    inner = DefaultFrame(f"{frame.name} [{elements}]", elements)
+                    known |= self._item(key, value, is_element, inner)
+                else:
+                    known |= self._item(key, value, is_element, frame)
+                elements += 1
         if landmarks:
             self._person({"landmarks": landmarks}, self._frame_of({}, frame))
         if known or landmarks:
@@ -143,6 +151,11 @@ class JsonReader:
     def _frame(self, value: Mapping[str, Any], frame: DefaultFrame) -> None:
         """Read the objects of a frame."""
         index = self._frame_of(value, frame)
+        for name, unit in TIMES.items():
+            time = value.get(name)
+            if isinstance(time, (int, float)) and not isinstance(time, bool):
+                self._builder.time(index, time, unit)
+                break
         for name in _OBJECTS:
             objects = value.get(name)
             if isinstance(objects, list):
@@ -190,9 +203,12 @@ class JsonReader:
             if keypoints is None:
                 raise ValueError(NO_KEYPOINTS)
             scores = next((person[n] for n in _SCORES if isinstance(person.get(n), list)), None)
-            if _are_points(keypoints):
+            if isinstance(keypoints, dict):
+                keypoints, scores = _columns(keypoints), None
+            elif _are_points(keypoints):
                 keypoints, scores = self._points(keypoints), None
             values = as_values(keypoints, scores, self._expected)
+            self._builder.in_box(values, person.get("bbox", person.get("box")))
         except ValueError as error:
             self._builder.leave_out(str(error), self._place(frame))
             return
@@ -264,6 +280,31 @@ class JsonReader:
             except ValueError:
                 return
             self._builder.name_keypoints(ordered)
+
+
+def _is_frame(key: str | None, value: Any) -> bool:
+    """Return whether an element of a list at the top is a frame, not an object."""
+    if key in ("frames", "results"):
+        return isinstance(value, (dict, list))
+    is_people = isinstance(value, dict) and any(isinstance(value.get(n), list) for n in _OBJECTS)
+    return key is None and (is_people or isinstance(value, list))
+
+
+def _columns(keypoints: Mapping[str, Any]) -> list[list[Any]]:
+    """Return x, y and confidence of keypoints given as lists of each (Ultralytics).
+
+    Raises:
+        ValueError: there are no such lists, or they are not of one length.
+    """
+    x, y = keypoints.get("x"), keypoints.get("y")
+    names = ("visible", *_CONFIDENCE)
+    c = next((keypoints[n] for n in names if isinstance(keypoints.get(n), list)), None)
+    columns = [column for column in (x, y, c) if isinstance(column, list)]
+    if len(columns) < 2 or not isinstance(x, list) or not isinstance(y, list):
+        raise ValueError(f"have keypoints with {', '.join(map(str, keypoints))[:60]}, not x and y")
+    if len({len(column) for column in columns}) > 1:
+        raise ValueError("have lists x and y of other lengths")
+    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _are_points(keypoints: Any) -> bool:

@@ -45,12 +45,18 @@ def json_items(file: Readable) -> Iterator[JsonItem]:
     return _Reader(file).items()
 
 
+def _encoding(start: bytes) -> str:
+    """Return the encoding of a document that begins so: UTF-16 is what PowerShell's `>` writes."""
+    is_utf16 = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return "utf-16" if is_utf16 else "utf-8-sig"
+
+
 class _Reader:
     """The text of a file that is not yet decoded, and the place in it."""
 
     def __init__(self, file: Readable) -> None:
         self._file, self._text, self._at, self._ended = file, "", 0, False
-        self._bytes = codecs.getincrementaldecoder("utf-8-sig")()
+        self._bytes: codecs.IncrementalDecoder | None = None
         self._decode = json.JSONDecoder().raw_decode
 
     def items(self) -> Iterator[JsonItem]:
@@ -131,6 +137,8 @@ class _Reader:
         # The part to read grows with the value, so that a large one is not decoded too often.
         data = self._file.read(max(_CHUNK, len(self._text) - self._at))
         self._ended = not data
+        if self._bytes is None:
+            self._bytes = codecs.getincrementaldecoder(_encoding(data))()
         self._text = self._text[self._at :] + self._bytes.decode(data, final=self._ended)
         self._at = 0
         return not self._ended

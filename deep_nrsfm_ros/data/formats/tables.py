@@ -14,7 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.data.formats.builder import DetectionsBuilder, KeypointFileError, as_identity
+from deep_nrsfm_ros.data.formats.builder import (
+    TIMES,
+    DetectionsBuilder,
+    KeypointFileError,
+    as_identity,
+)
 from deep_nrsfm_ros.extras import require_extra
 
 _CONFIDENCE = ("likelihood", "visibility", "score", "confidence", "conf", "presence", "v", "c", "s")
@@ -32,6 +37,8 @@ _EXPECTED = (
     "neither of DeepLabCut (rows scorer, bodyparts, coords), nor with a landmark a row (columns "
     "frame, landmark, x, y), nor with a column for each coordinate (nose_x, nose_y, ...)"
 )
+_UNIQUE = "single"  # individual of DeepLabCut that has the unique bodyparts
+_DECIMAL_COMMA = re.compile(r"^(\s*[-+]?\d+),(\d+)")
 _METRES = 50.0  # a larger coordinate of a TRC is in pixels: no one is filmed on 50 m
 
 Column = tuple[str, str, str]
@@ -43,7 +50,9 @@ def read_csv(path: Path, builder: DetectionsBuilder) -> None:
     with path.open(encoding="utf-8-sig", newline="") as file:
         first = file.readline()
         delimiter = max(",;\t", key=first.count)
-        rows = csv.reader(chain([first], file), delimiter=delimiter)
+        rows: Iterator[list[str]] = csv.reader(chain([first], file), delimiter=delimiter)
+        if delimiter != ",":  # spreadsheets of half of Europe write 1,5 for 1.5
+            rows = ([_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in rows)
         head = [cell.strip() for cell in next(rows, [])]
         if head and head[0].lower() == "scorer":
             _deeplabcut_rows(head, rows, builder)
@@ -176,16 +185,24 @@ def add_table(
     places: dict[str, dict[str, dict[str, int]]] = {}
     for i, (individual, part, coordinate) in enumerate(columns):
         places.setdefault(individual, {}).setdefault(part, {})[coordinate.lower()] = i
+    if _UNIQUE in places and len(places) > 1 and builder.options.category != _UNIQUE:
+        for part in places.pop(_UNIQUE):
+            builder.leave_out(
+                f"are points of the scene, not of an individual (--category {_UNIQUE} reads them)",
+                part,
+            )
     kinds: dict[tuple[str, ...], int] = {}
+    names: dict[int, list[str]] = {}
     plan = []
     for individual, parts in places.items():
         complete = {name: at for name, at in parts.items() if "x" in at and "y" in at}
         if not complete:
             continue
         kind = kinds.setdefault(tuple(complete), len(kinds))
-        if kind == len(kinds) - 1:
+        if kind not in names:
             builder.name_keypoints(list(complete), kind)
-            builder.name_category(kind, individual)
+        names.setdefault(kind, []).append(individual)
+        builder.name_category(kind, ", ".join(names[kind]))
         xy = np.array([(at["x"], at["y"]) for at in complete.values()])
         plan.append((individual, kind, xy, _confidence_columns(complete)))
     if not plan:
@@ -198,7 +215,7 @@ def add_table(
                 continue
             confidence = np.where(likelihood < 0, 1.0, values[likelihood])
             identity = as_identity(individual)
-            identity = None if identity == "single" else identity
+            identity = None if identity == _UNIQUE else identity
             builder.add(frame, np.column_stack([points, confidence]), identity, None, kind)
 
 
@@ -281,13 +298,15 @@ def _coordinate_columns(
 ) -> None:
     """Read a table with a row for each object and a column for each coordinate: nose_x, ..."""
     columns: list[Column] = []
-    frame = person = None
+    frame = person = time = None
     for i, cell in enumerate(head):
         name = cell.lower().replace(" ", "_")
         if name in _FRAME and frame is None:
             frame = i
         elif name in _OBJECT and person is None:
             person = i
+        elif name in TIMES and time is None:
+            time = i
         after = re.fullmatch(r"(.+)[_. -]([A-Za-z]+)", cell)
         before = re.fullmatch(r"([xyzvcs])_?(\d+)", name)
         if after and after[2].lower() in _COORDINATES:
@@ -313,8 +332,12 @@ def _coordinate_columns(
         if not any(cell.strip() for cell in row):
             continue
         values = _numbers(row, len(head))
-        key = None if frame is None else _key([row[frame]])
+        key: Any = None if frame is None else _key([row[frame]])
+        if key is None and time is not None:
+            key = float(values[time])
         index = _frame(builder, key, number)
+        if time is not None and not np.isnan(values[time]):
+            builder.time(index, float(values[time]), TIMES[head[time].lower().replace(" ", "_")])
         confidence = np.where(marks < 0, 1.0, values[marks])
         identity = None if person is None else as_identity(row[person].strip())
         builder.add(index, np.column_stack([values[xy], confidence]), identity)
