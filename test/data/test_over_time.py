@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from benchmarks.data.walking_person import FOCAL, IMAGE, in_layout
 from deep_nrsfm_ros.data.detections import Detections, gather, stamps_at
 from deep_nrsfm_ros.data.over_time import BOTH, CAUSAL, NONE, OverTime
 from deep_nrsfm_ros.data.recording import lift_recording
@@ -16,7 +17,6 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.model_files.model_file import load_model
-from test.fixtures.walking import FOCAL, IMAGE, in_layout
 
 CAMERA = Intrinsics((FOCAL, FOCAL), (IMAGE[0] / 2, IMAGE[1] / 2))
 LIFTER = Lifter(load_model("human"))
