@@ -62,8 +62,9 @@ class Recipe:
     )
     seeds: int = option(
         3,
-        "random initialisations that are compared at the start; the one with the lowest cycle "
-        "error is trained to the end",
+        "random initialisations that are compared at the start, at most; one that mirrors no frame "
+        "is trained to the end at once, else the one with the lowest sum of cycle error and share "
+        "of mirrored frames",
         low=1,
         high=1000,
     )

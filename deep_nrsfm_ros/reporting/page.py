@@ -40,7 +40,7 @@ _CURVES = {
     "cycle_error": "cycle error",
     "coherence": "coherence of the final dictionary",
 }
-_QUALITY = ("combined", "reprojection_error", "cycle_error", "coherence")
+_QUALITY = ("combined", "reprojection_error", "cycle_error", "coherence", "mirrored_share")
 _CAMERA_TO_SCREEN = np.array([1, -1, -1])  # x right, y down, z forward to x right, y up, z back
 
 

@@ -32,7 +32,8 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
 
     Returns:
         The model. Its `quality` is label-free: errors relative to the size of the object, 0 is
-        perfect, and the coherence of the final dictionary, 0 to 1.
+        perfect; the coherence of the final dictionary, 0 to 1; and the share of frames with
+        mirrored depth, 0 to 0.5, where the frames tell it and the training came to its end.
     """
     net = trainer.net.map(lambda w: w.cpu().numpy())
     normaliser = trainer.preset.normaliser
@@ -83,9 +84,12 @@ def _provenance(trainer: Trainer, source: str) -> dict[str, Any]:
 def _quality(trainer: Trainer, dictionary_coherence: float) -> dict[str, float]:
     """Return the label-free quality of the model, for its file."""
     reprojection_error, cycle_error = trainer.measure()
-    return {
+    quality = {
         "reprojection_error": round(reprojection_error, 5),
         "cycle_error": round(cycle_error, 5),
         "combined": round(math.hypot(reprojection_error, cycle_error), 5),
         "coherence": round(dictionary_coherence, 5),
     }
+    if not math.isnan(trainer.mirrored_share):
+        quality["mirrored_share"] = round(trainer.mirrored_share, 5)
+    return quality

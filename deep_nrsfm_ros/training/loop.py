@@ -28,6 +28,7 @@ from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
+from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, most_frames
 from deep_nrsfm_ros.training.progress import Clock, Progress
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -165,6 +166,7 @@ class _Loop:
         self.leader: Trainer | None = None
         self.leader_error = math.inf
         self.best = BestCheckpoint(setup.limits, recipe)
+        self.mirror = MirrorCheck(frames, preset.normaliser, most_frames(recipe), self.group)
         self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
         self.saved = time.monotonic()
         self.stopped, self.time_fraction = False, 0.0
@@ -187,14 +189,17 @@ class _Loop:
                 no_improvement=self.best.patience_exceeded,
             )
         self.best.restore_best(trainer)
+        if trainer.end_reason:
+            trainer.mirrored_share = self.mirror.share(trainer.net)
         if not self.group.rank:
             self.callbacks.on_progress(self.clock.progress(trainer))
         return trainer
 
     def _screen(self) -> None:
-        """Choose the seed with the lowest cycle error after a short training.
+        """Choose the seed with the lowest sum of cycle error and share of mirrored frames.
 
-        A half-mirrored solution has a high cycle error early, however low its loss is.
+        Both are measured after a short training. A seed that mirrors no frame goes on at once: its
+        rivals could only be better by a chance that the rest of the training levels.
         """
         recipe = self.preset.recipe
         steps = min(recipe.screening, recipe.steps // 10)
@@ -203,8 +208,12 @@ class _Loop:
             if self.stopped:
                 return
             _, error = self.group.mean(self.trainer.measure())
+            mirrored = self.mirror.share(self.trainer.net)
+            error += 0.0 if math.isnan(mirrored) else mirrored
             if self.leader is None or error < self.leader_error:
                 self.leader, self.leader_error = self.trainer, error
+            if mirrored <= TOLERATED:
+                break
             if done < recipe.seeds:
                 self.trainer = self._trainer(self.first_seed + done)
         assert self.leader is not None

@@ -104,7 +104,10 @@ def _train_and_save(
         checkpoint.unlink(missing_ok=True)
         raise CancelledError
     from deep_nrsfm_ros.training.finish import finish
+    from deep_nrsfm_ros.training.mirror import warning
 
+    if text := warning(trainer.mirrored_share):
+        reporter.warn(text)
     dataset = prepared.dataset
     model = finish(trainer, config.output.name, dataset.layout, dataset.source)
     date = time.strftime("%Y-%m-%d", time.gmtime())

@@ -43,6 +43,7 @@ class Trainer:
         time_fraction: fraction of the time limit that has elapsed, 0 without a limit.
         kept_step: step of the weights where they are not those of the last step, else None.
         end_reason: why the training has ended; "" if it was stopped or goes on.
+        mirrored_share: share of frames with mirrored depth at the end, 0 to 0.5; NaN unknown.
         total_frames: frames of all processes.
         cpu_seconds: processor time of this process in steps.
     """
@@ -77,6 +78,7 @@ class Trainer:
         self.time_fraction = 0.0
         self.kept_step: int | None = None
         self.end_reason = ""
+        self.mirrored_share = math.nan
         device = frames.device
         initial = start or initialise(
             architecture,

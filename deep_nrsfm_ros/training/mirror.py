@@ -1,0 +1,191 @@
+"""Mirrored frames in training: found without labels.
+
+`MirrorTest` of `nrsfm.neighbours` on the frames of a training. Its reference shapes depend on the
+frames alone, so all seeds share them. As known shapes of the cycle loss they teach a network the
+handedness that most of its frames have already.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from deep_nrsfm_ros.batched import slices
+from deep_nrsfm_ros.nrsfm.geometry import Floats, align, centre, centre_visible
+from deep_nrsfm_ros.nrsfm.neighbours import (
+    MirrorTest,
+    Neighbours,
+    Reference,
+    join,
+    mirrored_frames,
+    nearest,
+    rigid_shapes,
+)
+from deep_nrsfm_ros.nrsfm.network import (
+    Architecture,
+    Network,
+    initialise,
+    reconstruct,
+    whiten,
+    whitening,
+)
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
+from deep_nrsfm_ros.nrsfm.recipe import Recipe
+from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
+from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.trainer import second_moment
+
+MOST_FRAMES = 15_000
+"""Frames of the reference: 9 s on one core, 0.6 GB."""
+TOLERATED = 0.005
+"""Share of mirrored frames up to which a network counts as not mirrored."""
+MIN_TESTED = 0.5
+"""Share of the frames that the test must tell something about, for its share to count."""
+
+_NEIGHBOURS = 16
+_FLOOR = 1e-3  # of the whitening of the search
+_MIN_WEIGHT = 0.3  # of a reference shape that is taught
+
+
+def most_frames(recipe: Recipe) -> int:
+    """Return the frames of the reference, so that it takes about 3 % of the training's time."""
+    taken = recipe.steps * recipe.batch / (10_000 * 64)
+    return int(np.clip(MOST_FRAMES * math.sqrt(taken), 1000, MOST_FRAMES))
+
+
+def warning(share: float) -> str:
+    """Return a warning if the share of mirrored frames is more than tolerated, else ""."""
+    if not share > TOLERATED:  # NaN: unknown
+        return ""
+    return (
+        f"{100 * share:.1f} % of the frames have a mirrored depth: frames of nearly the same shape "
+        "from other sides are lifted as its mirror image; train with another seed (--seed) or "
+        "more of them (--seeds)"
+    )
+
+
+class MirrorCheck:
+    """The mirror test on a fixed sample of the frames of one process.
+
+    Attributes:
+        points: (n, p, 2) the frames of the sample, 0 where missing.
+        visible: (n, p).
+        on_progress: called with the frames done and n while the reference is computed.
+    """
+
+    def __init__(
+        self,
+        frames: FrameStore,
+        normaliser: Normaliser,
+        most: int = MOST_FRAMES,
+        group: ProcessGroup = ALONE,
+    ) -> None:
+        """Take the sample; the reference is computed when it is first needed.
+
+        Args:
+            frames: of this process.
+            normaliser: of the network's input.
+            most: frames of the sample; random ones if there are more.
+            group: all its processes make the check at the same time.
+        """
+        order = np.random.default_rng(0).permutation(len(frames))[:most]
+        batch = frames.batch(torch.from_numpy(np.sort(order)).to(frames.device))
+        self.points: NDArray[np.float32] = batch.points.cpu().numpy()
+        self._mask: NDArray[np.float32] = batch.mask.cpu().numpy()
+        self.visible: NDArray[np.bool_] = self._mask[..., 0] > 0
+        self.on_progress: Callable[[int, int], None] = lambda done, total: None
+        self._normaliser, self._group = normaliser, group
+        self._moment = second_moment(frames, normaliser, group)
+
+    @cached_property
+    def _reference(self) -> tuple[Neighbours, Reference]:
+        """Return the neighbours of the sample's frames, and a shape of each."""
+        L, L_inverse = whitening(self._moment, 1.0, _FLOOR)
+        net = _search_network(L, L_inverse)
+        W = self._normalised(net)
+        pairs = nearest(whiten(net, W), _NEIGHBOURS, self.on_progress)
+        return pairs, join(rigid_shapes(W, pairs), pairs)
+
+    def _normalised(self, net: Network) -> Floats:
+        """Return the completed and normalised keypoints (n, p, 2), as the input of a network."""
+        parts = [
+            normalise(net, self._normaliser, self.points[rows], self._mask[rows]).W
+            for rows in slices(len(self.points))
+        ]
+        return np.concatenate(parts) if parts else self.points
+
+    def lift(self, net: Network) -> Floats:
+        """Return the shapes (n, p, 3) of a network of arrays, centred, moved onto the keypoints."""
+        S = np.empty((*self.points.shape[:2], 3))
+        for rows in slices(len(S)):
+            mask = self._mask[rows]
+            W, gain, _, _ = normalise(net, self._normaliser, self.points[rows], mask)
+            X, M = reconstruct(net, W * gain)
+            S[rows] = centre(X + centre_visible(W - X @ M, mask) @ M.swapaxes(1, 2))
+        return S
+
+    def test(self, net: Network) -> MirrorTest:
+        """Return which frames of the sample a network of arrays or tensors mirrors."""
+        _, reference = self._reference
+        return mirrored_frames(self.lift(_arrays(net)), self.visible, reference)
+
+    def share(self, net: Network) -> float:
+        """Return the share of mirrored frames, 0 to 0.5; NaN where the frames tell too little.
+
+        They do where most of them have no neighbour from another side, as a video from a fixed
+        camera may be. In a group it is the mean over the processes, which all call this.
+        """
+        test = self.test(net)
+        share, tested = self._group.mean((test.share, float(test.tested.mean())))
+        return share if tested >= MIN_TESTED else math.nan
+
+    def known_shapes(self, net: Network) -> Tensor:
+        """Return the reference shapes (m, p, 3) in the axes and the handedness of a network.
+
+        Mirrored frames come out with the handedness of the majority, in the axes of a neighbour
+        that is not mirrored. Missing keypoints are those that the network lifts.
+        """
+        pairs, reference = self._reference
+        X = self.lift(_arrays(net))
+        test = mirrored_frames(X, self.visible, reference)
+        target = _unmirrored(X, test.mirrored, pairs)
+        mirror = np.where(test.handedness[:, None, None] < 0, np.array([1, 1, -1]), 1)
+        shapes = align(reference.shapes * mirror, target).aligned
+        shapes *= np.linalg.norm(target, axis=(1, 2), keepdims=True)
+        shapes = centre(np.where(self.visible[..., None], shapes, target))
+        sound = test.tested & (reference.weights > _MIN_WEIGHT)
+        return torch.from_numpy(shapes[sound].astype(np.float32))
+
+
+def _unmirrored(X: Floats, mirrored: NDArray[np.bool_], pairs: Neighbours) -> Floats:
+    """Return shapes X (n, p, 3) with the mirrored ones reflected into the axes of the others.
+
+    Each is fitted to its nearest neighbour that is not mirrored, or to the mean of all of those.
+    """
+    if not mirrored.any():
+        return X
+    others = pairs.frames[mirrored]
+    sound: NDArray[np.bool_] = np.logical_not(mirrored[others])
+    first = np.take_along_axis(others, sound.argmax(1)[:, None], 1)[:, 0]
+    target = np.where(sound.any(1)[:, None, None], X[first], X[~mirrored].mean(0))
+    result = X.copy()
+    result[mirrored] = align(X[mirrored] * np.array([1, 1, -1]), target).aligned
+    return result
+
+
+def _arrays(net: Network) -> Network:
+    """Return a network of arrays."""
+    return net.map(lambda w: w if isinstance(w, np.ndarray) else w.detach().cpu().numpy())
+
+
+def _search_network(L: NDArray[np.float32], L_inverse: NDArray[np.float32]) -> Network:
+    """Return a network of which only the whitening is used, to complete and whiten keypoints."""
+    net = initialise(Architecture(widths=(1,)), len(L), np.random.default_rng(0))
+    return dataclasses.replace(net, L=L, L_inverse=L_inverse)
