@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from itertools import islice
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from deep_nrsfm_ros.data.definitions import DefinitionError, find_types
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, InputType, read_observation
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
+from deep_nrsfm_ros.messages.mapping_file import shipped_mappings
 from deep_nrsfm_ros.messages.topics import WILDCARD, match
 
 _SAMPLE = 16  # messages of a topic that are read to see whether it fits
@@ -88,7 +89,7 @@ def find_topics(
             missing = f"no topic of type {mapping.type}, that of the field mapping"
         listing = ", ".join(f"{t.name} [{t.input_type}]" for t in bag.topics)
         has = f"its topics are: {listing}" if listing else "it has no topics at all"
-        raise BagError(f"bag {bag.path} has {missing}; {has}")
+        raise BagError(f"bag {bag.path} has {missing}; {has}{_mapping_hint(bag.topics, mapping)}")
     filled = [topic for topic in chosen if bag.has_messages(topic)]
     if not filled:
         names = " and ".join(f"{t.name} [{t.input_type}]" for t in chosen)
@@ -103,8 +104,19 @@ def find_topics(
             raise BagError(
                 f"topic {topic.name} of bag {bag.path} has type {topic.input_type}; "
                 f"it must be one of {', '.join(kinds)}, or come with a field mapping"
+                + _mapping_hint([topic], mapping)
             )
     return [(topic, kinds[topic.input_type]) for topic in filled]
+
+
+def _mapping_hint(topics: Iterable[Topic], mapping: FieldMapping | None) -> str:
+    """Return which field mapping of the package reads one of some topics; "" if none does."""
+    if mapping:
+        return ""
+    for topic in topics:
+        if files := shipped_mappings(topic.input_type):
+            return f"; {files[0]} is a field mapping of {topic.input_type} (--mapping)"
+    return ""
 
 
 def _described(pair: tuple[Topic, InputType]) -> str:

@@ -147,8 +147,9 @@ def _without_copies(detections: Detections) -> Detections:
     Objects of which the input gives different identities are kept.
     """
     is_same_frame = np.diff(detections.frame) == 0
-    indices = index_in_frame(detections.frame).astype(str)
-    if not is_same_frame.any() or (detections.identities != indices).any():
+    if not is_same_frame.any():
+        return detections
+    if (detections.identities != index_in_frame(detections.frame).astype(str)).any():
         return detections
     m = len(detections)
     columns = (detections.frame, *detections.points.reshape(m, -1).T, *detections.confidence.T)

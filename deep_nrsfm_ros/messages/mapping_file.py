@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from deep_nrsfm_ros.messages.field_mapping import NEGATIVE, NORMALISED, PIXELS, FieldMapping
 from deep_nrsfm_ros.messages.field_path import FieldPath
+from deep_nrsfm_ros.model_files.folders import mapping_folders
 from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 
 MAPPING_SUFFIXES = (".yaml", ".yml")
@@ -50,6 +52,17 @@ def read_mapping(path: Path) -> FieldMapping:
         return _mapping(read_fields(path, "type: my_msgs/People"))
     except ValueError as error:
         raise MappingError(f"field mapping {path}: {error}") from error
+
+
+def shipped_mappings(kind: str) -> list[Path]:
+    """Return the field mappings of a message type, "package/Type", that come with the package."""
+    found: dict[str, Path] = {}
+    for folder in mapping_folders():
+        for path in sorted(folder.glob(f"*{MAPPING_SUFFIXES[0]}")):
+            with suppress(ValueError):
+                if read_mapping(path).type == kind:
+                    found.setdefault(path.name, path)
+    return list(found.values())
 
 
 def _mapping(content: dict[Any, Any]) -> FieldMapping:

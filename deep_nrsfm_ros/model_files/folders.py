@@ -38,6 +38,11 @@ def layout_folders() -> list[Path]:
     return [*_shared("config/layouts"), _SOURCE_TREE / "config" / "layouts"]
 
 
+def mapping_folders() -> list[Path]:
+    """Return the folders of the field mappings that come with the package."""
+    return [*_shared("config/mappings"), _SOURCE_TREE / "config" / "mappings"]
+
+
 def _ros_home() -> Path:
     home = os.environ.get("ROS_HOME")
     return Path(home) if home else Path.home() / ".ros"

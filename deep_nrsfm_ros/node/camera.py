@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -17,6 +19,8 @@ from deep_nrsfm_ros.messages.field_mapping import Size
 
 # Drivers publish CameraInfo with every image; a simulator or a bag may publish it once, latched.
 _STREAM = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+_TYPE = "sensor_msgs/msg/CameraInfo"
+_LOOK_PERIOD = 2.0  # seconds between two looks at the topics
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -83,7 +87,8 @@ class CameraInfoSubscription:
         self.size: Size | None = None
         self._rectified = options.rectified
         self._topic = ""
-        self._problem = "has not been received: is the camera's driver running?"
+        self._problem = ""
+        self._node, self._silence, self._looked = node, "", -math.inf
         if not self.enabled:
             return
         for qos in (_STREAM, _LATCHED):
@@ -104,7 +109,7 @@ class CameraInfoSubscription:
             MessageError: no usable CameraInfo has been received.
         """
         if self.enabled and self.intrinsics is None:
-            raise MessageError(f"CameraInfo on {self._topic} {self._problem}")
+            raise MessageError(self._missing())
         return self.intrinsics
 
     @property
@@ -113,8 +118,37 @@ class CameraInfoSubscription:
         if not self.enabled:
             return "none: objects are centred"
         if self.intrinsics is None:
-            return f"CameraInfo on {self._topic} {self._problem}"
+            return self._missing()
         return f"{self.intrinsics.lens}, focal length {self.intrinsics.focal[0]:.1f} pixels"
+
+    def _missing(self) -> str:
+        """Return why there are no intrinsics, and the remedy."""
+        if not self._problem and time.monotonic() - self._looked > _LOOK_PERIOD:
+            self._looked = time.monotonic()
+            self._silence = self._why_silent()
+        return f"CameraInfo on {self._topic} {self._problem or self._silence}"
+
+    def _why_silent(self) -> str:
+        """Return why no CameraInfo has been received, from the topics that there are."""
+        kinds = dict(self._node.get_topic_names_and_types())
+        publishers = self._node.get_publishers_info_by_topic(self._topic)
+        if others := [p.topic_type for p in publishers if p.topic_type != _TYPE]:
+            return f"has not been received: the topic carries {others[0]}"
+        if publishers:
+            return (
+                "has not been received: it has a publisher, which has sent nothing yet; is the "
+                "camera's driver running?"
+            )
+        found = [
+            name
+            for name, types in kinds.items()
+            if _TYPE in types and self._node.count_publishers(name)
+        ]
+        known = f"; CameraInfo is published on {', '.join(found)}: set camera_info" if found else ""
+        return (
+            f"has not been received: nobody publishes it{known or '; start the camera driver'}, or "
+            "leave camera_info empty to lift without places"
+        )
 
     def _receive(self, message: CameraInfo) -> None:
         """Keep the intrinsics of a CameraInfo, or the reason why it has none."""

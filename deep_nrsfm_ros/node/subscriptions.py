@@ -24,6 +24,7 @@ from rclpy.subscription import Subscription
 from deep_nrsfm_ros.lifting.tracking import Tracker
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, InputType, resolve_input_type, type_name
 from deep_nrsfm_ros.messages.dropped_messages import DroppedMessages
+from deep_nrsfm_ros.messages.mapping_file import shipped_mappings
 from deep_nrsfm_ros.messages.options import AUTO, InputOptions
 from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.messages.stamps import TopicClock
@@ -205,6 +206,7 @@ class KeypointSubscriptions:
                 if usable
                 else "change the publisher, or start the lifter with another input_type, which may "
                 "be the path of a field mapping"
+                + "".join(f", as {path}" for kind in types for path in shipped_mappings(kind)[:1])
             )
             expected = "one type" if usable else " or ".join(self._usable_types)
             self._report(f"{topic} carries {', '.join(types)}; expected {expected}: {remedy}")

@@ -358,3 +358,12 @@ def point_cloud_bag(path: Path, maker: Any) -> Path:
     """Write a bag of one person, whose messages have no score of the person."""
     messages = [cloud_of(maker, p) for p in people(3, 17)]
     return write(path, maker, {"/k": ("sensor_msgs/PointCloud2", messages)})
+
+
+def test_a_type_that_a_shipped_mapping_reads_is_said(tmp_path: Path, recorded: Any) -> None:
+    message = recorded.detections([], package="yolov8_msgs")
+    bag = write(tmp_path / "bag", recorded, {"/d": ("yolov8_msgs/DetectionArray", [message])})
+    with pytest.raises(BagError, match=r"no keypoint topic; .*yolov8\.yaml is a field mapping"):
+        read_keypoints(bag)
+    with pytest.raises(BagError, match=r"has type yolov8_msgs.*yolov8\.yaml is a field mapping"):
+        read_keypoints(bag, ReadOptions(topic="/d"))

@@ -67,8 +67,11 @@ def test_objects_are_at_their_place_once_camera_info_is_heard(
     message, pixels = keypoints()
     sender = client.node.create_timer(0.1, lambda: publisher.publish(message))
     client.wait_for_health(
-        lambda _, v: "/camera_info has not been received" in v["last problem"] + v["camera"]
+        lambda _, v: "/camera_info has not been received: nobody publishes it" in v["camera"]
     )
+    other = client.node.create_publisher(CameraInfo, "/color/camera_info", STREAM)
+    client.wait_for_health(lambda _, v: "on /color/camera_info: set camera_info" in v["camera"])
+    client.node.destroy_publisher(other)
     assert not client.heard["/lifter/points"]
     client.node.destroy_timer(sender)
 
