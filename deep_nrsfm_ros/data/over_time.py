@@ -130,22 +130,27 @@ def lift_stream(
     passes = 3 if over_time.smooth == BOTH else 1
     m = len(stream.identities)
     end = float(stream.seconds[-1]) + _BETWEEN if len(stream.seconds) else 0.0
-    results = []
+    results: list[Lifted] = []
     for number in range(passes):
         backward = number == 1
         order = range(len(stream.frames))
-        parts: list[Lifted | None] = [None] * len(order)
+        whole: Lifted | None = None
         for i in reversed(order) if backward else order:
             rows, second = stream.frames[i], float(stream.seconds[i])
             time = 2 * number * end + (end - second if backward else second)
             names = tuple(stream.identities[rows]) if over_time.smooth != NONE else ()
             names = names or ("",) * (rows.stop - rows.start)
             context = memory(names, time, over_time.up)
-            parts[i] = lift(stream.points[rows], stream.confidence[rows], context)
+            part = lift(stream.points[rows], stream.confidence[rows], context)
+            if whole is None:
+                whole = Lifted(*(np.empty((m, *each.shape[1:]), each.dtype) for each in part))
+            # Each frame goes to its place, so that memory holds the objects but once.
+            for array, values in zip(whole, part, strict=True):
+                array[rows] = values
             on_progress((number * m + (m - rows.start if backward else rows.stop)) // passes, m)
-        whole = [part for part in parts if part is not None]
-        results.append(Lifted(*(np.concatenate(each) for each in zip(*whole, strict=True))))
-    return results[0] if passes == 1 else _mean(results[1], results[2])
+        assert whole is not None  # a stream has frames
+        results = [*results[-1:], whole]  # the first of three passes learns the bones only
+    return results[0] if passes == 1 else _mean(*results)
 
 
 def _mean(a: Lifted, b: Lifted) -> Lifted:
