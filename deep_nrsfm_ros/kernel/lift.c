@@ -120,17 +120,75 @@ static void refill_input(Plan *k, Object *o, int perspective) {
     }
 }
 
+/* Set the gap of the missing keypoints, `gaps` of lifting/confidence.py; return the known fraction of the variance of
+   all keypoints. The diagonal of the inverse of U^T U is the squared length of the columns of U^-T. */
+static double set_gaps(Plan *k, const Object *o) {
+    int p = k->p, m = 0, *missing = k->missing;
+    double unknown = 0, *y = k->spread;
+    for (int i = 0; i < p; i++)
+        if (!o->visible[i]) missing[m++] = i;
+    if (!m) return 1;
+    int n = DOUBLES_OF(m), stride = n + DOUBLES;
+    memset(k->system, 0, (size_t)n * stride * sizeof(double));
+    for (int a = 0; a < n; a++) {
+        double *row = k->system + (size_t)a * stride;
+        if (a >= m) row[a] = 1;
+        for (int b = a; b < m; b++) row[b] = k->point_precision[(size_t)missing[a] * p + missing[b]];
+    }
+    solve(n, 0, stride, k->system);
+    for (int a = 0; a < m; a++) {
+        double square = 0;
+        for (int b = a; b < m; b++) y[b] = b == a;
+        for (int b = a; b < m; b++) {
+            const double *U = k->system + (size_t)b * stride;
+            y[b] /= U[b];
+            square += y[b] * y[b];
+            for (int c = b + 1; c < m; c++) y[c] -= U[c] * y[b];
+        }
+        k->gap[missing[a]] = sqrt(square);
+        unknown += square / p;
+    }
+    return fmax(1 - unknown, k->min_known);
+}
+
 /* Set the confidence (p): the chance that each keypoint of a shape of this RMS radius is near its true place.
 
    As keypoint_confidence of lifting/confidence.py. */
 static void set_confidence(Plan *k, const Object *o, double radius, float *confidence) {
-    const double *by = k->calibration;
-    double common = by[0] + by[2] * log(o->residual + k->residual_offset) +
-                    by[3] * log(fmax(o->visible_count, 1) / k->p);
-    for (int i = 0; i < k->p; i++) {
-        double odds = exp(-common - by[1] * log(k->error_std[i] / fmax(radius, 1e-9)));
-        double detected = o->visible[i] ? fmin(o->confidence[i], 1) : 0;
-        confidence[i] = (float)(detected / (1 + odds) + (1 - detected) / (1 + odds * exp(-by[4])));
+    const double *seen = k->calibration, *hidden = seen + COEFFICIENTS;
+    int p = k->p, stride = k->stride;
+    double count = fmax(o->visible_count, 1), centroid[3] = {0}, extent = 0;
+    radius = fmax(radius, 1e-9);
+    for (int r = 0; r < 3; r++) {
+        for (int i = 0; i < p; i++) centroid[r] += o->visible[i] * o->S[r * stride + i];
+        centroid[r] /= count;
+    }
+    double *distance = k->spread;
+    double explained = set_gaps(k, o); /* before the distances, which take the place of its scratch memory */
+    for (int i = 0; i < p; i++) {
+        double square = 0;
+        for (int r = 0; r < 3; r++) {
+            double offset = (o->S[r * stride + i] - centroid[r]) / radius;
+            square += offset * offset;
+        }
+        extent += o->visible[i] * square / count;
+        distance[i] = sqrt(square);
+    }
+    double log_residual = log(o->residual + k->residual_offset), log_radius = log(radius);
+    double log_extent = log(sqrt(extent) + k->extent_offset);
+    double common = seen[0] - seen[1] * log_radius + seen[2] * log_residual + seen[3] * log(count / p) +
+                    seen[4] * log_extent;
+    double common_hidden = hidden[0] - hidden[1] * log_radius + hidden[2] * log_residual +
+                           hidden[3] * log(explained) + hidden[4] * log_extent;
+    for (int i = 0; i < p; i++) {
+        double detected = o->visible[i] ? o->certainty[i] : 0, log_std = k->log_error_std[i], chance = 0;
+        if (detected > 0) chance = detected / (1 + exp(-common - seen[1] * log_std - seen[5] * distance[i]));
+        if (detected < 1) {
+            double gap = o->visible[i] ? 1 / sqrt(k->point_precision[(size_t)i * p + i]) : k->gap[i];
+            chance += (1 - detected) / (1 + exp(-common_hidden - hidden[1] * log_std - hidden[5] * distance[i] -
+                                                hidden[6] * gap));
+        }
+        confidence[i] = (float)chance;
     }
 }
 
@@ -195,7 +253,7 @@ static void set_weights(const Plan *k, Object *o) {
     o->visible_count = 0;
     for (int i = 0; i < k->p; i++) {
         double ratio = fmin(fmin(o->confidence[i], 1) / usual, 1), r = ratio * ratio;
-        o->weight[i] = r * r * r;
+        o->certainty[i] = ratio, o->weight[i] = r * r * r;
         o->visible_count += o->input_mask[i] = o->visible[i] = o->weight[i] >= k->trusted_weight;
     }
 }

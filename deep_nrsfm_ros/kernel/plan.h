@@ -21,7 +21,7 @@ typedef struct {
     const float *image_points, *confidence; /* (p, 2), (p): the arguments of `lift` */
     float *input, *input_mask;              /* (p, 2), (p): what the network reads, refilled round by round */
     float *visible;                         /* (p), 1 or 0: whether the network reads the keypoint */
-    double *weight;                         /* (p) in the correction; 0 = missing */
+    double *weight, *certainty;             /* (p) in the correction, and relative confidence; 0 = missing */
     float *W, *S;                           /* (p, 2), (3, stride) in camera axes */
     double gain;                            /* p / number of keypoints in the input */
     double unit, origin[2];                 /* image = unit W + origin */
@@ -64,14 +64,15 @@ typedef struct {
     const int *bone_partners;    /* (bones): of each bone that of the other side, or itself */
     Matrix L, L_inverse, encoder[MAX_LAYERS], decoder[MAX_LAYERS], code_head;
     const float *b[MAX_LAYERS], *b_[MAX_LAYERS], *camera_head;
-    const float *error_std, *covariance;                                 /* (p), (p, 3, 3, p) in DOUBLES */
+    const float *log_error_std, *covariance;                             /* (p), (p, 3, 3, p) in DOUBLES */
     const double *completion, *image_rotations, *object_frame;           /* (p, p), (rotations, 2, 2), (3, 3) */
-    const double *calibration, *bone_lengths;                            /* (5), (bones, 2) length and deviation */
+    const double *calibration, *point_precision;                         /* (2, COEFFICIENTS), (p, p) */
+    const double *bone_lengths;                                          /* (bones, 2) length and deviation */
     const double *bone_correlation;                                      /* (bones, bones), symmetric */
     const double *axis;                                                  /* (p) from bottom to top */
     Past past;
     double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, residual_offset,
-        trusted_weight, full_ratio;
+        trusted_weight, full_ratio, extent_offset, min_known;
     void *constants, *scratch; /* the memory of all above, and of all below */
     int busy;                  /* whether a lift computes in the scratch memory */
     /* Scratch memory, for `block` objects at a time. Rows of doubles are filled up to multiples of DOUBLES. */
@@ -88,7 +89,10 @@ typedef struct {
     double *sight;                /* (2, bones) growth and weight of the bones in this frame */
     double *precision, *no_growth; /* (bones) length / deviation of the model; 0 */
     double *spread;               /* (DOUBLES, 2, p) of bones and keypoints in the image */
+    double *gap;                  /* (p) deviation of a missing keypoint given the visible ones */
 } Plan;
+
+#define COEFFICIENTS 7 /* of the log odds of a keypoint: Coefficients of lifting/confidence.py */
 
 /* Limits of a plan, as those of a network in algebra.h. */
 #define MAX_ROTATIONS 1024

@@ -11,6 +11,7 @@
 #define MAX_CORRELATION 1.001
 
 #define HEADER_LENGTH 13
+#define SCALARS 10 /* doubles at the end of a plan */
 
 static int in_range(int value, int first, int last) { return first <= value && value <= last; }
 
@@ -97,26 +98,29 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     last = k->widths[k->layers - 1];
     f = matrix(&k->code_head, 6 * FLOATS_OF(last), last, f, &f_items);
     k->camera_head = f, f += take(&f_items, last, 1);
-    k->error_std = f, f += take(&f_items, p, 1);
+    k->log_error_std = f, f += take(&f_items, p, 1);
     k->covariance = f, take(&f_items, 9 * DOUBLES_OF(p), DOUBLES_OF(p));
     k->completion = d, d += take(&d_items, p, p);
     k->image_rotations = d, d += take(&d_items, k->rotations, 4);
     k->object_frame = d, d += take(&d_items, 9, 1);
-    k->calibration = d, d += take(&d_items, 5, 1);
+    k->calibration = d, d += take(&d_items, 2, COEFFICIENTS);
+    k->point_precision = d, d += take(&d_items, p, p);
     k->bone_lengths = d, d += take(&d_items, k->bones, 2);
     k->bone_correlation = d, d += take(&d_items, k->bones, k->bones);
     k->axis = d, d += take(&d_items, p, 1);
     const double *past = d;
     d += take(&d_items, PAST_NUMBERS, 1);
-    take(&d_items, 8, 1);
+    take(&d_items, SCALARS, 1);
     if (f_items.exceeded || f_items.left) return "the array of float32 has another length";
     if (d_items.exceeded || d_items.left) return "the array of float64 has another length";
     k->noise = *d++, k->reference_length = *d++, k->unknown_variance = *d++, k->min_relative_depth = *d++;
     k->residual_scale = *d++, k->residual_offset = *d++, k->trusted_weight = *d++, k->full_ratio = *d++;
-    const double *scalars = &d[-8];
-    for (int i = 0; i < 8; i++)
+    k->extent_offset = *d++, k->min_known = *d++;
+    const double *scalars = &d[-SCALARS];
+    for (int i = 0; i < SCALARS; i++)
         if (!(scalars[i] >= 0 && scalars[i] < INFINITY)) return "a variance or length is negative or not finite";
-    if (!k->min_relative_depth || !k->residual_scale || !k->residual_offset || !k->trusted_weight) return "a divisor is zero";
+    if (!k->min_relative_depth || !k->residual_scale || !k->residual_offset || !k->trusted_weight || !k->extent_offset ||
+        !k->min_known) return "a divisor is zero";
     for (int i = 0; i < PAST_NUMBERS; i++)
         if (!(past[i] >= 0 && past[i] < INFINITY)) return "a constant of the past is negative or not finite";
     memcpy(&k->past, past, sizeof(Past));
@@ -176,6 +180,7 @@ int lay_out_scratch(Plan *k, char *memory, size_t *size) {
     k->precision = room(a, sizeof(double), k->bones, 1);
     k->no_growth = room(a, sizeof(double), k->bones, 1);
     for (int b = 0; memory && b < k->bones; b++) k->precision[b] = k->bone_lengths[2 * b] / k->bone_lengths[2 * b + 1];
+    k->gap = room(a, sizeof(double), p, 1);
     k->missing = room(a, sizeof(int), p, 1);
     k->incomplete = room(a, sizeof(Object *), n, 1);
     k->objects = room(a, sizeof(Object), n, 1);
@@ -185,6 +190,7 @@ int lay_out_scratch(Plan *k, char *memory, size_t *size) {
         o->input_mask = room(a, sizeof(float), p, 1);
         o->visible = room(a, sizeof(float), p, 1);
         o->weight = room(a, sizeof(double), p, 1);
+        o->certainty = room(a, sizeof(double), p, 1);
         o->W = room(a, sizeof(float), p, 2);
         o->S = room(a, sizeof(float), 3, stride);
         o->own_bones = room(a, sizeof(double), k->bones, 2);

@@ -13,14 +13,18 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.kernel import _kernel
 from deep_nrsfm_ros.lifting import gravity, history, own_bones
-from deep_nrsfm_ros.lifting.confidence import CALIBRATED, RESIDUAL_OFFSET
+from deep_nrsfm_ros.lifting.confidence import (
+    EXTENT_OFFSET,
+    MIN_KNOWN,
+    RESIDUAL_OFFSET,
+)
 from deep_nrsfm_ros.lifting.correction import UNKNOWN_VARIANCE
 from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.numpy_backend import MIN_RELATIVE_DEPTH, RESIDUAL_SCALE, LifterConstants
 from deep_nrsfm_ros.lifting.options import HistoryOptions
 from deep_nrsfm_ros.lifting.weights import FULL_RATIO, TRUSTED_RATIO
 from deep_nrsfm_ros.nrsfm.bones import Bones
-from deep_nrsfm_ros.nrsfm.network import completion_matrix
+from deep_nrsfm_ros.nrsfm.network import completion_matrix, point_precision
 
 
 class CompiledBackend:
@@ -59,7 +63,11 @@ class CompiledBackend:
             floats += [_panels(encoder), _padded(b), _panels(decoder), _padded(b_ if i else b_.T)]
         last = options.widths[-1]
         code_head = _padded(net.code_head.reshape(6, last, last).swapaxes(1, 2)).swapaxes(1, 2)
-        floats += [_panels(code_head.reshape(-1, last)), net.camera_head, constants.error_std]
+        floats += [
+            _panels(code_head.reshape(-1, last)),
+            net.camera_head,
+            np.log(constants.error_std),
+        ]
         # Three rows for each keypoint: (p, 3, 3, p), both p padded.
         rows = _padded(covariance.reshape(p, 3, p, 3).swapaxes(2, 3), _kernel.DOUBLES)
         rows = _padded(rows.swapaxes(0, 3), _kernel.DOUBLES).swapaxes(0, 3)
@@ -67,7 +75,8 @@ class CompiledBackend:
         doubles = [completion_matrix(net), constants.test_time_rotations, constants.object_frame]
         axis = np.zeros(p) if constants.axis is None else constants.axis
         correlation = bones.correlation
-        doubles += [CALIBRATED, np.stack((bones.lengths, bones.spread), 1)]
+        doubles += [constants.calibration, point_precision(net)]
+        doubles += [np.stack((bones.lengths, bones.spread), 1)]
         doubles += [np.eye(len(bones.lengths)) if correlation is None else correlation]
         doubles += [axis, _past_constants(constants.history)]
         doubles += [
@@ -77,7 +86,7 @@ class CompiledBackend:
             MIN_RELATIVE_DEPTH,
             RESIDUAL_SCALE,
         ]
-        doubles += [RESIDUAL_OFFSET, TRUSTED_RATIO**6, FULL_RATIO]
+        doubles += [RESIDUAL_OFFSET, TRUSTED_RATIO**6, FULL_RATIO, EXTENT_OFFSET, MIN_KNOWN]
         self._plan = _kernel.plan(
             np.array(header, np.int32), _joined(floats, np.float32), _joined(doubles, np.float64)
         )

@@ -13,6 +13,7 @@ from deep_nrsfm_ros.kernel import supports
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
+from deep_nrsfm_ros.lifting.confidence import CALIBRATED
 from deep_nrsfm_ros.lifting.history import Context, Memory, StateLayout
 from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.lifting.observation import from_arrays
@@ -233,6 +234,7 @@ def _constants(
         history=history,
         bone_partners=partner_bones(ends, model.layout.sides()),
         axis=model.layout.vertical_axis(),
+        calibration=CALIBRATED,
     )
 
 

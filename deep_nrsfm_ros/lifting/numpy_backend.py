@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.layouts.keypoint_map import detected_count
-from deep_nrsfm_ros.lifting.confidence import keypoint_confidence
+from deep_nrsfm_ros.lifting.confidence import Calibration, Evidence, keypoint_confidence
 from deep_nrsfm_ros.lifting.correction import ErrorModel, correct
 from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.options import HistoryOptions
 from deep_nrsfm_ros.lifting.past import Past
-from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
+from deep_nrsfm_ros.lifting.weights import keypoint_weight, relative_confidence, trusted
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.geometry import (
     centre,
@@ -30,7 +30,7 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     rotation_from_camera,
     weak_perspective,
 )
-from deep_nrsfm_ros.nrsfm.network import Network, reconstruct
+from deep_nrsfm_ros.nrsfm.network import Network, point_precision, reconstruct
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 
 Float32 = NDArray[np.float32]
@@ -65,6 +65,7 @@ class LifterConstants(NamedTuple):
         history: time constants of what is remembered.
         bone_partners: (b,) of each bone the one of the other side; see `own_bones`.
         axis: (p,) from bottom to top; see `gravity`. None: the layout names neither.
+        calibration: of the confidence.
     """
 
     network: Network
@@ -84,6 +85,7 @@ class LifterConstants(NamedTuple):
     history: HistoryOptions
     bone_partners: NDArray[np.int32]
     axis: NDArray[np.float64] | None
+    calibration: Calibration
 
 
 class Keypoints(NamedTuple):
@@ -107,11 +109,13 @@ class NumpyBackend:
 
     Attributes:
         constants: model and options.
+        precision: (p, p) as in `confidence.gaps`.
     """
 
     def __init__(self, constants: LifterConstants) -> None:
         """Take model and options."""
         self.constants = constants
+        self.precision = point_precision(constants.network)
         self._partners = None if constants.partners is None else np.array(constants.partners)
 
     def __call__(
@@ -155,31 +159,15 @@ class NumpyBackend:
             past.write()
         S, R, residual, _, _ = solution
         S = centre(S)
-        believed = np.where(visible, confidence, np.float32(0))
-        probability = self.keypoint_confidence(believed, residual, S)
+        probability = keypoint_confidence(
+            Evidence(relative_confidence(confidence), visible, residual, S),
+            self.constants.error_std,
+            self.precision,
+            self.constants.calibration,
+        )
         S *= self.constants.reference_length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
         return (S, R, scale, translation, residual, probability), not_lifted
-
-    def keypoint_confidence(self, confidence: Float32, residual: Float32, S: Float32) -> Float32:
-        """Return the probability (n, p) that each lifted point is correct.
-
-        Args:
-            confidence: (n, p) of the detector.
-            residual: (n,) relative reprojection error.
-            S: (n, p, 3) centred shapes in units of the network.
-        """
-        return keypoint_confidence(confidence, residual, self.relative_error_std(S))
-
-    def relative_error_std(self, S: Float32) -> Float32:
-        """Return the standard deviation (n, p) of the errors, relative to the RMS radius.
-
-        Args:
-            S: (n, p, 3) centred shapes in units of the network.
-        """
-        radius = np.sqrt((S * S).sum(2).mean(1))
-        relative: Float32 = self.constants.error_std / np.maximum(radius, 1e-9)[:, None]
-        return relative
 
     def _solve(
         self, points: Float32, mask: Float32, seen: Keypoints, past: Past | None, last: bool

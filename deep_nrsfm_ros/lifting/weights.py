@@ -27,15 +27,25 @@ FULL_RATIO = 0.85
 _TRUSTED_WEIGHT = TRUSTED_RATIO**6
 
 
-def keypoint_weight(confidence: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the weights (n, p) in [0, 1] of keypoints; 0 where missing.
+def relative_confidence(confidence: NDArray[Any]) -> NDArray[np.float64]:
+    """Return min(c_i / c, 1) (n, p): the confidence relative to that of the object's keypoints.
 
     Args:
         confidence: (n, p) of the detector; 0 where missing, above 1 counts as 1.
     """
     c = np.minimum(confidence, 1.0).astype(np.float64)
     usual = FULL_RATIO * (c * c).sum(1) / np.maximum(c.sum(1), 1e-30)
-    square = np.minimum(c / np.maximum(usual, 1e-30)[:, None], 1) ** 2
+    ratio: NDArray[np.float64] = np.minimum(c / np.maximum(usual, 1e-30)[:, None], 1)
+    return ratio
+
+
+def keypoint_weight(confidence: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the weights (n, p) in [0, 1] of keypoints; 0 where missing.
+
+    Args:
+        confidence: (n, p) of the detector; 0 where missing, above 1 counts as 1.
+    """
+    square = relative_confidence(confidence) ** 2
     weight: NDArray[np.float64] = square * square * square
     return weight
 

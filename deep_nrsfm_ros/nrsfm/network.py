@@ -366,6 +366,25 @@ def completion_matrix(net: Network) -> Array:
     return P + 1e-6 * P.trace() * (net.L @ net.L_inverse)
 
 
+def point_precision(net: Network) -> NDArray[np.float64]:
+    """Return the inverse second moment (p, p) of the points, in units of their RMS radius.
+
+    The inverse of its part of some missing points is their covariance given the visible ones, with
+    any translation of them all: the Gaussian of `complete`, whatever the exponent of the whitening.
+    Without whitening all points vary alike. A small multiple of the identity makes every part
+    invertible.
+    """
+    p, exponent = net.p, net.architecture.whitening
+    root, U = np.linalg.eigh(np.asarray(net.L, np.float64))
+    # Without whitening the roots are 1, whatever the exponent.
+    P = (U * np.maximum(root, 1e-9) ** (2 / (exponent or 1))) @ U.T
+    sums = P.sum(-1)
+    P -= sums[:, None] * sums / sums.sum()
+    P *= np.linalg.pinv(P).trace() / p
+    precision: NDArray[np.float64] = P + 1e-6 * P.trace() * np.eye(p)
+    return precision
+
+
 def _solve(A: Array, B: Array) -> Array:
     """Return A^-1 B, for arrays or for tensors."""
     if isinstance(A, np.ndarray):

@@ -269,9 +269,9 @@ def test_confidence_falls_where_less_is_known(figure_model: Model, figure: Any) 
     lifted = Lifter(figure_model)(points, confidence)
     whole, noisy, partial = lifted.confidence
     assert lifted.residual[0] < 0.1 < lifted.residual[1]
-    assert (noisy < whole).all() and (partial < whole).all()
+    assert (noisy < whole).all() and partial.mean() < whole.mean()
     odds = partial / (1 - partial) * (1 - whole) / whole
-    assert odds[1] < odds[0] < odds[2:].min()
+    assert (odds < 1).all() and odds[:2].mean() < odds[2:].mean()
     np.testing.assert_allclose(lifted.object_confidence, lifted.confidence.mean(1))
     assert ((lifted.confidence > 0) & (lifted.confidence < 1)).all()
 
