@@ -69,6 +69,13 @@ def parser() -> argparse.ArgumentParser:
     )
     data.add_argument("--stride", type=int, help="take every n-th CMU frame (default: 1)")
     data.add_argument("--camera-seed", type=int, help="seed of the CMU cameras (default: 0)")
+    data.add_argument(
+        "--virtual-people",
+        type=int,
+        help="learn error covariance and bones from so many virtual people in CMU poses, with "
+        "other bodies and with joints where detectors put them; 16384 typical, 0 = from the "
+        "training frames (default: 0)",
+    )
     result = parser.add_argument_group("Result")
     result.add_argument(
         "--object",

@@ -267,19 +267,24 @@ class TrialSelection:
     camera_seed: int = 0
 
 
+def selected_trials(selection: TrialSelection) -> list[Path]:
+    """Return the AMC files of a selection; raise ValueError if a subject has none."""
+    paths: list[Path] = []
+    for subject in selection.subjects:
+        found = trials(selection.folder, subject)
+        train, held_out = protocol_split(found)
+        paths += {"train": train, "held-out": held_out, "all": found}[selection.split]
+    return paths
+
+
 def read_split(
     selection: TrialSelection,
     layout: KeypointLayout,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Dataset:
     """Return the selected trials as one dataset, as `read_trials` reads them."""
-    paths: list[Path] = []
-    for subject in selection.subjects:
-        found = trials(selection.folder, subject)
-        train, held_out = protocol_split(found)
-        paths += {"train": train, "held-out": held_out, "all": found}[selection.split]
     return read_trials(
-        paths,
+        selected_trials(selection),
         layout,
         seed=selection.camera_seed,
         stride=selection.stride,

@@ -44,6 +44,7 @@ _MIN_VARIANCE = 1e-4  # of every direction, relative to the mean: any keypoints 
 _BLOCK = 64  # frames at a time: more exceed the cache and take five times as long
 _MIN_OWN_DEVIATION = 0.3  # share of a length's deviation that is always ascribed to the object
 _MIN_LENGTH_DEVIATION = 0.01  # of a length: no bone is known more precisely
+_MIN_DEVIATION_TOGETHER = 0.02  # the same of every combination of lengths
 _MIN_LENGTH = 1e-6  # share of all lengths, for two keypoints at the same place
 UNKNOWN_VARIANCE = (
     1e4  # of a missing keypoint and of the translation, relative to the mean of Sigma
@@ -187,12 +188,52 @@ def bone_lengths(
     """
     if not pairs:
         return np.zeros((0, 2), np.float32)
-    all_visible = np.ones(W.shape[:2])
-    errors = ErrorModel(covariance)
-    T = centre(correct(*lift(W), all_visible, errors))
-    T_again = correct(*lift(T @ random_cameras(len(T), rng)), all_visible, errors)
-    first, second = relative_lengths(T, pairs), relative_lengths(T_again, pairs)
+    first, second = _lengths_of_two_lifts(lift, W, pairs, covariance, rng)
     lengths, variance = np.maximum(first.mean(0), _MIN_LENGTH), first.var(0)
     error = ((second - first) ** 2).mean(0)
     least = np.maximum(_MIN_OWN_DEVIATION**2 * variance, (_MIN_LENGTH_DEVIATION * lengths) ** 2)
     return np.stack((lengths, np.sqrt(np.maximum(variance - error, least))), 1).astype(np.float32)
+
+
+def varied_bones(
+    lift: Lift,
+    W: Floats,
+    pairs: Sequence[tuple[int, int]],
+    covariance: Floats,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return length and standard deviation (b, 2) of each bone, and their correlation (b, b).
+
+    As `bone_lengths`, of frames that show many different objects: lengths that belong together, as
+    those of left and right, are told from lengths that vary by themselves. Frames of few objects do
+    not show it.
+
+    Args:
+        lift: the network with its normalisation.
+        W: (n, p, 2) complete keypoints.
+        pairs: b pairs of keypoints, at least one.
+        covariance: (3p, 3p) as `error_covariance` returns it.
+        rng: draws the random cameras.
+    """
+    first, second = _lengths_of_two_lifts(lift, W, pairs, covariance, rng)
+    lengths = np.maximum(first.mean(0), _MIN_LENGTH)
+    found, added = (first - lengths) / lengths, (second - first) / lengths
+    values, axes = np.linalg.eigh((found.T @ found - added.T @ added) / len(found))
+    varies = (axes * np.maximum(values, _MIN_DEVIATION_TOGETHER**2)) @ axes.T
+    relative = np.sqrt(varies.diagonal())
+    statistics = np.stack((lengths, relative * lengths), 1), varies / np.outer(relative, relative)
+    return statistics[0].astype(np.float32), statistics[1].astype(np.float32)
+
+
+def _lengths_of_two_lifts(
+    lift: Lift,
+    W: Floats,
+    pairs: Sequence[tuple[int, int]],
+    covariance: Floats,
+    rng: np.random.Generator,
+) -> tuple[Floats, Floats]:
+    """Return the relative lengths (n, b) of lifted shapes, and of those shapes lifted again."""
+    all_visible, errors = np.ones(W.shape[:2]), ErrorModel(covariance)
+    T = centre(correct(*lift(W), all_visible, errors))
+    T_again = correct(*lift(T @ random_cameras(len(T), rng)), all_visible, errors)
+    return relative_lengths(T, pairs), relative_lengths(T_again, pairs)

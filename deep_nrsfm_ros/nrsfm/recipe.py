@@ -16,7 +16,13 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 class Recipe:
     """Training."""
 
-    steps: int = option(30_000, "gradient steps of the training", low=1, high=10_000_000)
+    steps: int = option(
+        30_000,
+        "gradient steps of the training; 0 = keep the network of the model to start from and learn "
+        "only its error covariance and bones anew",
+        low=0,
+        high=10_000_000,
+    )
     batch: int = option(64, "frames of each gradient step", low=1, high=65536)
     learning_rate: float = option(
         3e-3, "learning rate of Adam at the first step; 0.001 to 0.003 typical", low=1e-7, high=1.0

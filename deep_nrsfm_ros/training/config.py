@@ -46,6 +46,8 @@ class DataConfig:
         all_trials: take all trials of a subject, not only the paper's first floor(0.8 N).
         stride: take every n-th CMU frame.
         camera_seed: seed of the random cameras of the CMU frames.
+        virtual_people: number of virtual people in CMU poses from which the last step learns error
+            covariance and bones; 0 is from frames of the training.
     """
 
     bags: tuple[Path, ...] = ()
@@ -64,6 +66,7 @@ class DataConfig:
     all_trials: bool = False
     stride: int = 1
     camera_seed: int = 0
+    virtual_people: int = 0
 
     @property
     def image_size(self) -> tuple[int, int] | None:

@@ -101,6 +101,8 @@ def inherit(trained: Model, start: Model) -> Model:
     the axes of its start and the sign of depth.
     """
     origin = {"model": start.name, "data": start.provenance.get("data", "unknown")}
+    if trained.provenance["recipe"]["steps"] == 0:  # the network is that of the start
+        origin |= start.provenance
     model = dataclasses.replace(trained, provenance=trained.provenance | {"from": origin})
     if not trained.layout.handedness:
         model = dataclasses.replace(model, object_frame=start.object_frame)

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from deep_nrsfm_ros import __version__
+from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.correction import bone_lengths, error_covariance
+from deep_nrsfm_ros.lifting.correction import bone_lengths, error_covariance, varied_bones
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import Floats
 from deep_nrsfm_ros.nrsfm.handedness import object_frame
@@ -21,7 +22,13 @@ from deep_nrsfm_ros.training.trainer import Trainer
 _MOST_FRAMES = 2048  # on which the object frame, the error covariance and the bones are measured
 
 
-def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> Model:
+def finish(
+    trainer: Trainer,
+    name: str,
+    layout: KeypointLayout,
+    source: str,
+    people: Dataset | None = None,
+) -> Model:
     """Return the trained model with object frame, error covariance, bones and provenance.
 
     Args:
@@ -29,6 +36,9 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         name: name of the model.
         layout: layout of the p keypoints that the trainer was trained on.
         source: where the data come from, in words, for the provenance.
+        people: complete frames of many different objects in this layout, from which the error
+            covariance and the bones are learned (see `data.virtual_people`). None: from frames of
+            the training.
 
     Returns:
         The model. Its `quality` is label-free: errors relative to the size of the object, 0 is
@@ -48,7 +58,17 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
     W, _ = complete(net, sample.points.cpu().numpy(), mask)
     S, _, _ = lift(W)
     rng = np.random.default_rng(trainer.seed)
-    covariance = error_covariance(lift, W, rng)
+    if people is not None:
+        W = people.points
+    covariance, pairs = error_covariance(lift, W, rng), layout.bone_indices()
+    if people is not None and pairs:
+        lengths, correlation = varied_bones(lift, W, pairs, covariance, rng)
+    else:
+        lengths = bone_lengths(lift, W, pairs, covariance, rng)
+        correlation = np.zeros((0, 0), np.float32)
+    provenance = _provenance(trainer, source)
+    if people is not None:
+        provenance["last_step"] = {"data": people.source, "frames": len(people)}
     return Model(
         name,
         net,
@@ -56,8 +76,9 @@ def finish(trainer: Trainer, name: str, layout: KeypointLayout, source: str) -> 
         normaliser,
         object_frame(S, layout, mask[..., 0] > 0),
         error_covariance=covariance,
-        bone_lengths=bone_lengths(lift, W, layout.bone_indices(), covariance, rng),
-        provenance=_provenance(trainer, source),
+        bone_lengths=lengths,
+        bone_correlation=correlation,
+        provenance=provenance,
         quality=_quality(trainer, coherence(net)),
     )
 

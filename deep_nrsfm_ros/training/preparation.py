@@ -16,6 +16,7 @@ from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
+from deep_nrsfm_ros.data.virtual_people import read_virtual_people
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
@@ -50,9 +51,7 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
     data = config.data
     source, target = find_layouts(config, COMMAND_LINE)
     if data.cmu:
-        trials = "all" if data.all_trials else "train"
-        selection = TrialSelection(data.cmu, data.subjects, trials, data.stride, data.camera_seed)
-        return read_split(selection, target, reporter.reading)
+        return read_split(_selection(data, data.cmu), target, reporter.reading)
     options = ReadOptions(
         topic=data.topic,
         min_confidence=data.min_confidence,
@@ -82,6 +81,20 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
             "read (max_frames); name fewer files, or allow more"
         )
     return dataset
+
+
+def read_people(config: TrainingConfig, reporter: Reporter) -> Dataset | None:
+    """Return the virtual people of the configuration; None if it has none."""
+    data = config.data
+    if not data.cmu or not data.virtual_people:
+        return None
+    return read_virtual_people(_selection(data, data.cmu), data.virtual_people, reporter.reading)
+
+
+def _selection(data: DataConfig, folder: Path) -> TrialSelection:
+    """Return the trials of CMU that the configuration names."""
+    trials = "all" if data.all_trials else "train"
+    return TrialSelection(folder, data.subjects, trials, data.stride, data.camera_seed)
 
 
 def _numbered(data: DataConfig, options: ReadOptions) -> KeypointLayout:

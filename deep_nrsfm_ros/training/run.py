@@ -19,7 +19,7 @@ from deep_nrsfm_ros.training.data_check import check_dataset
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
-from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data
+from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data, read_people
 from deep_nrsfm_ros.training.record import checkpoint_file, keep_record
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
 from deep_nrsfm_ros.training.validation import find_layouts, validate
@@ -100,7 +100,7 @@ def _train_and_save(
     trainer = _train(config, prepared, checkpoint, reporter, should_stop)
     if trainer.group.rank:
         return None
-    if not trainer.step:
+    if not trainer.step and config.recipe.steps:
         checkpoint.unlink(missing_ok=True)
         raise CancelledError
     from deep_nrsfm_ros.training.finish import finish
@@ -109,7 +109,8 @@ def _train_and_save(
     if text := warning(trainer.mirrored_share):
         reporter.warn(text)
     dataset = prepared.dataset
-    model = finish(trainer, config.output.name, dataset.layout, dataset.source)
+    people = read_people(config, reporter)
+    model = finish(trainer, config.output.name, dataset.layout, dataset.source, people)
     date = time.strftime("%Y-%m-%d", time.gmtime())
     model = dataclasses.replace(model, provenance=model.provenance | {"date": date})
     if start:

@@ -107,7 +107,7 @@ class Trainer:
     @property
     def progress(self) -> float:
         """Return the fraction of the steps or of the time limit that is over, the larger one."""
-        return max(self.step / self.preset.recipe.steps, min(self.time_fraction, 1.0))
+        return max(self.step / max(self.preset.recipe.steps, 1), min(self.time_fraction, 1.0))
 
     def sample(self, size: int, step: int = -1) -> Batch:
         """Return the random batch of a step, and leave the generator seeded for its cameras.

@@ -28,7 +28,7 @@ _OF_BAGS = (
     *("topic", "keypoint_layout", "min_confidence", "mapping", "image_width", "image_height"),
     *("missing_value", "min_score", "category"),
 )
-_OF_CMU = ("subjects", "all_trials", "stride", "camera_seed")
+_OF_CMU = ("subjects", "all_trials", "stride", "camera_seed", "virtual_people")
 
 
 def validate(config: TrainingConfig, names: OptionNames) -> str:
@@ -52,6 +52,13 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
     if target != _NUMBERED_LAYOUT:
         KeypointMap(source, target)
     config.layout_loss.check(target, names)
+    if config.data.virtual_people and target.keypoints != HUMAN17.keypoints:
+        raise ValueError(
+            f"{names('virtual_people')} has the keypoints of {HUMAN17.name}, and the model those "
+            f"of {target.name!r}: leave it out"
+        )
+    if not config.recipe.steps and not config.start:
+        raise ValueError(f"{names('steps')} is 0: name the model to keep with {names('start')}")
     if config.start:
         start = load_model(Path(config.start))
         if target != _NUMBERED_LAYOUT:
@@ -94,6 +101,7 @@ def _check_ranges(config: TrainingConfig, names: OptionNames) -> None:
     for name, value, least in (
         ("min_confidence", config.data.min_confidence, 0),
         ("stride", config.data.stride, 1),
+        ("virtual_people", config.data.virtual_people, 0),
         ("threads", config.output.threads, 0),
     ):
         if not value >= least:

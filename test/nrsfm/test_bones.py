@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.lifting.correction import ErrorModel, bone_lengths, correct
+from deep_nrsfm_ros.lifting.correction import ErrorModel, bone_lengths, correct, varied_bones
 from deep_nrsfm_ros.nrsfm.bones import Bones, relative_lengths
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 
@@ -147,3 +147,29 @@ def test_rigid_edges_are_told_from_others_without_labels() -> None:
     )
     assert (found > 0).all()
     assert not len(bone_lengths(lift, shapes @ random_cameras(f, rng), [], np.eye(3 * P), rng))
+
+
+def test_bones_that_grow_together_are_told_from_errors_without_labels() -> None:
+    """People of many sizes of both legs alike; the network errs on each point by itself."""
+    rng = np.random.default_rng(0)
+    f = 4000
+    rest = np.array([[-1, 2, 0], [-1, 1, 0], [-1, 0, 0], [1, 2, 0], [1, 1, 0], [1, 0, 0.0]])
+    pairs = [(0, 1), (1, 2), (3, 4), (4, 5), (0, 3)]
+    shapes = np.tile(rest, (f, 1, 1))
+    shin = 0.2 * np.clip(rng.standard_normal((f, 1)), -2, 2)
+    shapes[:, (2, 5), 1] -= shin
+
+    def lift(W: np.ndarray) -> tuple[Any, ...]:
+        errors = 0.05 * rng.standard_normal(shapes.shape)
+        rows = np.linalg.pinv(shapes) @ W
+        U, _, Vt = np.linalg.svd(rows, full_matrices=False)
+        return shapes + errors, U @ Vt, W
+
+    W = shapes @ random_cameras(f, rng)
+    found, correlation = varied_bones(lift, W, pairs, np.eye(18), rng)
+    expected = relative_lengths(shapes, pairs)
+    np.testing.assert_allclose(found[:, 0], expected.mean(0), rtol=0.03)
+    np.testing.assert_allclose(found[[1, 3], 1], expected[:, [1, 3]].std(0), rtol=0.25)
+    assert correlation[1, 3] > 0.8 and correlation[1, 0] < 0.4
+    np.testing.assert_allclose(correlation.diagonal(), 1, atol=1e-6)
+    assert np.linalg.eigvalsh(correlation)[0] > 0

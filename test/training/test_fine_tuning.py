@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import reprojection_error
@@ -163,6 +164,26 @@ def test_it_inherits_its_origin_and_the_axes_that_it_cannot_find(
     assert found.provenance["data"] == "new data"
     np.testing.assert_allclose(found.object_frame, source.object_frame, atol=0.1)
     np.testing.assert_array_equal(unknown.object_frame, mirrored)
+
+
+def test_no_steps_keep_the_network_and_learn_the_last_step_from_other_people(
+    source: Model, figure: Any
+) -> None:
+    recipe = dataclasses.replace(RECIPE, steps=0)
+    preset = Preset(source.network.architecture, source.normaliser, recipe)
+    visible = np.ones(figure.points.shape[:2], bool)
+    trainer = train(figure.points, visible, preset, Setup(start_from(source, figure.layout)))
+    assert trainer.step == 0 and trainer.progress == 0
+    people = Dataset(figure.points[::2].copy(), visible[::2], figure.layout, "people")
+    model = inherit(finish(trainer, "new", figure.layout, "data", people), source)
+    for (name, kept), (_, given) in zip(
+        model.network.named_weights(), source.network.named_weights(), strict=True
+    ):
+        np.testing.assert_array_equal(kept, given, err_msg=name)
+    assert model.provenance["last_step"] == {"data": "people", "frames": len(people)}
+    assert model.provenance["from"]["recipe"] == source.provenance["recipe"]
+    assert model.bone_correlation.shape == (len(model.bone_lengths),) * 2
+    assert not np.array_equal(model.error_covariance, source.error_covariance)
 
 
 def test_a_checkpoint_is_not_taken_on_by_a_training_that_starts_elsewhere(

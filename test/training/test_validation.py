@@ -64,6 +64,12 @@ def test_a_name_that_is_no_plain_file_name_is_refused(config: TrainingConfig, na
             "--keypoint-layout is 'horse'; name a preset",
             "train.keypoint_layout is 'horse'; name a preset",
         ),
+        (
+            {"virtual_people": 9},
+            "--virtual-people has no effect on bags",
+            "train.virtual_people has",
+        ),
+        ({"steps": 0}, "--steps is 0: .* with --from", "train.steps is 0"),
         ({"object": "cmu31"}, "share 0 keypoints", "share 0 keypoints"),
         ({"object": "numbered"}, "leave out --keypoint-layout", "leave out train.keypoint_layout"),
         ({"learning_rate": 7.0}, "--learning-rate is 7.0", "train.learning_rate is 7.0"),
