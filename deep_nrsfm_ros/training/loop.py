@@ -124,6 +124,8 @@ def train(
     """
     for config in (*preset, setup.limits):
         check(config)
+    if not preset.recipe.steps and setup.start is None:
+        raise ValueError("steps is 0 and there is no network to start from; it must be at least 1")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     frames, group = _frames_with_extent(points, visible), setup.group
     if group.size > min(len(frames), preset.recipe.batch):
