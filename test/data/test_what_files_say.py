@@ -433,3 +433,39 @@ def test_normalised_keypoints_become_pixels(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", points * 500)
     found = read_keypoints(tmp_path / "a.npy", options)
     np.testing.assert_allclose(found.points[1:], points[1:] * 500, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("box", "is_doubted"),
+    [
+        ([100, 100, 400, 400], False),
+        ([100, 100, 500, 500], False),  # two corners
+        ([[100, 100, 500, 500]], False),  # of MMPose
+        ([1, 2, 3, 4], False),  # a placeholder
+        (None, False),
+        ([900, 700, 400, 400], True),
+        ([900, 700, 1300, 1100], True),
+    ],
+)
+def test_keypoints_that_are_not_in_their_box(tmp_path: Path, box: Any, is_doubted: bool) -> None:
+    people = [{"image_id": i, "keypoints": person(i), "bbox": box} for i in range(5)]
+    found = read(tmp_path / "a.json", people, layout=COCO17)
+    assert [f.code for f in found.findings] == ["crop"] * is_doubted
+
+
+def test_times_of_frames(tmp_path: Path) -> None:
+    """They are read in any unit; frames without a number follow one another."""
+    for field, unit, said in (
+        ("timestamp", 1.0, "taken for seconds"),
+        ("timestamp", 1e3, "taken for milliseconds"),
+        ("time", 1e6, "taken for microseconds"),
+        ("timestamp_ms", 1e3, ""),
+    ):
+        times = [0.0, 0.1, 0.2, 0.5]
+        frames = [{field: unit * (50 + t), **openpose(person(i))} for i, t in enumerate(times)]
+        found = read(tmp_path / "a.json", {"frames": frames}, layout=COCO17)
+        assert found.frame.tolist() == [0, 1, 2, 3]
+        assert (found.stamps - found.stamps[0]).tolist() == [round(t * 1e9) for t in times]
+        assert any(said in warning for warning in found.warnings) == bool(said)
+    with pytest.raises(KeypointFileError, match="times of its own: leave out --rate"):
+        read(tmp_path / "a.json", {"frames": frames}, layout=COCO17, rate=10)

@@ -29,6 +29,7 @@ NO_KEYPOINTS = "have no keypoints"
 _ROWS = 8192  # of a chunk: large enough that a freed one returns to the system
 _MEDIAPIPE = 33  # landmarks of MediaPipe Pose
 _FEW = 4  # keypoints, which are too few to be compared with a box
+_SMALLEST_BOX = 20.0  # pixels; a smaller one is a placeholder
 _MANY = 0.5  # fraction of objects that makes a suspicion a warning
 UNITS = {"seconds": 10**9, "milliseconds": 10**6, "microseconds": 1000, "nanoseconds": 1}
 """Units of time in ns."""
@@ -284,11 +285,11 @@ class DetectionsBuilder:
     def in_box(self, values: NDArray[np.float64], box: Any) -> None:
         """Compare the keypoints of an object with its box, [x, y, width, height] or two corners."""
         try:
-            x, y, a, b = (float(number) for number in box)
+            x, y, a, b = (float(number) for number in (box[0] if len(box) == 1 else box))
         except (TypeError, ValueError):
             return
         visible = values[(values[:, 2] > 0) & values[:, :2].any(1), :2]
-        if len(visible) < _FEW:
+        if len(visible) < _FEW or min(a, b) < _SMALLEST_BOX:  # a box of [0, 0, 1, 1] says nothing
             return
         self._with_box += 1
         low, high = visible.min(0), visible.max(0)
