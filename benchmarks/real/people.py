@@ -24,13 +24,15 @@ from benchmarks.table import Table, bars
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import read_trials, trials
+from deep_nrsfm_ros.data.over_time import BOTH, CAUSAL, NONE, OverTime, Stream, lift_stream
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17, MEDIAPIPE33, MPII16
+from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.observation import to_observation, without_border
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
@@ -43,11 +45,37 @@ Floats = NDArray[Any]
 Masks = NDArray[np.bool_]
 
 FRAME_BY_FRAME = "frame by frame"
-SYSTEMS: dict[str, SmoothingOptions | None] = {
-    FRAME_BY_FRAME: None,
-    "in time": SmoothingOptions(enabled=True),
+
+
+class System(NamedTuple):
+    """How a track is lifted.
+
+    Attributes:
+        history: what is remembered; None: each frame by itself.
+        gravity: whether the direction of gravity is given.
+        filter: after the correction; None: no filter.
+        ahead: whether later frames are used as well.
+    """
+
+    history: HistoryOptions | None = None
+    gravity: bool = False
+    filter: SmoothingOptions | None = None
+    ahead: bool = False
+
+
+_ONE_EURO = SmoothingOptions(enabled=True)
+SYSTEMS = {
+    FRAME_BY_FRAME: System(),
+    "filter after": System(filter=_ONE_EURO),
+    "smoothing before": System(HistoryOptions(bones_time=0)),
+    "own bones": System(HistoryOptions(shape_time=0, hidden_time=0, rotation_time=0)),
+    "gravity": System(gravity=True),
+    "in time": System(HistoryOptions()),
+    "in time, filter after": System(HistoryOptions(), filter=_ONE_EURO),
+    "in time, gravity": System(HistoryOptions(), gravity=True),
+    "looking ahead": System(HistoryOptions(), ahead=True),
 }
-"""How a track is lifted: the options of `lift_track`."""
+"""The rows of a scene: the parts of lifting over time, alone and together."""
 MEDIAPIPE, MEAN_SHAPE = "MediaPipe", "mean shape"
 MEAN_STRIDE = 30
 FIGURES = {
@@ -80,7 +108,13 @@ LEGEND = {
     "CMU 03, 131": "motion capture that `human` was not trained on, before 3 simulated cameras 4 m "
     "away at 1.4 m, 30 Hz, noise as above; still: poses held for 1.5 s",
     FRAME_BY_FRAME: "each frame by itself",
-    "in time": "the lifter's options over time, one person a stream, causal",
+    "filter after": "the One-Euro filter of the corrected shapes, smoothing.enabled",
+    "smoothing before": "the network's shape and rotation, smoothed before the correction",
+    "own bones": "the person's bones, learned so far",
+    "gravity": "the camera's direction of gravity is given",
+    "in time": "smoothing before and own bones: the default of node and lift; one person a stream, "
+    "causal",
+    "looking ahead": "lift --smooth both",
     "intrinsics": "whether the lifter is given the camera's intrinsics",
     MEDIAPIPE: "its own 3D (world landmarks) from the images, trained with 3D labels, smoothed",
     MEAN_SHAPE: "the mean of the first trials of the subjects that `human` was trained on, with "
@@ -131,13 +165,13 @@ def benchmark(
             continue
         for intrinsics in (True, False):
             for model, lifter in lifters.items():
-                for system, options in SYSTEMS.items():
+                for name, system in SYSTEMS.items():
                     errors = [
-                        (t.view, lifting_errors(lifter, t, options, intrinsics=intrinsics))
+                        (t.view, lifting_errors(lifter, t, system, intrinsics=intrinsics))
                         for t in tracks
                     ]
-                    name = system if len(lifters) == 1 else f"{model}, {system}"
-                    labels = (scene, name, "yes" if intrinsics else "no")
+                    title = name if len(lifters) == 1 else f"{model}, {name}"
+                    labels = (scene, title, "yes" if intrinsics else "no")
                     table.add(labels, figures(errors))
         own = [(t, t.world_landmarks) for t in tracks if t.world_landmarks is not None]
         if own:
@@ -151,42 +185,48 @@ def benchmark(
     return table
 
 
-def lift_track(
-    lifter: Lifter, track: Track, smoothing: SmoothingOptions | None, *, intrinsics: bool
-) -> Lifted:
+def lift_track(lifter: Lifter, track: Track, system: System, *, intrinsics: bool) -> Lifted:
     """Lift a track as the node does, one frame after the other; return its f objects.
 
     Args:
         lifter: a model with its options; its layout may differ from the track's.
         track: one person.
-        smoothing: over time; None: frame by frame.
+        system: how it is lifted.
         intrinsics: whether the lifter is given the camera's intrinsics.
     """
     values = np.concatenate([track.points, track.confidence[..., None]], -1)
     seen = to_observation(values, InputOptions().min_confidence)
     keypoints = KeypointMap(track.layout, lifter.model.layout)(seen.points, seen.confidence)
 
-    def lift(points: Floats, confidence: Floats) -> Lifted:
-        if intrinsics:
-            return lift_perspective(lifter, track.intrinsics, points, confidence)
-        return lifter.lift(points, confidence)
+    lifter = Lifter(lifter.model, lifter.options, history=system.history)
+    f = len(track.points)
+    frames, names = [slice(i, i + 1) for i in range(f)], ["person"] * f
 
-    lifted = lift_all(lift, *keypoints)
-    if smoothing is None:
+    def lift(points: Floats, confidence: Floats, context: Context | None = None) -> Lifted:
+        if intrinsics:
+            return lift_perspective(lifter, track.intrinsics, points, confidence, context)
+        return lifter.lift(points, confidence, context=context)
+
+    if system.history or system.gravity:
+        stream = Stream(*keypoints, frames, track.seconds, names)
+        smooth = BOTH if system.ahead else CAUSAL if system.history else NONE
+        over_time = OverTime(smooth, track.up if system.gravity else None)
+        lifted = lift_stream(lift, lifter.memory(), stream, over_time)
+    else:
+        lifted = lift_all(lift, *keypoints)
+    if system.filter is None:
         return lifted
-    smoother = Smoother(smoothing)
-    frames = [
+    smoother = Smoother(system.filter)
+    smoothed = [
         smoother(Lifted(*(part[i : i + 1] for part in lifted)), ("person",), second)[0]
         for i, second in enumerate(track.seconds.tolist())
     ]
-    return Lifted(*(np.concatenate(parts) for parts in zip(*frames, strict=True)))
+    return Lifted(*(np.concatenate(parts) for parts in zip(*smoothed, strict=True)))
 
 
-def lifting_errors(
-    lifter: Lifter, track: Track, smoothing: SmoothingOptions | None, *, intrinsics: bool
-) -> Errors:
+def lifting_errors(lifter: Lifter, track: Track, system: System, *, intrinsics: bool) -> Errors:
     """Return the errors of a track, lifted as in `lift_track`."""
-    lifted = lift_track(lifter, track, smoothing, intrinsics=intrinsics)
+    lifted = lift_track(lifter, track, system, intrinsics=intrinsics)
     layout = lifter.model.layout
     limbs = [layout.index(joint) for joint in JOINTS]
     unit = lifter.options.reference_length or layout.reference_length or 1.0
