@@ -1,4 +1,4 @@
-"""Check an installation from the imports to an answer over DDS, and say how to mend what is wrong.
+"""Check an installation from the imports to an answer over DDS, and name the remedy of each fault.
 
 Exit code 0: all that lifting needs works; 1: something does not.
 """
@@ -35,18 +35,18 @@ class Result(NamedTuple):
 
     Attributes:
         seen: what was found, in words.
-        mend: what to do about it; "" if all is well.
+        remedy: what to do about it; "" if all is well.
         fatal: whether lifting needs it.
     """
 
     seen: str
-    mend: str = ""
+    remedy: str = ""
     fatal: bool = True
 
     @property
     def word(self) -> str:
         """Return "ok", "FAIL" or, for a result that is not fatal, "warn"."""
-        return "ok" if not self.mend else "FAIL" if self.fatal else "warn"
+        return "ok" if not self.remedy else "FAIL" if self.fatal else "warn"
 
 
 def check_imports() -> Result:
@@ -62,8 +62,8 @@ def check_imports() -> Result:
             try:
                 importlib.import_module(name)
             except Exception as error:  # a library of the wrong kind fails in many ways
-                mend = "install it anew; are two ROS installations mixed?"
-                return Result(f"{name} does not import: {error}", mend)
+                remedy = "install it anew; are two ROS installations mixed?"
+                return Result(f"{name} does not import: {error}", remedy)
         versions.extend(
             f"{distribution} {importlib.metadata.version(distribution)}"
             for distribution in distributions.get(name, ())[:1]  # none where apt has installed it
@@ -72,11 +72,11 @@ def check_imports() -> Result:
     if not missing:
         return Result(seen)
     seen = f"{', '.join(missing)} not found ({seen})"
-    mends = [f"pip install {name}" for name in missing if name in CORE]
-    mends += [how_to_install("ros")] if set(missing) & set(FOR_ROS) else []
-    if not mends:
+    remedies = [f"pip install {name}" for name in missing if name in CORE]
+    remedies += [how_to_install("ros")] if set(missing) & set(FOR_ROS) else []
+    if not remedies:
         return Result(seen, f"{how_to_install('train')}, if you want to train", fatal=False)
-    return Result(seen, "; ".join(mends))
+    return Result(seen, "; ".join(remedies))
 
 
 def check_environment() -> Result:
@@ -91,8 +91,8 @@ def check_environment() -> Result:
     if reach == "OFF" and not said("ROS_STATIC_PEERS"):
         return Result(seen, "with discovery OFF nothing is found: set it to LOCALHOST or SUBNET")
     if said("ROS_LOCALHOST_ONLY", "0") == "1":
-        mend = "unset ROS_LOCALHOST_ONLY, which overrides it; LOCALHOST as range does the same"
-        return Result(f"{seen}, ROS_LOCALHOST_ONLY 1", mend, fatal=False)
+        remedy = "unset ROS_LOCALHOST_ONLY, which overrides it; LOCALHOST as range does the same"
+        return Result(f"{seen}, ROS_LOCALHOST_ONLY 1", remedy, fatal=False)
     if said("ROS_SECURITY_ENABLE", "").lower() == "true":
         keystore = said("ROS_SECURITY_KEYSTORE", "")
         seen += f", security on with keystore {keystore or 'none'}"
@@ -101,7 +101,7 @@ def check_environment() -> Result:
     return Result(seen)
 
 
-def check_room(models_dir: Path) -> Result:
+def check_disk_and_shared_memory(models_dir: Path) -> Result:
     """Return whether models can be written, and whether DDS has shared memory."""
     place = models_dir
     while not place.exists():
@@ -114,8 +114,8 @@ def check_room(models_dir: Path) -> Result:
         return Result(seen, "make room on its disk, to train", fatal=False)
     shared = Path("/dev/shm")
     if not os.access(shared, os.W_OK) or shutil.disk_usage(shared).free < LEAST_SHM:
-        mend = "give /dev/shm room (docker run --shm-size or --ipc host), or DDS is slow or deaf"
-        return Result(f"{seen}; no shared memory", mend)
+        remedy = "give /dev/shm room (docker run --shm-size or --ipc host), or DDS is slow or deaf"
+        return Result(f"{seen}; no shared memory", remedy)
     return Result(seen)
 
 
@@ -128,25 +128,25 @@ def check_model(name: str, models_dir: Path) -> Result:
     from deep_nrsfm_ros.model_files.folders import model_folders
     from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 
-    mend = "install the package anew; its models belong in share/deep_nrsfm_ros/models"
+    remedy = "install the package anew; its models belong in share/deep_nrsfm_ros/models"
     if name != SHIPPED:
-        mend = f"name another with --model; {SHIPPED} comes with the package"
+        remedy = f"name another with --model; {SHIPPED} comes with the package"
     try:
         path = find_model(name, model_folders(models_dir))
         if path.parent == models_dir:
-            mend = f"remove or replace {path}, or name another with --model"
+            remedy = f"remove or replace {path}, or name another with --model"
         model = load_model(path)
     except ValueError as error:
-        return Result(str(error), mend)
+        return Result(str(error), remedy)
     p = len(model.layout)
     points = np.random.default_rng(0).uniform(50, 600, (1, p, 2)).astype(np.float32)
     lifted = Lifter(model)(points, np.ones((1, p), np.float32))
     if not np.isfinite(lifted.shapes).all():
-        return Result(f"{path} lifts to what is no number", mend)
+        return Result(f"{path} lifts to what is no number", remedy)
     seen = f"{path} of {p} keypoints lifts"
     if not kernel.AVAILABLE:
-        mend = "install a C compiler (apt-get install gcc python3-dev), then the package anew"
-        return Result(f"{seen}, but in NumPy: ten times slower", mend, fatal=False)
+        remedy = "install a C compiler (apt-get install gcc python3-dev), then the package anew"
+        return Result(f"{seen}, but in NumPy: ten times slower", remedy, fatal=False)
     return Result(f"{seen}, compiled")
 
 
@@ -164,8 +164,8 @@ def check_bags() -> Result:
             write_bag(bag, "/keypoints", frames(points, np.ones((10, 17))), storage)
             read = read_bags([bag], HUMAN17, HUMAN17, ReadOptions("/keypoints")).dataset
             if not np.allclose(read.points, points, rtol=1e-4):
-                mend = "pip install --force-reinstall rosbags"
-                return Result(f"{storage}: what was read is not what was written", mend)
+                remedy = "pip install --force-reinstall rosbags"
+                return Result(f"{storage}: what was read is not what was written", remedy)
     return Result(f"written and read: {', '.join(STORAGES)}")
 
 
@@ -183,11 +183,11 @@ def check_dds(name: str, models_dir: Path, seconds: float) -> Result:
         took = time_to_first_points(str(path), points, seconds)
     except SelfTestError as error:
         if error.ended:
-            return Result(str(error), "mend what its output names")
-        mend = "let the firewall pass UDP 7400-7500 and multicast on this machine"
+            return Result(str(error), "repair what its output names")
+        remedy = "let the firewall pass UDP 7400-7500 and multicast on this machine"
         if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") != "LOCALHOST":
-            mend += ", or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
-        return Result(str(error), f"{mend}; on a busy machine raise --timeout")
+            remedy += ", or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"
+        return Result(str(error), f"{remedy}; on a busy machine raise --timeout")
     return Result(f"a lifter in another process answered {took:.1f} s after its start")
 
 
@@ -196,7 +196,7 @@ def examine(args: argparse.Namespace) -> bool:
     checks: dict[str, Callable[[], Result]] = {
         "imports": check_imports,
         "environment": check_environment,
-        "room": lambda: check_room(args.models_dir),
+        "disk and shared memory": lambda: check_disk_and_shared_memory(args.models_dir),
         "model": lambda: check_model(args.model, args.models_dir),
         "bags": check_bags,
         "DDS": lambda: check_dds(args.model, args.models_dir, args.timeout),
@@ -206,12 +206,12 @@ def examine(args: argparse.Namespace) -> bool:
         try:
             result = check()
         except Exception as error:  # whatever is broken, the other checks tell more
-            mend = "report it with this line" if well else "mend what is wrong above first"
-            result = Result(f"{type(error).__name__}: {error}", mend)
+            remedy = "report it with this line" if well else "repair the faults above first"
+            result = Result(f"{type(error).__name__}: {error}", remedy)
         well &= result.word != "FAIL"
         print(f"{result.word:4}  {name}: {result.seen}", flush=True)
-        if result.mend:
-            print(f"      -> {result.mend}", flush=True)
+        if result.remedy:
+            print(f"      -> {result.remedy}", flush=True)
     return well
 
 
@@ -227,7 +227,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     args.models_dir = args.models_dir.expanduser().absolute()
     if not examine(args):
-        print("something that lifting needs does not work; mend it from the top", file=sys.stderr)
+        print("lifting does not work yet; repair the faults from the top", file=sys.stderr)
         sys.exit(1)
     print("all that lifting needs works")
 

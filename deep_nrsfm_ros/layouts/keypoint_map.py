@@ -41,14 +41,15 @@ class KeypointMap:
         identical: True if both have the same keypoints in the same order.
         derivations: pairs (m, 2) of a keypoint of the target and a keypoint that it follows from,
             in the order of the first. A visible keypoint adds no information where all that it
-            follows from are visible. A keypoint that this map derives follows from itself.
+            follows from are visible. The pair (t, t) marks a keypoint that this map computes; it
+            never counts as detected.
     """
 
     def __init__(self, source: KeypointLayout, target: KeypointLayout) -> None:
         """Match the names of the two layouts.
 
-        A keypoint of the target that the source lacks is derived, if the target says how, or
-        stays missing.
+        A keypoint of the target whose name the source layout lacks is derived, if the target says
+        how, or stays missing. A keypoint that is missing in one frame only is not derived.
 
         Raises:
             ValueError: fewer than 4 keypoints match; no shape can be lifted from them.

@@ -1,6 +1,6 @@
-"""A loss from what a keypoint layout says of the object: rigid bones, keypoints in front, depth.
+"""Losses of bone lengths, handedness and depth, from the edges and corners of a keypoint layout.
 
-Not of the paper, and no 3D label: a layout file gives the edges and the handedness in words. Views
+Not of the paper, and without 3D labels: a layout file gives edges and handedness in words. Views
 from one side only contain little about depth: the direction of each limb, and the depth of
 keypoints that hardly move, are then a matter of chance without this loss
 (`recipe.LayoutLossWeights`).
@@ -19,7 +19,7 @@ from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 _FRONT_MARGIN = 0.1
 """Least height of a front keypoint over its plane, in RMS radii: at 0 it would lie in the plane."""
 _SYMMETRY_WEIGHT = 4.0
-"""Left and right differ by twice what each differs from their mean, squared."""
+"""Turns ((l - r) / (l + r))^2 of left and right into ((l - r) / mean)^2."""
 
 
 class LayoutLoss:
@@ -66,9 +66,9 @@ class LayoutLoss:
         return loss
 
     def _bone_lengths(self, S: Tensor) -> Tensor:
-        """Return how far each edge's share of all lengths varies, and differs from its partner's.
+        """Return the squared coefficient of variation of the relative edge lengths in the batch.
 
-        Squares, relative to the share, means over the edges.
+        A mean over the edges; the squared asymmetry of left and right is added.
         """
         bones = _product(S, self._edges)
         lengths = (bones * bones).sum(1).add(1e-10).sqrt()  # (b, edges)

@@ -1,4 +1,6 @@
-"""What training minimises: "Loss function" of the paper, and the cycle loss.
+"""What training minimises: "Loss function" of the paper, the cycle loss, and the layout's losses.
+
+The losses of bone lengths, handedness and depth are in `layout_loss.py`.
 
 The cycle loss needs no 3D label: a reconstructed shape, seen by another camera, must be
 reconstructed as the same shape. It keeps the network from explaining half of the frames by a

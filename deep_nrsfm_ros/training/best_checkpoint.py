@@ -14,7 +14,7 @@ from deep_nrsfm_ros.training.trainer import Trainer
 
 SHARE = 0.02
 """Largest share of a training's time that measuring takes."""
-_COST = 600  # frames whose training takes as long as one measurement
+_FRAMES_PER_MEASUREMENT = 600  # frames whose training takes as long as one measurement
 _MIN_IMPROVEMENT = 0.01  # relative; less does not count against the patience
 
 
@@ -24,7 +24,7 @@ def steps_between(recipe: Recipe) -> int:
     It follows from the size of a batch instead of the clock, so that the same seed measures the
     same states.
     """
-    return math.ceil(max(recipe.steps * SHARE, _COST / (recipe.batch * SHARE)))
+    return math.ceil(max(recipe.steps * SHARE, _FRAMES_PER_MEASUREMENT / (recipe.batch * SHARE)))
 
 
 class BestCheckpoint:

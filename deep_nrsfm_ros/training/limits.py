@@ -28,8 +28,8 @@ class Limits:
     )
     patience: float = option(
         0.0,
-        "share of the training without a better label-free quality after which it ends; 0 = "
-        "never, 0.2 typical",
+        "fraction of the steps (or of the time limit) without an improvement of the label-free "
+        "quality by 1 %, after which the training ends; 0 = never, 0.2 typical",
         low=0.0,
         high=1.0,
     )

@@ -15,13 +15,13 @@ def test_a_sound_installation_has_nothing_to_mend(tmp_path: Path) -> None:
         doctor.check_imports(),
         doctor.check_model("human", tmp_path),
         doctor.check_bags(),
-        doctor.check_room(tmp_path / "not" / "there"),
+        doctor.check_disk_and_shared_memory(tmp_path / "not" / "there"),
     ):
         assert found.word == "ok", found
 
 
 @pytest.mark.parametrize(
-    ("variables", "mend"),
+    ("variables", "remedy"),
     [
         ({}, ""),
         ({"ROS_DOMAIN_ID": "200"}, "number from 0 to 101"),
@@ -34,14 +34,14 @@ def test_a_sound_installation_has_nothing_to_mend(tmp_path: Path) -> None:
     ],
 )
 def test_the_environment_is_judged(
-    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], mend: str
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], remedy: str
 ) -> None:
     for name in ("DOMAIN_ID", "AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST_ONLY", "SECURITY_ENABLE"):
         monkeypatch.delenv(f"ROS_{name}", raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     found = doctor.check_environment()
-    assert mend in found.mend and bool(mend) == (found.word != "ok")
+    assert remedy in found.remedy and bool(remedy) == (found.word != "ok")
 
 
 def test_what_is_missing_is_named_with_the_mend(
@@ -49,20 +49,20 @@ def test_what_is_missing_is_named_with_the_mend(
 ) -> None:
     monkeypatch.setattr(doctor, "TO_TRAIN", ("no_torch_here",))
     assert doctor.check_imports().word == "warn"
-    assert "if you want to train" in doctor.check_imports().mend
+    assert "if you want to train" in doctor.check_imports().remedy
     monkeypatch.setattr(kernel, "AVAILABLE", False)
     found = doctor.check_model("human", tmp_path)
-    assert found.word == "warn" and "C compiler" in found.mend
+    assert found.word == "warn" and "C compiler" in found.remedy
     monkeypatch.setattr(doctor, "FOR_ROS", ("no_rclpy_here",))
     found = doctor.check_imports()
     assert found.word == "FAIL" and "no_rclpy_here" in found.seen
-    assert "pip install 'deep_nrsfm_ros[ros]' (or source" in found.mend
+    assert "pip install 'deep_nrsfm_ros[ros]' (or source" in found.remedy
     (tmp_path / "mine.safetensors").write_bytes(b"x" * 100)
     for name in ("mine", "nobody"):
         found = doctor.check_model(name, tmp_path)
-        assert found.word == "FAIL" and name in found.seen and "--model" in found.mend
-    assert "remove or replace" in doctor.check_model("mine", tmp_path).mend
-    assert "human comes with the package" in doctor.check_model("nobody", tmp_path).mend
+        assert found.word == "FAIL" and name in found.seen and "--model" in found.remedy
+    assert "remove or replace" in doctor.check_model("mine", tmp_path).remedy
+    assert "human comes with the package" in doctor.check_model("nobody", tmp_path).remedy
 
 
 def test_one_failure_makes_the_exit_code_1_and_the_others_are_still_told(
