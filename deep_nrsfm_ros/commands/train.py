@@ -167,9 +167,14 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
     """Write the page of a training, and report how the training ended."""
     step = result.model.provenance["step"]
     values: dict[str, object] = {"step": step, "steps": step, **result.model.quality}
-    if warning := handedness_warning(result.model, result.prepared.dataset):
-        reporter.warn(warning)
-        values["warning"] = warning
+    from deep_nrsfm_ros.training.mirror import warning as mirror_warning  # imports torch
+
+    share = result.model.quality.get("mirrored_share", 0.0)
+    found = (mirror_warning(share), handedness_warning(result.model, result.prepared.dataset))
+    if warnings := [text for text in found if text]:
+        for text in warnings:
+            reporter.warn(text)
+        values["warning"] = "; ".join(warnings)
     page = write_page(result, reporter)
     message = result.message + (f"; report {page}" if page else "")
     reporter.end(result.state, message, model=str(result.path), report=page, **values)

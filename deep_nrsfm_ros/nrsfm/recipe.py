@@ -61,6 +61,13 @@ class Recipe:
         low=0.0,
         high=0.9,
     )
+    reference: str = option(
+        "repair",
+        "known shapes of the cycle loss that are made of frames of nearly the same shape, not by "
+        "the network: repair = while frames are mirrored, always = from a fifth of the steps on, "
+        "off = never; without effect where cycle is 0 or frames show one side only",
+        choices=("repair", "always", "off"),
+    )
     paper_initialisation: bool = option(
         False,
         "initialise the weights as the paper's code does: random biases, and the scale of weights "

@@ -28,7 +28,7 @@ from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
-from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, most_frames
+from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
 from deep_nrsfm_ros.training.progress import Clock, Progress
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -169,6 +169,7 @@ class _Loop:
         self.leader_error = math.inf
         self.best = BestCheckpoint(setup.limits, recipe)
         self.mirror = MirrorCheck(frames, preset.normaliser, most_frames(recipe), self.group)
+        self.teacher = Teacher(self.mirror, recipe)
         self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
         self.saved = time.monotonic()
         self.stopped, self.time_fraction = False, 0.0
@@ -243,6 +244,8 @@ class _Loop:
             trainer.time_fraction = self.time_fraction
             if self.stopped or time_is_up(trainer.step, trainer.time_fraction, time_budget):
                 return
+            if chosen:
+                self.teacher.prepare(trainer)
             trainer.advance()
             if best:
                 best.update(trainer)
@@ -261,7 +264,7 @@ class _Loop:
 
     def state(self) -> dict[str, Tensor]:
         """Return all that `restore` needs, as named tensors."""
-        tensors = self.trainer.state() | self.best.state()
+        tensors = self.trainer.state() | self.best.state() | self.teacher.state()
         tensors["seconds"] = torch.tensor(self.clock.seconds(), dtype=torch.float64)
         if self.screening:
             tensors["screening"] = torch.tensor(self.leader_error, dtype=torch.float64)
@@ -274,6 +277,7 @@ class _Loop:
         """Continue from a `state`; raise ValueError if it belongs to another training."""
         self.trainer.restore(tensors)
         self.best.restore(tensors)
+        self.teacher.restore(tensors)
         self.clock.earlier_seconds = float(tensors.get("seconds", 0.0))
         last_seed = self.first_seed + self.preset.recipe.seeds - 1
         if "screening" not in tensors:

@@ -1,4 +1,4 @@
-"""Mirrored frames in training: found without labels.
+"""Mirrored frames in training: found without labels, and repaired in the network.
 
 `MirrorTest` of `nrsfm.neighbours` on the frames of a training. Its reference shapes depend on the
 frames alone, so all seeds share them. As known shapes of the cycle loss they teach a network the
@@ -40,12 +40,16 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.trainer import second_moment
+from deep_nrsfm_ros.training.trainer import Trainer, second_moment
 
 MOST_FRAMES = 15_000
 """Frames of the reference: 9 s on one core, 0.6 GB."""
 TOLERATED = 0.005
 """Share of mirrored frames up to which a network counts as not mirrored."""
+REPAIRED = 0.001
+"""Share of mirrored frames up to which a network is not repaired."""
+FIRST_LESSON = 0.2
+"""Progress of a training from which its network is taught always, if the recipe says so."""
 MIN_TESTED = 0.5
 """Share of the frames that the test must tell something about, for its share to count."""
 
@@ -172,9 +176,10 @@ def _unmirrored(X: Floats, mirrored: NDArray[np.bool_], pairs: Neighbours) -> Fl
     if not mirrored.any():
         return X
     others = pairs.frames[mirrored]
-    sound: NDArray[np.bool_] = np.logical_not(mirrored[others])
+    sound = np.logical_not(mirrored[others])
+    has_one = np.asarray(sound.any(1), bool)[:, None, None]
     first = np.take_along_axis(others, sound.argmax(1)[:, None], 1)[:, 0]
-    target = np.where(sound.any(1)[:, None, None], X[first], X[~mirrored].mean(0))
+    target = np.where(has_one, X[first], X[~mirrored].mean(0))
     result = X.copy()
     result[mirrored] = align(X[mirrored] * np.array([1, 1, -1]), target).aligned
     return result
@@ -189,3 +194,53 @@ def _search_network(L: NDArray[np.float32], L_inverse: NDArray[np.float32]) -> N
     """Return a network of which only the whitening is used, to complete and whiten keypoints."""
     net = initialise(Architecture(widths=(1,)), len(L), np.random.default_rng(0))
     return dataclasses.replace(net, L=L, L_inverse=L_inverse)
+
+
+class Teacher:
+    """Reference shapes as the known shapes of the cycle loss, where frames are mirrored.
+
+    The test is made after the screening and at each tenth of the steps. A network that mirrors
+    more than `REPAIRED` is taught until the next test: images of the reference shapes from random
+    cameras must be lifted as these shapes. They take the place of the network's own shapes, which
+    repeat its mistakes.
+
+    Attributes:
+        known: (m, p, 3) the reference shapes in the network's axes while it is taught, else None.
+    """
+
+    def __init__(self, check: MirrorCheck, recipe: Recipe) -> None:
+        """Start without shapes."""
+        self.check, self.mode = check, recipe.reference
+        self.interval = max(recipe.steps // 10, 1)
+        self.first = max(min(recipe.screening, self.interval), 1)  # a random network has no axes
+        self.known: Tensor | None = None
+
+    def prepare(self, trainer: Trainer) -> None:
+        """Set the known shapes of the trainer's next step, if it is to be taught."""
+        if self.mode == "off" or not trainer.preset.recipe.cycle:
+            return
+        step = trainer.step
+        if step == self.first or (step and step % self.interval == 0):
+            self.known = self._lesson(trainer)
+        if self.known is None:
+            return
+        generator = torch.Generator().manual_seed((trainer.seed << 32) + step)
+        chosen = torch.randint(len(self.known), (trainer.batch,), generator=generator)
+        trainer.shapes = self.known[chosen].to(trainer.weights.device)
+
+    def _lesson(self, trainer: Trainer) -> Tensor | None:
+        """Return the reference shapes to teach until the next test, None for none."""
+        share = self.check.share(trainer.net)
+        always = self.mode == "always" and trainer.progress >= FIRST_LESSON
+        if math.isnan(share) or not (share > REPAIRED or always):
+            return None
+        known = self.check.known_shapes(trainer.net)
+        return known if len(known) else None
+
+    def state(self) -> dict[str, Tensor]:
+        """Return all that `restore` needs, as named tensors."""
+        return {} if self.known is None else {"reference": self.known}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Set to a saved state."""
+        self.known = tensors.get("reference")

@@ -104,10 +104,7 @@ def _train_and_save(
         checkpoint.unlink(missing_ok=True)
         raise CancelledError
     from deep_nrsfm_ros.training.finish import finish
-    from deep_nrsfm_ros.training.mirror import warning
 
-    if text := warning(trainer.mirrored_share):
-        reporter.warn(text)
     dataset = prepared.dataset
     people = read_people(config, reporter)
     model = finish(trainer, config.output.name, dataset.layout, dataset.source, people)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, random_cameras
 from deep_nrsfm_ros.nrsfm.neighbours import MirrorTest
@@ -16,7 +18,7 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training import loop
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.mirror import MirrorCheck, most_frames, warning
+from deep_nrsfm_ros.training.mirror import MirrorCheck, Teacher, most_frames, warning
 from deep_nrsfm_ros.training.trainer import Trainer
 
 
@@ -94,7 +96,7 @@ def test_a_warning_gives_the_share() -> None:
 def test_a_seed_that_mirrors_nothing_has_no_rivals(
     figure: Any, monkeypatch: pytest.MonkeyPatch, shares: list[float], tried: int
 ) -> None:
-    recipe = Recipe(steps=40, batch=16, seeds=3, screening=4)
+    recipe = Recipe(steps=40, batch=16, seeds=3, screening=4, reference="off")
     preset = Preset(Architecture(widths=(8, 4)), Normaliser(), recipe)
     measured = iter([*shares, 0.0])  # the last one is that of the end
     calls: list[float] = []
@@ -123,3 +125,55 @@ def test_the_check_reports_progress(figure: Any, trained: Trainer) -> None:
     assert isinstance(check.test(trained.net), MirrorTest)
     check.test(trained.net)
     assert calls[-1] == (600, 600) and len(calls) == 3
+
+
+def mirroring_trainer(figure: Any, trained: Trainer) -> Trainer:
+    """Return a trainer whose network was taught to mirror the shapes on one side of a plane."""
+    start = trained.net.map(lambda w: w.detach().numpy().copy())
+    trainer = Trainer(frames_of(figure), trained.preset, 1, start)
+    check = MirrorCheck(frames_of(figure), Normaliser())
+    X = check.known_shapes(trained.net)
+    place = X[:, 5, 0]
+    X[place > place.quantile(0.6)] *= torch.tensor([1.0, 1.0, -1.0])
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(200):
+        trainer.shapes = X[torch.randint(len(X), (64,), generator=generator)]
+        trainer.advance()
+    return trainer
+
+
+def test_a_network_that_mirrors_is_repaired(figure: Any, trained: Trainer) -> None:
+    trainer = mirroring_trainer(figure, trained)
+    check = MirrorCheck(frames_of(figure), Normaliser())
+    assert check.share(trainer.net) > 0.1
+    recipe = dataclasses.replace(trainer.preset.recipe, steps=2000)
+    teacher = Teacher(check, recipe)
+    for _ in range(400):
+        teacher.prepare(trainer)
+        trainer.advance()
+    assert check.share(trainer.net) < 0.02
+
+
+@pytest.mark.parametrize("reference", ["repair", "always", "off"])
+def test_who_is_taught(figure: Any, trained: Trainer, reference: str) -> None:
+    recipe = dataclasses.replace(trained.preset.recipe, reference=reference, steps=10)
+    start = trained.net.map(lambda w: w.detach().numpy().copy())
+    check = MirrorCheck(frames_of(figure), Normaliser())
+    trainer = Trainer(frames_of(figure), trained.preset._replace(recipe=recipe), 0, start)
+    teacher = Teacher(check, recipe)
+    taught = []
+    for _ in range(4):
+        teacher.prepare(trainer)
+        taught.append(teacher.known is not None)
+        trainer.step += 1
+    # The network mirrors nothing, so that nothing is repaired.
+    assert taught == ([False, False, True, True] if reference == "always" else [False] * 4)
+
+
+def test_without_a_cycle_loss_nothing_is_taught(figure: Any, trained: Trainer) -> None:
+    recipe = dataclasses.replace(trained.preset.recipe, cycle=0.0)
+    preset = trained.preset._replace(recipe=recipe)
+    trainer = Trainer(frames_of(figure), preset, 0)
+    teacher = Teacher(MirrorCheck(frames_of(figure), Normaliser()), recipe)
+    teacher.prepare(trainer)
+    assert teacher.known is None and trainer.shapes is None
