@@ -8,6 +8,7 @@ and then repaired: a tenth of its steps with the cycle loss on reference shapes.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -114,7 +115,8 @@ def _add(
             errors = figures(evaluate(model, test, LIFTING[lifted]))
             shown = {name: errors[name] for name in _SHOWN}
             if split == "train" and lifted == "network alone":
-                shown[_FOUND] = 100 * check.share(model.network)
+                share = check.share(model.network)
+                shown |= {} if math.isnan(share) else {_FOUND: 100 * share}
             table.add((*labels, tested_on, lifted, f"seed {seed}"), shown, seed)
 
 
