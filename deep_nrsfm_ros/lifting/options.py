@@ -102,9 +102,9 @@ class HistoryOptions:
         high=10.0,
     )
     bones_time: float = option(
-        0.3,
+        1.0,
         "seconds of sight after which the lengths of an object's bones count as much as those of "
-        "the model; 0 = bone lengths are not learned, 0.3 typical, 2 slow",
+        "the model; 0 = bone lengths are not learned, 1 typical, 3 slow",
         low=0.0,
         high=60.0,
     )

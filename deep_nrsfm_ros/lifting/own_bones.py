@@ -39,7 +39,7 @@ MAX_SECONDS = 0.1
 """Longest time for which one frame counts as evidence."""
 MEMORY = 10.0
 """Seconds of sight beyond which older ones are forgotten."""
-OWN_VARIANCE = 0.5
+OWN_VARIANCE = 0.8
 """Share of a length's variance that learning removes, at most."""
 MISFIT_TIME = 0.5
 """Time constant in seconds of the test whether the object is another one."""
