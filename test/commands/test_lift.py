@@ -259,3 +259,25 @@ def test_a_camera_file_that_says_nothing(
             ]
         )
     assert "neither k nor camera_matrix" in capsys.readouterr().err
+
+
+def test_frames_help_each_other_unless_they_must_not(people: Path, tmp_path: Path) -> None:
+    shapes = {}
+    for smooth in ("none", "causal", "both"):
+        out = tmp_path / f"{smooth}.npz"
+        main([str(people), "--keypoint-layout=coco17", f"--output={out}", f"--smooth={smooth}"])
+        with np.load(out) as file:
+            shapes[smooth] = file["shapes"]
+    np.testing.assert_allclose(shapes["causal"][0], shapes["none"][0], atol=1e-5)
+    assert np.abs(shapes["causal"][4] - shapes["none"][4]).max() > 1e-4
+    assert np.abs(shapes["both"][0] - shapes["none"][0]).max() > 1e-4
+
+
+def test_gravity_is_three_numbers(
+    people: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [str(people), "--keypoint-layout=coco17", f"--output={tmp_path / 'out.npz'}"]
+    main([*command, "--up", "0", "-1", "0"])
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "--up", "0", "-1"])
+    assert ended.value.code == 2 and "three numbers" in capsys.readouterr().err
