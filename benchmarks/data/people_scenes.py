@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -76,35 +76,52 @@ class Track(NamedTuple):
     world_landmarks: Floats | None = None
 
 
-def people_scenes(data: Path, output: Path, stride: int = 1) -> Iterator[tuple[str, list[Track]]]:
+def people_scenes(
+    data: Path, output: Path, stride: int = 1, chosen: Sequence[str] = ()
+) -> Iterator[tuple[str, list[Track]]]:
     """Yield the name and the tracks of each scene; scenes without data are left out, with a note.
 
     Args:
         data: folder that holds cmu/ and scenes/.
         output: folder of results, where MediaPipe's results on the clip are kept.
         stride: every n-th trial or sequence only, to shorten a run.
+        chosen: names of the scenes; (): all.
     """
+
+    def wanted(*names: str) -> bool:
+        return not chosen or not set(names).isdisjoint(chosen)
+
     shelf, humaneva = (
         data / "scenes" / "shelf" / "shelf_dev.npz",
         data / "scenes" / "humaneva" / "humaneva_s1.npz",
     )
-    if shelf.exists():
+    if not wanted(SHELF):
+        pass
+    elif shelf.exists():
         yield SHELF, list(shelf_tracks(shelf))
     else:
         print(f"no {shelf}: no rows of {SHELF}")
-    if humaneva.exists():
+    if not wanted(HUMANEVA, HUMANEVA_NOISY):
+        pass
+    elif humaneva.exists():
         exact = list(humaneva_tracks(humaneva, stride))
-        yield HUMANEVA, exact
-        yield HUMANEVA_NOISY, [noisy(track, seed) for seed, track in enumerate(exact)]
+        if wanted(HUMANEVA):
+            yield HUMANEVA, exact
+        if wanted(HUMANEVA_NOISY):
+            yield HUMANEVA_NOISY, [noisy(track, seed) for seed, track in enumerate(exact)]
     else:
         print(f"no {humaneva}: no rows of {HUMANEVA}")
-    try:
-        balancing, standing, _ = scenes(output)
-    except (ValueError, OSError) as error:
-        print(f"no rows of the pose2sim clip: {error}")
-    else:
-        yield CLIP, [clip_track(scene) for scene in balancing]
-        yield STANDING, [clip_track(scene) for scene in standing]
+    if wanted(CLIP, STANDING):
+        try:
+            balancing, standing, _ = scenes(output)
+        except (ValueError, OSError) as error:
+            print(f"no rows of the pose2sim clip: {error}")
+        else:
+            for name, views in ((CLIP, balancing), (STANDING, standing)):
+                if wanted(name):
+                    yield name, [clip_track(scene) for scene in views]
+    if not wanted(CMU, CMU_STILL):
+        return
     moving, still = [], []
     for seed, motion in enumerate(list(held_out_motions(data / "cmu"))[::stride]):
         poses = motion[np.linspace(0, len(motion) - 1, STILL_POSES + 2).astype(int)[1:-1]]
@@ -113,8 +130,9 @@ def people_scenes(data: Path, output: Path, stride: int = 1) -> Iterator[tuple[s
             azimuth = AZIMUTHS[i % len(AZIMUTHS)]
             held = np.repeat(pose[None], STILL_FRAMES, 0)
             still.append(noisy(filmed(held, azimuth, seed), STILL_POSES * seed + i))
-    yield CMU, moving
-    yield CMU_STILL, still
+    for name, tracks in ((CMU, moving), (CMU_STILL, still)):
+        if wanted(name):
+            yield name, tracks
 
 
 def shelf_tracks(file: Path) -> Iterator[Track]:

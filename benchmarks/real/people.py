@@ -141,12 +141,18 @@ class Errors(NamedTuple):
 
 
 def benchmark(
-    lifters: Mapping[str, Lifter], data: Path, output: Path, stride: int, chosen: Sequence[str]
+    lifters: Mapping[str, Lifter],
+    systems: Mapping[str, System],
+    data: Path,
+    output: Path,
+    stride: int,
+    chosen: Sequence[str],
 ) -> Table:
     """Return the table of errors of each scene and system.
 
     Args:
         lifters: name of a model -> its lifter.
+        systems: name -> how the tracks are lifted.
         data: folder that holds cmu/ and scenes/.
         output: folder of results.
         stride: every n-th trial or sequence only.
@@ -160,12 +166,10 @@ def benchmark(
     capture = read_trials(first, HUMAN17, stride=MEAN_STRIDE)
     assert capture.shapes is not None
     mean = mean_shape(capture.shapes)[[HUMAN17.index(joint) for joint in JOINTS]]
-    for scene, tracks in people_scenes(data, output, stride):
-        if chosen and scene not in chosen:
-            continue
+    for scene, tracks in people_scenes(data, output, stride, chosen):
         for intrinsics in (True, False):
             for model, lifter in lifters.items():
-                for name, system in SYSTEMS.items():
+                for name, system in systems.items():
                     errors = [
                         (t.view, lifting_errors(lifter, t, system, intrinsics=intrinsics))
                         for t in tracks
@@ -438,13 +442,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     parser.add_argument("--stride", type=int, default=1, help="use every n-th trial or sequence")
     parser.add_argument("--scenes", nargs="+", default=[], help="names of scenes; default: all")
+    parser.add_argument(
+        "--systems", nargs="+", default=list(SYSTEMS), choices=SYSTEMS, help="default: all"
+    )
     add_arguments(parser, LiftingOptions)
     args = parser.parse_args(argv)
     try:
         options = override(LiftingOptions(), args)
         files = [find_model(name, model_folders(default_models_dir())) for name in args.models]
         lifters = {file.stem: Lifter(load_model(file), options) for file in files}
-        tables = [benchmark(lifters, args.data, args.output, args.stride, args.scenes)]
+        systems = {name: SYSTEMS[name] for name in args.systems}
+        choice = (args.stride, args.scenes)
+        tables = [benchmark(lifters, systems, args.data, args.output, *choice)]
         if not args.scenes:
             tables.append(look_at(lifters, args.data, args.output))
     except (ValueError, OSError) as error:
