@@ -25,6 +25,7 @@ REFUSALS = (TypeError, ValueError, RuntimeError)
 HUGE = (2**31 - 1, 2**32, 2**60, 2**62, 2**63 - 1, 2**63, -(2**63), 2**70, -(2**70))
 OBJECTS: tuple[Any, ...] = (None, "x", b"", 1.5, object(), [], (), 10**400, datetime.datetime_CAPI)
 PAST = 17  # constants of what is remembered
+COEFFICIENTS, SCALARS = 7, 10  # of the confidence; numbers at the end of a plan
 GUARD, GUARDED = 64, 77  # items before and after an output, and their value
 
 Arguments = list[Any]
@@ -92,8 +93,9 @@ def plan(spoiler: Spoiler, network: Sizes | None = None) -> Arguments:
         before, filled = widths[i - 1], lined(width, panels)
         to, back = (filled, lined(before, panels)) if i else (3 * filled, 3 * wide)
         n += (before if i else p) * to + filled + (width + 1) * back
-    doubles = [*floats(spoiler, p * p + 4 * rotations + 14), *[0.5] * (2 * bones + bones * bones)]
-    doubles += [*np.nan_to_num(floats(spoiler, p), posinf=1, neginf=1), *[0.5] * (PAST + 8)]
+    doubles = [*floats(spoiler, p * p + 4 * rotations + 9 + 2 * COEFFICIENTS + p * p)]
+    doubles += [0.5] * (2 * bones + bones * bones)
+    doubles += [*np.nan_to_num(floats(spoiler, p), posinf=1, neginf=1), *[0.5] * (PAST + SCALARS)]
     return [np.array(header, np.int32), floats(spoiler, n), np.array(doubles, np.float64)]
 
 
