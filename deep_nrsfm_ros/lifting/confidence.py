@@ -76,8 +76,8 @@ class Calibration(NamedTuple):
 
 
 CALIBRATED = Calibration(
-    visible=Coefficients(-3.26, -1.30, -1.59, 0.67, -0.98, -1.59, 0.00),
-    missing=Coefficients(-1.46, -1.19, -1.12, 1.56, -0.49, -0.67, -5.37),
+    visible=Coefficients(-3.16, -1.24, -1.67, 0.67, -1.02, -1.62, 0.00),
+    missing=Coefficients(-1.51, -1.26, -1.18, 1.66, -0.57, -0.66, -5.55),
 )
 """Fitted to a subject that no model was trained on.
 
