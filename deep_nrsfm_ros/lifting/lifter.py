@@ -143,8 +143,9 @@ class Lifter:
 
         Returns:
             The length of each bone in units of the reference length, by the names of its ends; a
-            bone of the right side has the length of the left one and is left out. And the seconds
-            of sight behind the best known length; 0: nothing is learned.
+            bone that was never seen is left out, and so is one of the right side, which has the
+            length of the left one. And the seconds of sight behind the best known length; 0:
+            nothing is learned.
         """
         bones, row = self.constants.bones, memory.row(identity)
         if bones is None or row is None or np.isnan(row[0]):
@@ -161,7 +162,7 @@ class Lifter:
         shown = {
             f"{names[a]}-{names[b]}": float(length)
             for i, ((a, b), length) in enumerate(zip(pairs, lengths, strict=True))
-            if self.constants.bone_partners[i] >= i
+            if self.constants.bone_partners[i] >= i and state.evidence[0, i] > 0
         }
         return shown, float(state.evidence.max(initial=0))
 

@@ -125,10 +125,15 @@ class GravityOptions:
     def __post_init__(self) -> None:
         """Raise ValueError unless `up` is three finite numbers."""
         if len(self.up) != 3 or not all(math.isfinite(x) for x in self.up):
-            raise ValueError(f"up is {self.up}; it must be three numbers, as in 0 -1 0")
+            raise ValueError(
+                f"up is {list(self.up)}; it must be three finite numbers, as in 0 -1 0"
+            )
 
     @property
     def direction(self) -> NDArray[np.float64] | None:
         """The unit vector (3,) against gravity; None: unknown."""
-        length = math.hypot(*self.up)
-        return np.array(self.up) / length if length else None
+        largest = max(map(abs, self.up))
+        if not largest:
+            return None
+        up = np.array(self.up) / largest  # the squares of very long ones are infinite
+        return np.asarray(up / np.linalg.norm(up))

@@ -39,6 +39,7 @@ class Pipeline:
         min_confidence: detector confidence below which a keypoint is missing.
         min_score: detector's score of an object below which it is left out.
         image_size: width and height of the image in pixels that the options give; None: unknown.
+        remembers: whether objects are lifted with what their last frames have shown.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class Pipeline:
         self.tolerances = keypoint_tolerances(model.layout)
         self._map = KeypointMap(self.source, model.layout)
         self._lifter = Lifter(model, lifting, layout=self.source, history=history)
-        self._remembers = history.enabled and lifting.correction != "none"
+        self.remembers = history.enabled and lifting.correction != "none"
         self._memories: dict[str, Memory] = {}
         self.min_confidence = inputs.min_confidence
         self.min_score = inputs.min_score
@@ -112,7 +113,15 @@ class Pipeline:
     @property
     def needs_identities(self) -> bool:
         """Whether `lift` needs the identities of objects: something is remembered of them."""
-        return self._smoothing.enabled or self._remembers
+        return self._smoothing.enabled or self.remembers
+
+    @property
+    def history_status(self) -> str:
+        """What is remembered from message to message, as text for diagnostics."""
+        if not self.remembers:
+            return "off: each message is lifted by itself"
+        count = sum(map(len, self._memories.values()))
+        return f"on: {count} object{'s' * (count != 1)} remembered"
 
     def restart(self, topic: str) -> None:
         """Forget all identities of a topic, as when its stamps begin anew."""
@@ -161,7 +170,7 @@ class Pipeline:
         """
         points, confidence = observation.points, observation.confidence
         context = None
-        if self._remembers:
+        if self.remembers:
             memory = self._memories.get(topic)
             if memory is None:
                 memory = self._memories[topic] = self._lifter.memory()

@@ -3,10 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Protocol
 
-from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
+
+
+class Sources(Protocol):
+    """Sources of the direction of gravity; "": not used."""
+
+    @property
+    def imu(self) -> str:
+        """Topic of an IMU."""
+
+    @property
+    def frame(self) -> str:
+        """Frame on /tf."""
+
 
 _DEFAULT_HISTORY = HistoryOptions()
 
@@ -42,3 +57,32 @@ def unused_options(
                 name = f"history.{field.name}"
                 warnings[name] = f"{name} is {value:g} and has no effect, since {reason}"
     return warnings
+
+
+def unused_gravity(
+    up: GravityOptions, sources: Sources, lifting: LiftingOptions, layout: KeypointLayout
+) -> dict[str, str]:
+    """Return a warning for each parameter of gravity that has no effect, by its name.
+
+    Args:
+        up: the direction that a parameter gives.
+        sources: the other sources of gravity.
+        lifting: how keypoints are lifted.
+        layout: of the model.
+    """
+    named = {
+        "gravity.up": str(list(up.up)) if up.direction is not None else "",
+        "gravity.imu": sources.imu,
+        "gravity.frame": sources.frame,
+    }
+    if lifting.correction == "none":
+        reason = "correction is 'none'"
+    elif not layout.top:
+        reason = f"the model's layout {layout.name!r} names no top and bottom"
+    else:
+        return {}
+    return {
+        name: f"{name} is {value} and has no effect, since {reason}"
+        for name, value in named.items()
+        if value
+    }

@@ -81,10 +81,11 @@ class PathSandbox:
     def bag(self, option: str, word: str) -> str:
         """Return the path of a bag; a relative one begins in bags_dir. Raises PathSandboxError.
 
-        No file in the folder of a bag may be a link that leads elsewhere either.
+        One that the owner gave at the start is looked for in the working folder first. No file in
+        the folder of any other bag may be a link that leads elsewhere either.
         """
         path = _expanded(option, word)
-        if word in self._owners:
+        if word in self._owners and path.exists():
             return os.path.abspath(path)
         path = self._inside(option, word, self.bags_dir / path)
         for file in path.iterdir() if path.is_dir() else ():

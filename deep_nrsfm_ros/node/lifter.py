@@ -48,7 +48,7 @@ from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
-from deep_nrsfm_ros.messages.unused_options import unused_options
+from deep_nrsfm_ros.messages.unused_options import unused_gravity, unused_options
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
@@ -120,7 +120,7 @@ class LifterNode(Node):
         self._logged: dict[str, float] = {}
         self._checks = 0
 
-        self._frame_id = camera.frame_id
+        self._frame_id, self._last_frame = camera.frame_id, ""
         self._camera = CameraInfoSubscription(self, camera)
         self._gravity = GravityDirection(self, sources)
         self._tf = TransformBroadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
@@ -148,6 +148,11 @@ class LifterNode(Node):
                 f"{self._pipeline.source.name!r}"
             )
         )
+        if self._pipeline.remembers:
+            self.get_logger().info(
+                "an answer depends on the last seconds of its object too; -p "
+                "history.enabled:=false lifts each message by itself"
+            )
         self._keypoint_topics = KeypointSubscriptions(
             self,
             self._inputs,
@@ -187,12 +192,14 @@ class LifterNode(Node):
             header = header or self._now()
             if not header.frame_id or (self._frame_id and header.frame_id != self._frame_id):
                 header = header._replace(frame_id=self._frame(source, header.frame_id))
+            self._last_frame = header.frame_id
             up = self._gravity(self._up, header.frame_id)
             lifted, identities = self._pipeline.lift(
                 observation, intrinsics, identities, source.topic, moment, up
             )
         except Exception as problem:  # one bad message must not end the node
-            self._reject(source, problem)
+            if self.context.ok():  # else a signal came meanwhile, and the message is not at fault
+                self._reject(source, problem)
             return
         if not identities:
             self._lifter_diagnostics.empty()
@@ -304,12 +311,12 @@ class LifterNode(Node):
         if level == OK and self._findings or level == WARN and layouts:
             level, message = WARN, str((layouts or self._findings)[0])
         values["findings"] = "; ".join(map(str, self._findings)) or "none"
-        values["keypoint layout"] = self._pipeline.source.name + (
-            f" (auto: {self._chosen.reason})" if self._chosen else ""
-        )
+        values["keypoint layout"] = self._layout_status()
         model = self._pipeline.model
         values |= {"model": model.name, "topic": ", ".join(self._keypoint_topics.topics)}
-        values["gravity"] = self._gravity.status(self._up, self._frame_id or self._camera.frame)
+        values["history"] = self._pipeline.history_status
+        frame = self._last_frame or self._frame_id or self._camera.frame
+        values["gravity"] = self._gravity.status(self._up, frame)
         for identity, bones in self._pipeline.learned_bones().items():
             values[f"bones of {identity}"] = bones
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
@@ -320,6 +327,13 @@ class LifterNode(Node):
                 header=publishing.to_header(self._now()), status=[lifting, self._training.status]
             )
         )
+
+    def _layout_status(self) -> str:
+        """Return the layout of the keypoints as text, for diagnostics."""
+        if self._stream.searching:
+            return "auto: not known yet, the first messages will show it"
+        name = self._pipeline.source.name
+        return f"{name} (auto: {self._chosen.reason})" if self._chosen else name
 
     def _check_input(self, level: int, residual: float, *, idle: bool) -> None:
         """Look at the last messages; log what looks wrong, at a limited rate.
@@ -435,11 +449,18 @@ class LifterNode(Node):
 
     def _unused_options(self, changes: Sequence[Parameter] | None = None) -> list[str]:
         """Return a warning for each parameter, or each of `changes`, that has no effect."""
+        lifting = parameter_bridge.read(self, LiftingOptions, changes=changes or ())
         warnings = unused_options(
             parameter_bridge.read(self, InputOptions, changes=changes or ()),
-            parameter_bridge.read(self, LiftingOptions, changes=changes or ()),
+            lifting,
             parameter_bridge.read(self, SmoothingOptions, _SMOOTHING, changes or ()),
             parameter_bridge.read(self, HistoryOptions, _HISTORY, changes or ()),
+        )
+        warnings |= unused_gravity(
+            parameter_bridge.read(self, GravityOptions, _GRAVITY, changes or ()),
+            parameter_bridge.read(self, GravitySources, _GRAVITY),
+            lifting,
+            self._pipeline.model.layout,
         )
         if changes is not None:
             names = {change.name for change in changes}
@@ -488,6 +509,17 @@ def _error_text(problem: Exception) -> str:
     return f"internal error: {problem!r}"
 
 
+def _start_error(problem: Exception) -> str:
+    """Return why rclpy cannot start, with the remedy where it is known."""
+    text = str(problem)
+    if "same type" in text:
+        text += (
+            "\nWrite all numbers of a list with a decimal point: [0.0, -0.94, -0.34], not "
+            "[0, -0.94, -0.34]"
+        )
+    return text
+
+
 def main() -> None:
     """Run the node until SIGINT or SIGTERM; exit with 0, or with 1 if it cannot start."""
     # rclpy's own handlers call these and shut the context down, which ends `spin`. The list serves
@@ -495,7 +527,11 @@ def main() -> None:
     signals: list[int] = []
     for number in _SIGNALS:
         signal.signal(number, lambda number, _: signals.append(number))
-    rclpy.init()
+    try:
+        rclpy.init()
+    except Exception as problem:  # such as a malformed parameter; rclpy has no public class for it
+        print(f"cannot start: {_start_error(problem)}", file=sys.stderr)
+        sys.exit(1)
     try:
         if not signals:
             _run()

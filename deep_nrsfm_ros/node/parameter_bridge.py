@@ -66,7 +66,10 @@ def read(
         value = proposed.get(name, present.value)
         values[field.name] = _from_ros(name, value, field.default)
         opt.check(name, values[field.name])
-    return cls(**values)
+    try:
+        return cls(**values)
+    except ValueError as error:  # it begins with the name of the option
+        raise ValueError(f"{prefix}{error}") from error
 
 
 def undeclared(node: Node) -> list[str]:

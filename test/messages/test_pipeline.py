@@ -120,3 +120,4 @@ def test_learned_bones_are_shown_in_units_of_the_reference_length() -> None:
     assert pipeline.learned_bones(0) == {}
     (text,) = pipeline.learned_bones().values()
     assert "s of sight: " in text and "neck-mid_hip 1.000" in text and "right_knee" not in text
+    assert "left_knee-left_ankle" in text and "big_toe" not in text  # coco17 has no toes

@@ -6,10 +6,12 @@ from typing import Any
 
 import pytest
 
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.lifting.options import GravityOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
-from deep_nrsfm_ros.messages.unused_options import unused_options
+from deep_nrsfm_ros.messages.unused_options import unused_gravity, unused_options
 
 DEFAULTS = (InputOptions(), LiftingOptions(), SmoothingOptions())
 
@@ -32,3 +34,19 @@ def test_options_with_an_effect_are_not_warned_of() -> None:
     inputs = InputOptions(image_width=1280, image_height=720)
     assert not unused_options(inputs, LiftingOptions(noise=0.1), SmoothingOptions(True, beta=2.0))
     assert not unused_options(*DEFAULTS)
+
+
+class Sources:
+    """As the node's parameters."""
+
+    imu, frame = "/imu", ""
+
+
+def test_gravity_without_effect_is_warned_of() -> None:
+    level, layout = GravityOptions((0, -1.0, 0)), KeypointLayout("chair", ("a", "b", "c", "d"))
+    warnings = unused_gravity(level, Sources(), LiftingOptions(), layout)
+    assert list(warnings) == ["gravity.up", "gravity.imu"]
+    assert "'chair' names no top and bottom" in warnings["gravity.imu"]
+    warnings = unused_gravity(level, Sources(), LiftingOptions(correction="none"), HUMAN17)
+    assert "no effect, since correction is 'none'" in warnings["gravity.up"]
+    assert not unused_gravity(level, Sources(), LiftingOptions(), HUMAN17)

@@ -107,6 +107,9 @@ def test_what_the_owner_names_at_the_start_may_be_anywhere(
     assert sandbox.layout("train.object", words[0]) == str(places / words[0])
     assert sandbox.bag("train.bags", words[1]) == words[1]
     assert sandbox.model("model", words[2]).is_file()
+    # A bag that the working folder lacks is one of bags_dir.
+    sandbox = PathSandbox(places / "models", places / "bags", ("a_bag",))
+    assert sandbox.bag("train.bags", "a_bag") == str(places / "bags" / "a_bag")
     with pytest.raises(PathSandboxError):
         sandbox.bag("train.bags", "/etc")
 

@@ -309,7 +309,7 @@ class Client:
 
         def found() -> DiagnosticStatus | None:
             for status in (s for message in heard for s in message.status):
-                if status.name == "/lifter: lifting" and condition(status, values(status)):
+                if status.name.endswith("/lifter: lifting") and condition(status, values(status)):
                     return status
             return None
 

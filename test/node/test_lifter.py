@@ -335,6 +335,8 @@ def test_parameters_change_what_the_next_message_gets(
     assert "read-only" in client.set_parameters(models_dir="/tmp")
     assert "read-only" in client.set_parameters(input_type=POLYGON)
     assert "at most 1" in client.set_parameters(min_confidence=2)
+    refusal = client.set_parameters(gravity__up=[0.0, float("nan"), 0.0])
+    assert "gravity.up is [0.0, nan, 0.0]; it must be three finite numbers" in refusal
     assert unpack(client.exchange(publisher, human)).shape == (1, P, 4)
 
     assert client.set_parameters(model="joints") == ""

@@ -90,6 +90,12 @@ def test_a_name_that_is_taken_is_warned_of(
         )
 
 
+def test_what_an_answer_depends_on_is_said(running: tuple[LifterProcess, Client]) -> None:
+    lifter, client = running
+    lifter.wait_for_log("-p history.enabled:=false lifts each message by itself")
+    client.wait_for_health(lambda _, v: v.get("history", "").startswith("on: "))
+
+
 def test_a_lifter_ends_with_the_launch_that_started_it(
     start_lifter: StartLifter, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -267,3 +267,13 @@ def test_a_lifter_that_cannot_listen_says_why(start_lifter: StartLifter, tmp_pat
         assert lifter.process.wait(60) == 1, number
         assert "cannot start" in lifter.log and reason in lifter.log
         assert "Traceback" not in lifter.log
+
+
+def test_a_list_of_mixed_numbers_is_explained(start_lifter: StartLifter) -> None:
+    """ROS refuses it before the node begins."""
+    program = (*("-m", "deep_nrsfm_ros.node.lifter"), "--ros-args")
+    parameters = ("-p", "gravity.up:=[0, -0.94, -0.34]", "--")
+    lifter = start_lifter((*program, *parameters), listens=False)
+    assert lifter.process.wait(60) == 1
+    assert "cannot start" in lifter.log and "[0.0, -0.94, -0.34], not [0" in lifter.log
+    assert "Traceback" not in lifter.log
