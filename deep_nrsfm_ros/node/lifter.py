@@ -119,6 +119,7 @@ class LifterNode(Node):
         self._findings: list[Finding] = []
         self._logged: dict[str, float] = {}
         self._checks = 0
+        self._unused: frozenset[str] = frozenset()
 
         self._frame_id, self._last_frame = camera.frame_id, ""
         self._camera = CameraInfoSubscription(self, camera)
@@ -447,25 +448,24 @@ class LifterNode(Node):
         for warning in self._unused_options(changes):
             self.get_logger().warning(warning)
 
-    def _unused_options(self, changes: Sequence[Parameter] | None = None) -> list[str]:
-        """Return a warning for each parameter, or each of `changes`, that has no effect."""
-        lifting = parameter_bridge.read(self, LiftingOptions, changes=changes or ())
+    def _unused_options(self, changes: Sequence[Parameter] = ()) -> list[str]:
+        """Return a warning for each parameter without effect that is among `changes` or new."""
+        lifting = parameter_bridge.read(self, LiftingOptions)
         warnings = unused_options(
-            parameter_bridge.read(self, InputOptions, changes=changes or ()),
+            parameter_bridge.read(self, InputOptions),
             lifting,
-            parameter_bridge.read(self, SmoothingOptions, _SMOOTHING, changes or ()),
-            parameter_bridge.read(self, HistoryOptions, _HISTORY, changes or ()),
+            parameter_bridge.read(self, SmoothingOptions, _SMOOTHING),
+            parameter_bridge.read(self, HistoryOptions, _HISTORY),
         )
         warnings |= unused_gravity(
-            parameter_bridge.read(self, GravityOptions, _GRAVITY, changes or ()),
+            parameter_bridge.read(self, GravityOptions, _GRAVITY),
             parameter_bridge.read(self, GravitySources, _GRAVITY),
             lifting,
             self._pipeline.model.layout,
         )
-        if changes is not None:
-            names = {change.name for change in changes}
-            warnings = {name: text for name, text in warnings.items() if name in names}
-        return list(dict.fromkeys(warnings.values()))
+        changed = {change.name for change in changes}
+        said, self._unused = self._unused, frozenset(warnings)
+        return list({t: 0 for name, t in warnings.items() if name in changed or name not in said})
 
     def _training_request(self) -> TrainingRequest:
         """Return the training that the present parameters ask for."""

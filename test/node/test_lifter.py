@@ -308,8 +308,14 @@ def test_a_parameter_without_effect_is_set_with_a_warning(
     assert client.set_parameters(image_width=0, image_height=0) == ""
     assert client.set_parameters(smoothing__beta=2.0) == ""
     lifter.wait_for_log("smoothing.beta is 2 and has no effect, since smoothing.enabled is false")
-    assert client.set_parameters(smoothing__beta=4.0) == ""
-    assert lifter.log.count("has no effect") == 2
+    assert client.set_parameters(smoothing__beta=4.0, gravity__up=[0.0, -1.0, 0.0]) == ""
+    # It is another parameter that makes this one useless.
+    assert client.set_parameters(correction="none") == ""
+    lifter.wait_for_log("gravity.up is [0.0, -1.0, 0.0] and has no effect, since correction is")
+    assert client.set_parameters(reference_length=2.0) == ""
+    assert client.set_parameters(gravity__up=[0.0, 0.0, 0.0], correction="bones") == ""
+    assert client.set_parameters(reference_length=0.0) == ""
+    assert lifter.log.count("has no effect") == 3
 
 
 def test_parameters_change_what_the_next_message_gets(
