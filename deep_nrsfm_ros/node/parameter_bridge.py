@@ -86,8 +86,11 @@ def undeclared(node: Node) -> list[str]:
         if name in declared or name.startswith(_OF_ROS):
             continue
         text = f"there is no parameter {name!r}; its value is not used"
-        if alike := difflib.get_close_matches(name, declared, 1, _ALIKE):
-            text += f"; do you mean {alike[0]!r}?"
+        # The programs have options without the group: `--up` of `lift` is gravity.up here.
+        alike = [whole for whole in declared if whole.endswith(f".{name}")]
+        alike = alike or difflib.get_close_matches(name, declared, 1, _ALIKE)
+        if alike:
+            text += f"; do you mean {' or '.join(map(repr, alike))}?"
         warnings.append(text)
     return warnings
 

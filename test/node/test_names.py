@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float32MultiArray
 
 from deep_nrsfm_ros.messages.decoding import MULTI_ARRAY
+from deep_nrsfm_ros.node.parameter_bridge import undeclared
 from deep_nrsfm_ros.node.surroundings import LAUNCH_PID
 from test.node.conftest import (
     DEADLINE,
@@ -79,6 +81,25 @@ def test_a_parameter_that_does_not_exist_is_warned_of_with_the_nearest_name(
         "'keypoint_layout'?"
     )
     assert lifter.log.count("there is no parameter") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("up", "; do you mean 'gravity.up'?"),
+        ("enabled", "; do you mean 'smoothing.enabled' or 'history.enabled'?"),
+        ("history.enable", "; do you mean 'history.enabled'?"),
+        ("colour", ""),
+    ],
+)
+def test_the_name_that_is_meant_is_found(name: str, meant: str) -> None:
+    declared = ["gravity.up", "smoothing.enabled", "history.enabled", "model"]
+    listed = SimpleNamespace(names=declared)
+    node: Any = SimpleNamespace(
+        _parameter_overrides={name: 0, "model": 0}, list_parameters=lambda *_: listed
+    )
+    text = f"there is no parameter {name!r}; its value is not used"
+    assert undeclared(node) == [text + meant]
 
 
 def test_a_name_that_is_taken_is_warned_of(
