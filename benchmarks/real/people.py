@@ -200,11 +200,11 @@ def lift_track(lifter: Lifter, track: Track, system: System, *, intrinsics: bool
     """
     values = np.concatenate([track.points, track.confidence[..., None]], -1)
     seen = to_observation(values, InputOptions().min_confidence)
-    keypoints = KeypointMap(track.layout, lifter.model.layout)(seen.points, seen.confidence)
+    to_model = KeypointMap(track.layout, lifter.model.layout)
 
     lifter = Lifter(lifter.model, lifter.options, history=system.history)
     f = len(track.points)
-    frames, names = [slice(i, i + 1) for i in range(f)], ["person"] * f
+    starts, names = np.arange(f + 1), ["person"] * f
 
     def lift(points: Floats, confidence: Floats, context: Context | None = None) -> Lifted:
         if intrinsics:
@@ -212,12 +212,12 @@ def lift_track(lifter: Lifter, track: Track, system: System, *, intrinsics: bool
         return lifter.lift(points, confidence, context=context)
 
     if system.history or system.gravity:
-        stream = Stream(*keypoints, frames, track.seconds, names)
+        stream = Stream(seen.points, seen.confidence, to_model, starts, track.seconds, names)
         smooth = BOTH if system.ahead else CAUSAL if system.history else NONE
         over_time = OverTime(smooth, track.up if system.gravity else None)
         lifted = lift_stream(lift, lifter.memory(), stream, over_time)
     else:
-        lifted = lift_all(lift, *keypoints)
+        lifted = lift_all(lift, *to_model(seen.points, seen.confidence))
     if system.filter is None:
         return lifted
     smoother = Smoother(system.filter)

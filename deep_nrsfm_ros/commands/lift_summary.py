@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.data.recording import Recording
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
@@ -107,9 +108,12 @@ def _left_out(recording: Recording, min_visible: int, *, with_camera: bool) -> d
     rows = np.flatnonzero(~recording.is_lifted)
     if not len(rows):
         return {}
-    to_model = KeypointMap(recording.source, recording.target)
-    _, mapped = to_model(detections.points[rows], detections.confidence[rows])
-    few = int((to_model.detected_count(trusted(keypoint_weight(mapped))) < min_visible).sum())
+    to_model, few = KeypointMap(recording.source, recording.target), 0
+    for part in slices(len(rows)):
+        chosen = rows[part]
+        _, mapped = to_model(detections.points[chosen], detections.confidence[chosen])
+        count = to_model.detected_count(trusted(keypoint_weight(mapped)))
+        few += int((count < min_visible).sum())
     camera = ", or come out behind the camera" if with_camera else ""
     counts = {
         f"have fewer than {min_visible} detected keypoints of the model (min_visible)": few,

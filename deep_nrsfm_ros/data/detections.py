@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.data.openpose import largest
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
@@ -97,6 +98,13 @@ class Detections:
             scores=self.scores[objects],
         )
 
+    def has_identities(self) -> bool:
+        """Return whether an identity is not just the index of the object in its frame."""
+        index = index_in_frame(self.frame)
+        return any(
+            (self.identities[rows] != index[rows].astype(str)).any() for rows in slices(len(self))
+        )
+
     def largest(self) -> Detections:
         """Return the object with the largest bounding box of each frame that has one.
 
@@ -111,6 +119,15 @@ class Detections:
             index = largest(Observation(self.points[rows], self.confidence[rows]))
             indices.append(int(rows[index or 0]))
         return self[np.array(indices, np.int64)]
+
+
+def index_in_frame(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index (m,) of each object among the objects of its frame."""
+    order = np.argsort(frame, kind="stable")
+    ordered = frame[order]
+    index = np.empty(len(frame), np.int64)
+    index[order] = np.arange(len(frame)) - np.searchsorted(ordered, ordered)
+    return index
 
 
 def gather(

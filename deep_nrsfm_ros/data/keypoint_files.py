@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -22,7 +23,6 @@ from deep_nrsfm_ros.data.formats.arrays import read_npy, read_npz
 from deep_nrsfm_ros.data.formats.builder import (
     DetectionsBuilder,
     KeypointFileError,
-    index_in_frame,
 )
 from deep_nrsfm_ros.data.formats.frame_numbers import natural
 from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
@@ -149,13 +149,17 @@ def _without_copies(detections: Detections) -> Detections:
     is_same_frame = np.diff(detections.frame) == 0
     if not is_same_frame.any():
         return detections
-    if (detections.identities != index_in_frame(detections.frame).astype(str)).any():
+    if detections.has_identities():
         return detections
-    m = len(detections)
-    columns = (detections.frame, *detections.points.reshape(m, -1).T, *detections.confidence.T)
-    first = np.unique(np.column_stack(columns), axis=0, return_index=True)[1]
     is_kept = np.asarray(~(detections.confidence > 0).any(1))
-    is_kept[first] = True
+    # Blocks that end with a frame, since objects of different frames are not compared.
+    targets = np.arange(0, len(detections), _BLOCK)
+    starts = np.unique(np.searchsorted(detections.frame, detections.frame[targets])).tolist()
+    for start, stop in pairwise([*starts, len(detections)]):
+        frame, points = detections.frame[start:stop], detections.points[start:stop]
+        columns = (frame, *points.reshape(len(frame), -1).T, *detections.confidence[start:stop].T)
+        first = np.unique(np.column_stack(columns), axis=0, return_index=True)[1]
+        is_kept[start + first] = True
     if is_kept.all():
         return detections
     warning = (
@@ -299,6 +303,7 @@ def _read_frames(
             builder.leave_out("cannot be read", f"{frame.name}: {problem}")
 
 
+_BLOCK = 4096  # objects that are compared at once
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 """Images beside the files of their keypoints are no keypoints, and usual."""

@@ -16,6 +16,7 @@ from deep_nrsfm_ros.data.bag_files import BagError, BagFile, Topic, lifter_topic
 from deep_nrsfm_ros.data.bags import STORAGES, point_cloud
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import stamp_of
+from deep_nrsfm_ros.large_arrays import release
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.decoding import read_points
 from deep_nrsfm_ros.messages.stamps import one_clock
@@ -24,6 +25,7 @@ from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_quaternion
 KEYPOINTS, POINTS, ROTATION = "/keypoints", "/lifter/points", "/lifter/camera_rotation"
 """The default topics of the lifter."""
 
+_RELEASED = 1024  # messages after which results that are in files are taken out of memory
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 _CLOUD, _QUATERNION = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/QuaternionStamped"
 
@@ -148,6 +150,8 @@ def write_lifted_bag(
                 raw = _STORE.serialize_cdr(message, topics[name])
                 writer.write(connections[name], stamp, raw)
                 count += 1
+            if count % _RELEASED == 0:
+                release(lifted)
     return count
 
 

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.lifted_bags import write_lifted_bag
 from deep_nrsfm_ros.data.recording import Recording
+from deep_nrsfm_ros.large_arrays import release
 
 _DIGITS = 6  # of numbers in JSON
+_RELEASED = 1024  # frames after which results that are in files are taken out of memory
 
 
 def check_output(path: Path) -> None:
@@ -44,10 +47,10 @@ def write_recording(path: Path, recording: Recording, model: str) -> None:
     check_output(path)
     if path.suffix == ".npz":
         arrays = _arrays(recording, model)
-        _replace(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
+        _replace(path, lambda file: _write_npz(file, arrays))
     elif path.suffix == ".json":
-        text = json.dumps(_document(recording, model), allow_nan=False)
-        _replace(path, lambda file: file.write(text.encode()))
+        parts = _document(recording, model)
+        _replace(path, lambda file: file.writelines(part.encode() for part in parts))
     else:
         write_lifted_bag(path, recording.detections, recording.lifted)
 
@@ -61,6 +64,28 @@ def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+class _Member:
+    """A member of an .npz, which takes an array out of memory as its parts are written."""
+
+    def __init__(self, file: IO[bytes], array: NDArray[Any]) -> None:
+        self._file, self._array = file, array
+
+    def write(self, data: bytes) -> int:
+        """Write bytes; return their number."""
+        count = self._file.write(data)
+        release([self._array])
+        return count
+
+
+def _write_npz(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as `np.savez_compressed` does; memory holds 16 MB of a large one."""
+    with ZipFile(file, "w", ZIP_DEFLATED) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                write = np.lib.format.write_array
+                write(_Member(member, array), array, allow_pickle=False)  # type: ignore[no-untyped-call]
 
 
 def _arrays(recording: Recording, model: str) -> dict[str, NDArray[Any]]:
@@ -78,26 +103,32 @@ def _arrays(recording: Recording, model: str) -> dict[str, NDArray[Any]]:
     }
 
 
-def _document(recording: Recording, model: str) -> dict[str, Any]:
-    """Return the JSON document, frame by frame, without objects that were not lifted."""
+def _document(recording: Recording, model: str) -> Iterator[str]:
+    """Yield the JSON document, frame by frame, without objects that were not lifted."""
     detections, target = recording.detections, recording.target
-    frames: list[dict[str, Any]] = [
-        {"stamp": stamp, "number": number, "name": name, "objects": []}
-        for stamp, number, name in zip(
-            detections.stamps.tolist(), *(each.tolist() for each in detections.frames), strict=True
-        )
-    ]
-    for i in np.flatnonzero(recording.is_lifted).tolist():
-        fields = {name: _plain(values[i]) for name, values in recording.lifted._asdict().items()}
-        frames[detections.frame[i]]["objects"].append(
-            {"identity": str(detections.identities[i]), **fields}
-        )
-    return {
-        "model": model,
-        "keypoints": list(target.keypoints),
-        "edges": target.edge_indices(),
-        "frames": frames,
-    }
+    start = {"model": model, "keypoints": list(target.keypoints), "edges": target.edge_indices()}
+    yield json.dumps(start)[:-1] + ', "frames": ['
+    f, is_lifted = len(detections.stamps), recording.is_lifted
+    ends = np.searchsorted(detections.frame, np.arange(f + 1))
+    for i in range(f):
+        objects = [
+            {
+                "identity": str(detections.identities[row]),
+                **{name: _plain(each[row]) for name, each in recording.lifted._asdict().items()},
+            }
+            for row in range(*ends[i : i + 2].tolist())
+            if is_lifted[row]
+        ]
+        frame = {
+            "stamp": int(detections.stamps[i]),
+            "number": int(detections.frames.numbers[i]),
+            "name": str(detections.frames.names[i]),
+            "objects": objects,
+        }
+        yield ", " * (i > 0) + json.dumps(frame, allow_nan=False)
+        if i % _RELEASED == 0:
+            release(recording.lifted)
+    yield "]}"
 
 
 def _plain(values: NDArray[Any]) -> Any:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.data.detections import Detections
+from deep_nrsfm_ros.large_arrays import empty, release
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.lifting.history import MAX_BACK, MAX_GAP, Context, Memory
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Identities, Observation
@@ -22,6 +26,7 @@ SMOOTH = (CAUSAL, BOTH, NONE)
 """How a recording is lifted: by the frames so far, by those before and after, or each by itself."""
 _MAX_MOTION = 0.25  # of the size of an object from one frame to the next, median
 _NEIGHBOUR = 0.25  # s, the longest time between two frames of which the motion counts
+_BLOCK = 2048  # frames or objects that are in memory in the model's layout
 _BETWEEN = MAX_GAP + MAX_BACK  # s, between two passes: smoothing starts anew
 
 
@@ -41,46 +46,80 @@ class Stream(NamedTuple):
     """The objects of a recording, frame by frame.
 
     Attributes:
-        points: (m, p, 2) in the model's layout.
-        confidence: (m, p).
-        frames: of each frame with objects its rows, in order of time.
-        seconds: of each of these frames.
+        points: (m, q, 2) in the detector's layout.
+        confidence: (m, q).
+        to_model: maps them to the model's layout.
+        starts: (f + 1,) the first row of each frame with objects, in order of time, and m.
+        seconds: (f,) of each of these frames.
         identities: (m,) from frame to frame; "": unknown.
     """
 
     points: Floats
     confidence: Floats
-    frames: list[slice]
+    to_model: KeypointMap
+    starts: NDArray[np.int64]
     seconds: Floats
     identities: list[str]
 
 
-def stream_of(
-    detections: Detections, points: Floats, confidence: Floats, tolerances: Floats | None
-) -> Stream:
+class _Frame(NamedTuple):
+    """A frame of a stream.
+
+    Attributes:
+        number: in the stream.
+        rows: its objects.
+        points: (n, p, 2) in the model's layout.
+        confidence: (n, p).
+    """
+
+    number: int
+    rows: slice
+    points: Floats
+    confidence: Floats
+
+
+def _frames(stream: Stream, *, backward: bool = False) -> Iterator[_Frame]:
+    """Yield the frames of a stream in order of time, or from the last to the first."""
+    blocks = slices(len(stream.seconds), _BLOCK)
+    for block in reversed(blocks) if backward else blocks:
+        starts = stream.starts[block.start : block.stop + 1].tolist()
+        rows = slice(starts[0], starts[-1])
+        points, confidence = stream.to_model(stream.points[rows], stream.confidence[rows])
+        order = range(block.stop - block.start)
+        for i in reversed(order) if backward else order:
+            rows, own = (
+                slice(*starts[i : i + 2]),
+                slice(starts[i] - starts[0], starts[i + 1] - starts[0]),
+            )
+            yield _Frame(block.start + i, rows, points[own], confidence[own])
+
+
+def stream_of(detections: Detections, to_model: KeypointMap, tolerances: Floats | None) -> Stream:
     """Return the objects of a recording with identities; those that it lacks are found.
 
     Args:
         detections: of the recording.
-        points: (m, p, 2) its keypoints in the model's layout.
-        confidence: (m, p) of the keypoints.
-        tolerances: (p,) of the keypoints, as in `Tracker`.
+        to_model: maps its keypoints to the model's layout.
+        tolerances: (p,) of the model's keypoints, as in `Tracker`.
     """
-    first, count = np.unique(detections.frame, return_index=True, return_counts=True)[1:]
-    frames = [slice(a, a + n) for a, n in zip(first.tolist(), count.tolist(), strict=True)]
+    first = np.unique(detections.frame, return_index=True)[1]
     stamps = detections.stamps[detections.frame[first]]
     seconds = 1e-9 * (stamps - (stamps[0] if len(stamps) else 0)).astype(np.float64)
-    index = np.concatenate([np.arange(n) for n in count] or [np.zeros(0, int)])
+    starts = np.append(first, len(detections))
+    points, confidence = detections.points, detections.confidence
+    stream = Stream(points, confidence, to_model, starts, seconds, [])
     # A source without identities has the index in the frame instead.
-    given = bool((detections.identities != index.astype(str)).any())
+    given = detections.has_identities()
     tracker = Tracker()
     period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
     identities: list[str] = []
-    for rows, second in zip(frames, seconds.tolist(), strict=True):
-        names: Identities = tuple(detections.identities[rows].tolist()) if given else ()
-        seen = Observation(points[rows], confidence[rows], tuple(n or None for n in names))
-        identities += tracker(seen, second, period, tolerances)
-    return Stream(points, confidence, frames, seconds, identities)
+    texts: dict[str, str] = {}  # one text for all objects of an identity
+    for frame in _frames(stream):
+        names: Identities = tuple(detections.identities[frame.rows].tolist()) if given else ()
+        seen = Observation(frame.points, frame.confidence, tuple(n or None for n in names))
+        found = tracker(seen, float(seconds[frame.number]), period, tolerances)
+        identities += [texts.setdefault(identity, identity) for identity in found]
+    return stream._replace(identities=identities)
 
 
 def is_in_time(stream: Stream) -> bool:
@@ -89,23 +128,39 @@ def is_in_time(stream: Stream) -> bool:
     In unrelated images, objects move by as much as they are large. A stream of which no object is
     in two frames less than 0.25 s apart has nothing to smooth: it counts as in time.
     """
-    last: dict[str, tuple[float, int]] = {}
-    motions = []
-    for rows, second in zip(stream.frames, stream.seconds.tolist(), strict=True):
-        for row in range(rows.start, rows.stop):
-            before, last[stream.identities[row]] = (
-                last.get(stream.identities[row]),
-                (second, row),
-            )
-            if before is None or second - before[0] > _NEIGHBOUR:
-                continue
-            both = (stream.confidence[row] > 0) & (stream.confidence[before[1]] > 0)
+    motions = array("f")
+    earlier = _earlier_rows(stream)
+    for block in slices(len(earlier), _BLOCK):
+        rows = block.start + np.flatnonzero(earlier[block] >= 0)
+        keypoints = stream.to_model(stream.points[rows], stream.confidence[rows])
+        rows = earlier[rows]
+        before = stream.to_model(stream.points[rows], stream.confidence[rows])
+        for points, confidence, points_before, confidence_before in zip(
+            *keypoints, *before, strict=True
+        ):
+            both = (confidence > 0) & (confidence_before > 0)
             if both.sum() < 2:
                 continue
-            a, b = stream.points[row, both], stream.points[before[1], both]
+            a, b = points[both], points_before[both]
             size = np.sqrt(np.square(a - a.mean(0)).sum(1).mean())
             motions.append(np.median(np.linalg.norm(a - b, axis=1)) / max(size, 1e-9))
     return not motions or float(np.median(motions)) <= _MAX_MOTION
+
+
+def _earlier_rows(stream: Stream) -> NDArray[np.int64]:
+    """Return the row (m,) of the same identity before each, less than 0.25 s ago; -1: none."""
+    earlier = np.full(len(stream.identities), -1, np.int64)
+    last: dict[str, tuple[float, int]] = {}
+    is_ascending = bool((np.diff(stream.seconds) >= 0).all())
+    for i, second in enumerate(stream.seconds.tolist()):
+        for row in range(*stream.starts[i : i + 2].tolist()):
+            identity = stream.identities[row]
+            before, last[identity] = last.get(identity), (second, row)
+            if before is not None and second - before[0] <= _NEIGHBOUR:
+                earlier[row] = before[1]
+        if is_ascending and i % _BLOCK == 0:  # identities that are gone need no memory
+            last = {k: v for k, v in last.items() if second - v[0] <= _NEIGHBOUR}
+    return earlier
 
 
 def lift_stream(
@@ -115,7 +170,7 @@ def lift_stream(
     over_time: OverTime,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Lifted:
-    """Return the lifted objects (m,) of a recording.
+    """Return the lifted objects (m,) of a recording; large results are in temporary files.
 
     `both` is the mean of a pass forward and a pass backward in time, each with the bones that a
     first pass has learned.
@@ -133,20 +188,21 @@ def lift_stream(
     results: list[Lifted] = []
     for number in range(passes):
         backward = number == 1
-        order = range(len(stream.frames))
         whole: Lifted | None = None
-        for i in reversed(order) if backward else order:
-            rows, second = stream.frames[i], float(stream.seconds[i])
+        for i, rows, points, confidence in _frames(stream, backward=backward):
+            second = float(stream.seconds[i])
             time = 2 * number * end + (end - second if backward else second)
             names = tuple(stream.identities[rows]) if over_time.smooth != NONE else ()
             names = names or ("",) * (rows.stop - rows.start)
             context = memory(names, time, over_time.up)
-            part = lift(stream.points[rows], stream.confidence[rows], context)
+            part = lift(points, confidence, context)
             if whole is None:
-                whole = Lifted(*(np.empty((m, *each.shape[1:]), each.dtype) for each in part))
+                whole = Lifted(*(empty((m, *each.shape[1:]), each.dtype) for each in part))
             # Each frame goes to its place, so that memory holds the objects but once.
-            for array, values in zip(whole, part, strict=True):
-                array[rows] = values
+            for each, values in zip(whole, part, strict=True):
+                each[rows] = values
+            if i % _BLOCK == 0:
+                release(whole)
             on_progress((number * m + (m - rows.start if backward else rows.stop)) // passes, m)
         assert whole is not None  # a stream has frames
         results = [*results[-1:], whole]  # the first of three passes learns the bones only
@@ -155,10 +211,14 @@ def lift_stream(
 
 def _mean(a: Lifted, b: Lifted) -> Lifted:
     """Return the mean of two lifts of the same objects."""
-    means = Lifted(*((x + y) / np.float32(2) for x, y in zip(a, b, strict=True)))
-    lifted = np.isfinite(means.rotations).all((1, 2))
-    U, _, Vt = np.linalg.svd(means.rotations[lifted].astype(np.float64))
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    rotations = means.rotations.copy()
-    rotations[lifted] = U @ Vt
-    return means._replace(rotations=rotations)
+    means = Lifted(*(empty(each.shape, each.dtype) for each in a))
+    for rows in slices(len(a.shapes), _BLOCK):
+        for mean, x, y in zip(means, a, b, strict=True):
+            mean[rows] = (x[rows] + y[rows]) / np.float32(2)
+        rotations = means.rotations[rows]
+        lifted = np.isfinite(rotations).all((1, 2))
+        U, _, Vt = np.linalg.svd(rotations[lifted].astype(np.float64))
+        U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+        rotations[lifted] = U @ Vt
+        release((*means, *a, *b))
+    return means

@@ -9,9 +9,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.data.detections import Detections, gather
 from deep_nrsfm_ros.data.lifted_bags import LiftedMessage
 from deep_nrsfm_ros.data.over_time import NONE, OverTime, is_in_time, lift_stream, stream_of
+from deep_nrsfm_ros.large_arrays import release
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.history import Context
@@ -46,7 +48,10 @@ class Recording:
     @property
     def is_lifted(self) -> NDArray[np.bool_]:
         """Return which objects (m,) were lifted."""
-        is_lifted: NDArray[np.bool_] = ~np.isnan(self.lifted.shapes.sum((1, 2)))
+        is_lifted = np.empty(len(self.lifted.shapes), bool)
+        for rows in slices(len(is_lifted)):
+            is_lifted[rows] = ~np.isnan(self.lifted.shapes[rows].sum((1, 2)))
+            release(self.lifted)
         return is_lifted
 
 
@@ -79,16 +84,19 @@ def lift_recording(
     if lifter.layout != source:
         history = lifter.constants.history
         lifter = Lifter(lifter.model, lifter.options, layout=source, history=history)
-    points, confidence = to_model(detections.points, detections.confidence)
     if over_time.smooth != NONE or over_time.up is not None:
-        stream = stream_of(detections, points, confidence, keypoint_tolerances(target))
+        stream = stream_of(detections, to_model, keypoint_tolerances(target))
         if not is_in_time(stream):
             over_time = over_time._replace(smooth=NONE)
     if not len(detections) or (over_time.smooth == NONE and over_time.up is None):
         lift = partial(lift_perspective, lifter, intrinsics) if intrinsics else lifter.lift
-        return Recording(
-            source, target, detections, lift_all(lift, points, confidence, on_progress)
+        lifted = lift_all(
+            lambda *keypoints: lift(*to_model(*keypoints)),
+            detections.points,
+            detections.confidence,
+            on_progress,
         )
+        return Recording(source, target, detections, lifted)
 
     def lift_frame(points: Floats, confidence: Floats, context: Context) -> Lifted:
         if intrinsics:

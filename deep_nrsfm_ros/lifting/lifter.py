@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.kernel import supports
+from deep_nrsfm_ros.large_arrays import empty, release
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.compiled_backend import CompiledBackend
@@ -24,6 +25,7 @@ from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model
 
 _BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
+_RELEASED = 128  # blocks after which results that are in files are taken out of memory
 
 
 class Lifted(NamedTuple):
@@ -247,6 +249,8 @@ def lift_all(
 ) -> Lifted:
     """Lift any number of objects, in slices of at most 64 to stay in cache.
 
+    Large results are in temporary files (`large_arrays.empty`).
+
     Args:
         lift: `Lifter.lift`, or a function of the same two arrays.
         points: (n, p, 2) as in `Lifter.lift`.
@@ -260,12 +264,14 @@ def lift_all(
     if not rest:
         return lifted
     # Each slice goes to its place, so that memory holds the objects but once.
-    result = Lifted(*(np.empty((n, *array.shape[1:]), array.dtype) for array in lifted))
-    for part in (first, *rest):
+    result = Lifted(*(empty((n, *array.shape[1:]), array.dtype) for array in lifted))
+    for i, part in enumerate((first, *rest)):
         if part is not first:
             lifted = lift(points[part], confidence[part])
         for array, values in zip(result, lifted, strict=True):
             array[part] = values
+        if i % _RELEASED == 0:
+            release(result)
         on_progress(part.stop, n)
     return result
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 
 MAX_COORDINATE = 1e9
@@ -124,12 +125,12 @@ def without_border(observation: Observation, size: tuple[int, int]) -> Observati
     points, confidence = observation.points, observation.confidence
     half = np.array(size, np.float32) / 2
     inner = half - np.maximum(np.float32(1), np.float32(2 * _BORDER) * half)
-    outside = (np.abs(points - half + _HALF_PIXEL) >= inner).any(-1)
     visible = confidence > 0
-    if not (outside & visible).any():
-        return observation
-    far = (np.abs(points - half) > 2 * half).any(-1) & visible
-    if far.sum() > _FAR * visible.sum():
+    outside, far = np.empty_like(visible), np.empty_like(visible)
+    for rows in slices(len(points)):
+        outside[rows] = (np.abs(points[rows] - half + _HALF_PIXEL) >= inner).any(-1)
+        far[rows] = (np.abs(points[rows] - half) > 2 * half).any(-1)
+    if not (outside & visible).any() or (far & visible).sum() > _FAR * visible.sum():
         return observation
     points = np.where(outside[..., None], _MISSING, points)
     confidence = np.where(outside, _MISSING, confidence)

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.batched import slices
+from deep_nrsfm_ros.large_arrays import release
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
@@ -111,7 +113,10 @@ def looks_normalised(points: Floats, visible: NDArray[np.bool_]) -> bool:
         points: (n, q, 2).
         visible: (n, q).
     """
-    largest = float(np.abs(points).max(where=visible[..., None], initial=0))
+    mask = visible[..., None]
+    largest = max(
+        float(points.max(where=mask, initial=0)), -float(points.min(where=mask, initial=0))
+    )
     return 0 < largest <= _NORMALISED and not is_signed(points, visible)
 
 
@@ -382,9 +387,11 @@ def _plausible(spacing: float) -> bool:
 def _places(lifted: Lifted) -> Iterator[Finding]:
     """Yield objects behind the camera or kilometres away."""
     is_lifted = ~np.isnan(lifted.residual)
-    places = lifted.shapes[is_lifted].mean(1)
-    if not len(places):
+    if not is_lifted.any():
         return
+    parts = slices(len(is_lifted))
+    places = np.concatenate([lifted.shapes[rows][is_lifted[rows]].mean(1) for rows in parts])
+    release(lifted)
     distance = np.linalg.norm(places, axis=1)
     farthest = places[distance.argmax()]
     if (behind := int((places[:, 2] < 0).sum())) > _FAR * len(places):

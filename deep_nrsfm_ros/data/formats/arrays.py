@@ -11,11 +11,10 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.data.detections import Detections, Frames
+from deep_nrsfm_ros.data.detections import Detections, Frames, index_in_frame
 from deep_nrsfm_ros.data.formats.builder import (
     KeypointFileError,
     identities_of,
-    index_in_frame,
     wrong_count,
 )
 from deep_nrsfm_ros.data.formats.frame_numbers import stamps_of

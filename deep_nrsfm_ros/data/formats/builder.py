@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.data.detections import Detections, Frames
+from deep_nrsfm_ros.batched import slices
+from deep_nrsfm_ros.data.detections import Detections, Frames, index_in_frame
 from deep_nrsfm_ros.data.formats.frame_numbers import (
     MOST,
     natural,
@@ -26,7 +27,7 @@ from deep_nrsfm_ros.lifting.observation import to_observation
 from deep_nrsfm_ros.lifting.sanity import Finding, looks_normalised
 
 NO_KEYPOINTS = "have no keypoints"
-_ROWS = 8192  # of a chunk: large enough that a freed one returns to the system
+_ROWS = 1024  # by which arrays grow at least
 _MEDIAPIPE = 33  # landmarks of MediaPipe Pose
 _FEW = 4  # keypoints, which are too few to be compared with a box
 _SMALLEST_BOX = 20.0  # pixels; a smaller one is a placeholder
@@ -49,36 +50,57 @@ class KeypointFileError(ValueError):
 
 
 class _Group:
-    """The objects of one category with one number of keypoints, in chunks."""
+    """The objects of one category with one number of keypoints, in arrays that grow.
+
+    Attributes:
+        frame: (n,) index of the frame of each object.
+        scores: (n,) of each object.
+        identities: (n,) of each object; None where the input gives none.
+        points: (n or more, q, 2), of which the first n are the objects.
+        confidence: (n or more, q), likewise.
+    """
 
     def __init__(self, keypoints: int) -> None:
-        self.keypoints = keypoints
-        self.chunks: list[NDArray[np.float32]] = []
         self.frame = array("q")
         self.scores = array("f")
         self.identities: list[str | None] = []
+        self.points = np.empty((0, keypoints, 2), np.float32)
+        self.confidence = np.empty((0, keypoints), np.float32)
 
     def add(self, values: NDArray[np.float64]) -> None:
         """Add x, y and confidence (q, 3) of an object."""
-        row = len(self.frame) % _ROWS
-        if row == 0:
-            self.chunks.append(np.empty((_ROWS, self.keypoints, 3), np.float32))
-        self.chunks[-1][row] = values
+        row = len(self.frame)
+        if row >= len(self.points):
+            self._resize(row + max(_ROWS, row // 8))
+        self.points[row], self.confidence[row] = values[:, :2], values[:, 2]
+
+    def extend(self, other: _Group) -> None:
+        """Add the objects of another group, with as many keypoints."""
+        n, m = len(self.frame), len(other.frame)
+        self._resize(n + m)
+        self.points[n:], self.confidence[n:] = other.points[:m], other.confidence[:m]
+        self.frame += other.frame
+        self.scores += other.scores
+        self.identities += other.identities
 
     def arrays(self, min_confidence: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return points (m, q, 2) and confidence (m, q) as of an observation; empties the chunks.
+        """Return points (m, q, 2) and confidence (m, q) as of an observation, once.
 
-        A chunk is freed as soon as it is copied, so that memory holds all objects but once.
+        They are the arrays of the group, so that memory holds all objects but once.
         """
-        m = len(self.frame)
-        points = np.empty((m, self.keypoints, 2), np.float32)
-        confidence = np.empty((m, self.keypoints), np.float32)
-        self.chunks.reverse()
-        for start in range(0, m, _ROWS):
-            rows = slice(start, min(start + _ROWS, m))
-            observation = to_observation(self.chunks.pop()[: rows.stop - start], min_confidence)
+        self._resize(len(self.frame))
+        points, confidence = self.points, self.confidence
+        for rows in slices(len(points)):
+            values = np.concatenate((points[rows], confidence[rows, :, None]), -1)
+            observation = to_observation(values, min_confidence)
             points[rows], confidence[rows] = observation.points, observation.confidence
         return points, confidence
+
+    def _resize(self, rows: int) -> None:
+        """Change the number of rows in place: the system moves large arrays without a copy."""
+        q = self.confidence.shape[1]
+        self.points.resize((rows, q, 2), refcheck=False)
+        self.confidence.resize((rows, q), refcheck=False)
 
 
 class DetectionsBuilder:
@@ -99,6 +121,7 @@ class DetectionsBuilder:
         self.findings: dict[str, str] = {}
         self.is_mediapipe = False
         self._groups: dict[tuple[Any, int], _Group] = {}
+        self._identities: dict[str, str] = {}
         self._frames: dict[Any, int] = {}
         self._keys: list[Any] = []
         self._frame_names: list[str] = []
@@ -227,7 +250,8 @@ class DetectionsBuilder:
         group.add(values)
         group.frame.append(frame)
         group.scores.append(1.0 if score is None else score)
-        group.identities.append(identity)
+        # One text for all objects of an identity.
+        group.identities.append(identity and self._identities.setdefault(identity, identity))
 
     def detections(self, expected: str) -> Detections:
         """Return all objects that were added.
@@ -268,7 +292,8 @@ class DetectionsBuilder:
         if (np.diff(frame) < 0).any():
             rows = np.argsort(frame, kind="stable")
             frame, scores, identities = frame[rows], scores[rows], identities[rows]
-            points, confidence = points[rows], confidence[rows]
+            for k in range(points.shape[1]):  # one by one: a copy of all would be large
+                points[:, k], confidence[:, k] = points[rows, k], confidence[rows, k]
         return Detections(
             points,
             confidence,
@@ -304,8 +329,7 @@ class DetectionsBuilder:
         """Return what looks wrong in the objects; mend what can be mended."""
         warnings = []
         if self._not_confidence > _MANY * max(len(group.frame), 1):
-            for chunk in group.chunks:
-                chunk[..., 2] = 1
+            group.confidence[:] = 1
             warnings.append(
                 f"the third number of a keypoint is negative in {self._not_confidence} of "
                 f"{len(group.frame)} objects: it is a depth and no confidence, so all keypoints "
@@ -412,7 +436,7 @@ class DetectionsBuilder:
         groups = [group for (_, count), group in self._groups.items() if count == q]
         merged = groups[0] if groups else _Group(q)
         for group in groups[1:]:
-            merged = _merge(merged, group)
+            merged.extend(group)
         return merged
 
     def _in_order(self) -> tuple[NDArray[np.int64], Frames, NDArray[np.int64]]:
@@ -493,18 +517,6 @@ def wrong_count(q: int, layout: KeypointLayout | None) -> str:
     )
 
 
-def _merge(a: _Group, b: _Group) -> _Group:
-    """Return the objects of two categories that are read as one."""
-    merged = _Group(a.keypoints)
-    for group in (a, b):
-        for row in range(len(group.frame)):
-            merged.add(group.chunks[row // _ROWS][row % _ROWS].astype(np.float64))
-            merged.frame.append(group.frame[row])
-    merged.scores = a.scores + b.scores
-    merged.identities = a.identities + b.identities
-    return merged
-
-
 def identities_of(
     given: Sequence[str | None], frame: NDArray[np.int64]
 ) -> tuple[NDArray[np.str_], str]:
@@ -536,15 +548,6 @@ def identities_of(
         f"{repeated.sum()} objects have the identity of another one in their frame, such as "
         f"{example}; they are read without identity"
     )
-
-
-def index_in_frame(frame: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (m,) of each object among the objects of its frame."""
-    order = np.argsort(frame, kind="stable")
-    ordered = frame[order]
-    index = np.empty(len(frame), np.int64)
-    index[order] = np.arange(len(frame)) - np.searchsorted(ordered, ordered)
-    return index
 
 
 def as_identity(value: Any) -> str | None:
