@@ -280,4 +280,4 @@ def test_gravity_is_three_numbers(
     main([*command, "--up", "0", "-1", "0"])
     with pytest.raises(SystemExit) as ended:
         main([*command, "--up", "0", "-1"])
-    assert ended.value.code == 2 and "three numbers" in capsys.readouterr().err
+    assert ended.value.code == 2 and "three finite numbers" in capsys.readouterr().err
