@@ -60,7 +60,7 @@ def test_a_training_from_request_to_use(
     bag = models / "joints"
     assert client.set_parameters(train__bags=[str(bag)], train__name="../evil") == ""
     assert "../evil" in client.call("/lifter/train").message
-    assert "Min: 1" in client.set_parameters(train__steps=0)
+    assert "Min: 1" in client.set_parameters(train__batch=0)
     assert not client.call("/lifter/cancel_training").success
 
     client.set_parameters(train__name="wait")
