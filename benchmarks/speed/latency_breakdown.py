@@ -176,7 +176,9 @@ def benchmark(args: Namespace) -> Iterator[Table]:
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         parameters = {"input": "/lifter/points"}
         stack.enter_context(node("benchmarks.speed.relay_node", parameters, Path(name) / "log"))
-        rclpy.init(args=["--ros-args", "-p", "model:=cmu31"])
+        # A type of its own: with "auto" the lifter would wait for a publisher.
+        settings = ("model:=cmu31", "input_type:=sensor_msgs/PointCloud2")
+        rclpy.init(args=["--ros-args", *(word for text in settings for word in ("-p", text))])
         stack.callback(rclpy.try_shutdown)
         lifter_under_test = InProcessLifter()
         stack.callback(lifter_under_test.close)
