@@ -52,9 +52,9 @@ typedef struct {
 /* Constants of lifting/history.py, own_bones.py and gravity.py, in the order of the plan's doubles. */
 typedef struct {
     double shape_time, hidden_time, rotation_time, bones_time, max_gap, max_back, outlier, max_step, max_seconds,
-        memory, own_variance, misfit_time, misfit_ratio, change_evidence, doubted_evidence, lean_deviation, free_lean;
-} Past;
-#define PAST_NUMBERS ((int)(sizeof(Past) / sizeof(double)))
+        memory, max_variance_reduction, misfit_time, misfit_ratio, change_evidence, doubted_evidence, lean_deviation, free_lean;
+} HistoryConstants;
+#define HISTORY_NUMBERS ((int)(sizeof(HistoryConstants) / sizeof(double)))
 
 typedef struct {
     int p, stride, layers, rotations, refill_rounds, reference[2], min_visible, bones, derivations;
@@ -70,7 +70,7 @@ typedef struct {
     const double *bone_lengths;                                          /* (bones, 2) length and deviation */
     const double *bone_correlation;                                      /* (bones, bones), symmetric */
     const double *axis;                                                  /* (p) from bottom to top */
-    Past past;
+    HistoryConstants history;
     double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, residual_offset,
         trusted_weight, full_ratio, extent_offset, min_known;
     void *constants, *scratch; /* the memory of all above, and of all below */

@@ -108,8 +108,8 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     k->bone_lengths = d, d += take(&d_items, k->bones, 2);
     k->bone_correlation = d, d += take(&d_items, k->bones, k->bones);
     k->axis = d, d += take(&d_items, p, 1);
-    const double *past = d;
-    d += take(&d_items, PAST_NUMBERS, 1);
+    const double *history = d;
+    d += take(&d_items, HISTORY_NUMBERS, 1);
     take(&d_items, SCALARS, 1);
     if (f_items.exceeded || f_items.left) return "the array of float32 has another length";
     if (d_items.exceeded || d_items.left) return "the array of float64 has another length";
@@ -121,9 +121,9 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
         if (!(scalars[i] >= 0 && scalars[i] < INFINITY)) return "a variance or length is negative or not finite";
     if (!k->min_relative_depth || !k->residual_scale || !k->residual_offset || !k->trusted_weight || !k->extent_offset ||
         !k->min_known) return "a divisor is zero";
-    for (int i = 0; i < PAST_NUMBERS; i++)
-        if (!(past[i] >= 0 && past[i] < INFINITY)) return "a constant of the past is negative or not finite";
-    memcpy(&k->past, past, sizeof(Past));
+    for (int i = 0; i < HISTORY_NUMBERS; i++)
+        if (!(history[i] >= 0 && history[i] < INFINITY)) return "a constant of the history is negative or not finite";
+    memcpy(&k->history, history, sizeof(HistoryConstants));
     for (int i = 0; i < p; i++) {
         if (!isfinite(k->axis[i])) return "the axis is not finite";
         k->has_axis |= k->axis[i] != 0;

@@ -78,7 +78,7 @@ class CompiledBackend:
         doubles += [constants.calibration, point_precision(net)]
         doubles += [np.stack((bones.lengths, bones.spread), 1)]
         doubles += [np.eye(len(bones.lengths)) if correlation is None else correlation]
-        doubles += [axis, _past_constants(constants.history)]
+        doubles += [axis, _history_constants(constants.history)]
         doubles += [
             constants.noise,
             constants.reference_length,
@@ -126,13 +126,13 @@ class CompiledBackend:
         return lifted, not_lifted
 
 
-def _past_constants(options: HistoryOptions) -> list[float]:
-    """Return the numbers of the kernel's `Past`, in its order."""
+def _history_constants(options: HistoryOptions) -> list[float]:
+    """Return the numbers of the kernel's `HistoryConstants`, in its order."""
     return [
         *(options.shape_time, options.hidden_time, options.rotation_time, options.bones_time),
         *(history.MAX_GAP, history.MAX_BACK),
         *(own_bones.OUTLIER, own_bones.MAX_STEP, own_bones.MAX_SECONDS, own_bones.MEMORY),
-        *(own_bones.OWN_VARIANCE, own_bones.MISFIT_TIME, own_bones.MISFIT_RATIO),
+        *(own_bones.MAX_VARIANCE_REDUCTION, own_bones.MISFIT_TIME, own_bones.MISFIT_RATIO),
         *(own_bones.CHANGE_EVIDENCE, own_bones.DOUBTED_EVIDENCE),
         *(gravity.LEAN_DEVIATION, gravity.FREE_LEAN),
     ]

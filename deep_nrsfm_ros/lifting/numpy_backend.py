@@ -18,8 +18,8 @@ from deep_nrsfm_ros.layouts.keypoint_map import detected_count
 from deep_nrsfm_ros.lifting.confidence import Calibration, Evidence, keypoint_confidence
 from deep_nrsfm_ros.lifting.correction import ErrorModel, correct
 from deep_nrsfm_ros.lifting.history import Context
+from deep_nrsfm_ros.lifting.history_update import HistoryUpdate
 from deep_nrsfm_ros.lifting.options import HistoryOptions
-from deep_nrsfm_ros.lifting.past import Past
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, relative_confidence, trusted
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.geometry import (
@@ -140,13 +140,13 @@ class NumpyBackend:
         not_lifted |= (
             detected_count(visible, self.constants.derivations) < self.constants.min_visible
         )
-        past = None
+        history = None
         if context is not None and self.constants.covariance is not None:
-            past = Past(self.constants, context, not_lifted)
+            history = HistoryUpdate(self.constants, context, not_lifted)
         mask = visible[..., None].astype(np.float32)
         complete = np.ones_like(mask)
         rounds = 0 if visible.all() else self.constants.refill
-        solution = self._solve(points, mask, seen, past, rounds == 0)
+        solution = self._solve(points, mask, seen, history, rounds == 0)
         if rounds:
             for number in range(1, rounds + 1):
                 S, _, _, unit, origin = solution
@@ -154,9 +154,9 @@ class NumpyBackend:
                 if perspective:
                     reprojected /= np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
                 filled = np.where(visible[..., None], points, reprojected)
-                solution = self._solve(filled, complete, seen, past, number == rounds)
-        if past:
-            past.write()
+                solution = self._solve(filled, complete, seen, history, number == rounds)
+        if history:
+            history.write()
         S, R, residual, _, _ = solution
         S = centre(S)
         probability = keypoint_confidence(
@@ -170,7 +170,12 @@ class NumpyBackend:
         return (S, R, scale, translation, residual, probability), not_lifted
 
     def _solve(
-        self, points: Float32, mask: Float32, seen: Keypoints, past: Past | None, last: bool
+        self,
+        points: Float32,
+        mask: Float32,
+        seen: Keypoints,
+        history: HistoryUpdate | None,
+        last: bool,
     ) -> tuple[Float32, Float32, Float32, Float32, Float32]:
         """Return S in camera axes, R, residual (n,), and unit and origin of S in the image.
 
@@ -188,18 +193,18 @@ class NumpyBackend:
             W = np.where(doubtful, (seen.points - origin) / unit, W)
             points = np.where(doubtful, seen.points, points)
             S = S @ R
-            if past and last:
-                S, R = past.smoothed(S, R, visible)
+            if history and last:
+                S, R = history.smoothed(S, R, visible)
                 M = R.swapaxes(1, 2)[..., :2]
             cameras = M[:, None] - R[:, None, 2, :, None] * points[:, :, None] if perspective else M
             errors = ErrorModel(constants.covariance, constants.bones)
             noise = constants.noise * size
-            if past:
+            if history:
                 if last:
                     first_stage = ErrorModel(constants.covariance)
                     X = correct(S, cameras, W, seen.weight, first_stage, noise)
-                    past.learn(X, R, seen.weight * visible)
-                errors = past.errors(R)
+                    history.learn(X, R, seen.weight * visible)
+                errors = history.errors(R)
             S = correct(S, cameras, W, seen.weight, errors, noise)
             S = S @ R.swapaxes(1, 2)
         return S, R, residual, unit, origin

@@ -39,7 +39,7 @@ MAX_SECONDS = 0.1
 """Longest time for which one frame counts as evidence."""
 MEMORY = 10.0
 """Seconds of sight beyond which older ones are forgotten."""
-OWN_VARIANCE = 0.8
+MAX_VARIANCE_REDUCTION = 0.8
 """Share of a length's variance that learning removes, at most."""
 MISFIT_TIME = 0.5
 """Time constant in seconds of the test whether the object is another one."""
@@ -84,24 +84,27 @@ def partner_bones(ends: NDArray[np.int32], partners: Sequence[int]) -> NDArray[n
     return np.array(found, np.int32)
 
 
-def own_growth(bones: Bones, learned: Learned, time: float) -> Floats:
-    """Return the growth (n, b) of each bone that lifting takes, without growth of the whole.
+def own_growth(bones: Bones, learned: Learned, bones_time: float) -> Floats:
+    """Return the growth (n, b) of each bone that lifting takes, without their common scale.
 
     Args:
         bones: of the model.
         learned: of n objects.
-        time: seconds of sight with which half of the learned growth counts; 0: none ever does.
+        bones_time: seconds of sight with which half of the learned growth counts; 0: none ever
+            does.
     """
-    growth = _share(learned.evidence, time) * learned.growth
+    growth = _trust(learned.evidence, bones_time) * learned.growth
     precision = (bones.lengths / bones.spread) ** 2
-    whole: Floats = growth @ precision / precision.sum()
-    return growth - whole[:, None]
+    scale: Floats = growth @ precision / precision.sum()
+    return growth - scale[:, None]
 
 
-def own_bones(bones: Bones, learned: Learned, time: float) -> Bones:
+def own_bones(bones: Bones, learned: Learned, bones_time: float) -> Bones:
     """Return bones with the lengths (n, b) and the spread (n, b) of each object."""
-    lengths = bones.lengths * np.exp(own_growth(bones, learned, time))
-    spread = bones.spread * np.sqrt(1 - OWN_VARIANCE * _share(learned.evidence, time))
+    lengths = bones.lengths * np.exp(own_growth(bones, learned, bones_time))
+    spread = bones.spread * np.sqrt(
+        1 - MAX_VARIANCE_REDUCTION * _trust(learned.evidence, bones_time)
+    )
     return bones._replace(lengths=lengths, spread=spread)
 
 
@@ -129,7 +132,7 @@ def learn(
     learned: Learned,
     sight: Sight,
     seconds: Floats,
-    time: float,
+    bones_time: float,
 ) -> Learned:
     """Return what is learned after one more frame.
 
@@ -139,24 +142,24 @@ def learn(
         learned: of n objects before the frame.
         sight: of the frame.
         seconds: (n,) since the last frame.
-        time: as in `own_growth`.
+        bones_time: as in `own_growth`.
     """
     precision = (bones.lengths / bones.spread) ** 2
     w = sight.weight
-    expected = own_growth(bones, learned, time)
+    expected = own_growth(bones, learned, bones_time)
     misfit = np.stack([_misfit(sight, g, precision) for g in (expected, 0 * expected)], 1)
     part = gain(seconds, MISFIT_TIME)[:, None] * (w.sum(1) > 0)[:, None]
     misfit = learned.misfit + part * (misfit - learned.misfit)
     evidence = learned.evidence
     another = (evidence.max(1) > CHANGE_EVIDENCE) & (misfit[:, 0] > MISFIT_RATIO * misfit[:, 1])
     evidence = np.where(another[:, None], np.minimum(evidence, DOUBTED_EVIDENCE), evidence)
-    # The growth of the whole, which is the unknown size, without bones that are measured wrong.
+    # The common scale, which is the unknown size, without bones that are measured wrong.
     r, limit = sight.growth - expected, OUTLIER / np.sqrt(precision)
-    whole = _mean(r, w * precision)
+    scale = _mean(r, w * precision)
     for _ in range(REWEIGHTINGS):
-        whole = _mean(r, w * precision / np.maximum(1, np.abs(r - whole) / limit))
+        scale = _mean(r, w * precision / np.maximum(1, np.abs(r - scale) / limit))
     both = w + w[:, partners]
-    own = w * (sight.growth - whole)
+    own = w * (sight.growth - scale)
     growth = (own + own[:, partners]) / np.maximum(both, 1e-12)
     gained = both / 2 * np.minimum(seconds, MAX_SECONDS)[:, None]
     evidence = np.minimum(evidence + gained, MEMORY)
@@ -165,9 +168,9 @@ def learn(
     return Learned(learned.growth + step, evidence, misfit)
 
 
-def _share(evidence: Floats, time: float) -> Floats:
+def _trust(evidence: Floats, bones_time: float) -> Floats:
     """Return the share in [0, 1) of what is learned that counts."""
-    return evidence / (evidence + time) if time else 0 * evidence
+    return evidence / (evidence + bones_time) if bones_time else 0 * evidence
 
 
 def _mean(x: Floats, weight: Floats) -> Floats:

@@ -110,12 +110,12 @@ def lift(spoiler: Spoiler, network: Sizes | None = None, made: object = None) ->
     if made is None:
         arguments = plan(spoiler, network)
         made = COMPILED.plan(*arguments)
-        context = spoiler.choice((None, past(spoiler, n, p, int(arguments[0][11]))))
+        context = spoiler.choice((None, history(spoiler, n, p, int(arguments[0][11]))))
     perspective = spoiler.choice((False, True))
     return [made, floats(spoiler, n, p, 2), confidence, perspective, context, *arrays]
 
 
-def past(spoiler: Spoiler, n: int, p: int, bones: int) -> tuple[Any, ...]:
+def history(spoiler: Spoiler, n: int, p: int, bones: int) -> tuple[Any, ...]:
     """Return a context of n objects; some of its states are random, some of objects to come."""
     capacity = spoiler.choice((0, 1, 5))
     states = output(capacity, 12 + 3 * p + 2 * bones, dtype=np.float64)

@@ -1,4 +1,4 @@
-/* What is remembered of one object from frame to frame: lifting/past.py, network_smoothing.py, own_bones.py and
+/* What is remembered of one object from frame to frame: lifting/history_update.py, network_smoothing.py, own_bones.py and
    gravity.py. */
 #include <math.h>
 #include <string.h>
@@ -22,17 +22,17 @@ static double gain(double seconds, double time) { return time > 0 ? 1 - exp(-sec
 
 /* Return the share of what is learned that counts. */
 static double share(const Plan *k, double evidence) {
-    return k->past.bones_time > 0 ? evidence / (evidence + k->past.bones_time) : 0;
+    return k->history.bones_time > 0 ? evidence / (evidence + k->history.bones_time) : 0;
 }
 
-/* Set the bones of an object, and their growth, which is without growth of the whole: own_bones. */
+/* Set the bones of an object, and their growth, which is without the common scale: own_bones. */
 static void set_own_bones(Plan *k, Object *o) {
     const double *growth = growth_of(k, o), *evidence = evidence_of(k, o);
     double whole = 0, sum = 0;
     for (int b = 0; b < k->bones; b++) {
         double T = k->precision[b] * k->precision[b], part = share(k, evidence[b]);
         o->own_growth[b] = part * growth[b];
-        o->own_bones[2 * b + 1] = k->bone_lengths[2 * b + 1] * sqrt(1 - k->past.own_variance * part);
+        o->own_bones[2 * b + 1] = k->bone_lengths[2 * b + 1] * sqrt(1 - k->history.max_variance_reduction * part);
         whole += T * o->own_growth[b], sum += T;
     }
     whole /= sum;
@@ -64,12 +64,12 @@ void recall(Plan *k, Object *o, const Context *context, ptrdiff_t i, int lifted)
         o->state[STATE_MISFIT] = o->state[STATE_MISFIT + 1] = 0;
         memset(growth_of(k, o), 0, 2 * k->bones * sizeof(double));
     }
-    int restarts = begins || elapsed < -k->past.max_back || elapsed > k->past.max_gap;
+    int restarts = begins || elapsed < -k->history.max_back || elapsed > k->history.max_gap;
     o->time = context->time;
     o->seconds = begins || elapsed < 0 ? 0 : elapsed;
     o->goes_on = !restarts && elapsed > 0;
     o->updates = restarts || o->goes_on;
-    if (!k->bones || !(k->past.bones_time > 0)) return;
+    if (!k->bones || !(k->history.bones_time > 0)) return;
     set_own_bones(k, o);
 }
 
@@ -100,8 +100,8 @@ void smooth_network(Plan *k, Object *o) {
         return;
     }
     int goes_on = o->goes_on && old_size < INFINITY;
-    double seen = goes_on ? gain(o->seconds, k->past.shape_time) : 1;
-    double hidden = goes_on ? gain(o->seconds, k->past.hidden_time) : 1;
+    double seen = goes_on ? gain(o->seconds, k->history.shape_time) : 1;
+    double hidden = goes_on ? gain(o->seconds, k->history.hidden_time) : 1;
     double ratio = goes_on ? sqrt(size) / fmax(sqrt(old_size), 1e-9) : 0;
     for (int i = 0; i < p; i++) {
         double part = o->visible[i] ? seen : hidden;
@@ -117,7 +117,7 @@ void smooth_network(Plan *k, Object *o) {
         memcpy(old, o->state + STATE_ROTATION, sizeof(old));
         transpose(old, back);
         turn(&R[0][0], 0, back, step);
-        rotation_part(step, gain(o->seconds, k->past.rotation_time), step);
+        rotation_part(step, gain(o->seconds, k->history.rotation_time), step);
         turn(&step[0][0], 0, old, R);
     }
     memcpy(o->state + STATE_ROTATION, R, sizeof(R));
@@ -143,7 +143,7 @@ static double mean_growth(const Plan *k, const double *expected, double limit, d
 
 /* Return the mean squared deviation of the bones from lengths of growth `expected`, in spreads: _misfit. */
 static double misfit(const Plan *k, const double *expected) {
-    const double *growth = k->sight, *weight = k->sight + k->bones, limit = k->past.outlier;
+    const double *growth = k->sight, *weight = k->sight + k->bones, limit = k->history.outlier;
     double mean = mean_growth(k, expected, 0, 0), square = 0, sum = 0;
     for (int b = 0; b < k->bones; b++) {
         double x = (growth[b] - expected[b] - mean) * k->precision[b];
@@ -154,9 +154,9 @@ static double misfit(const Plan *k, const double *expected) {
 
 void learn_bones(Plan *k, Object *o) {
     int p = DOUBLES_OF(k->p), n = k->bones;
-    const Past *past = &k->past;
+    const HistoryConstants *constants = &k->history;
     double *sight_growth = k->sight, *weight = k->sight + n, *own = o->own_growth, sum = 0, most = 0;
-    if (!n || !(past->bones_time > 0)) return;
+    if (!n || !(constants->bones_time > 0)) return;
     for (int b = 0; b < n; b++) {
         const int *ends = k->bone_ends + 2 * b;
         double square = 0, along = 0;
@@ -171,27 +171,28 @@ void learn_bones(Plan *k, Object *o) {
         double seen[2];
         for (int end = 0; end < 2; end++) seen[end] = o->visible[ends[end]] ? o->weight[ends[end]] : 0;
         sight_growth[b] = log(square / (k->bone_lengths[2 * b] * k->bone_lengths[2 * b])) / 2;
+        /* own_bones.FORESHORTENING_POWER */
         weight[b] = across * across * across * across * fmin(seen[0], seen[1]);
         sum += weight[b];
     }
     if (!(sum > 0)) return; /* Nothing is visible, or a number is NaN. */
     double *growth = growth_of(k, o), *evidence = evidence_of(k, o), *q = o->state + STATE_MISFIT;
-    double part = gain(o->seconds, past->misfit_time);
+    double part = gain(o->seconds, constants->misfit_time);
     q[0] += part * (misfit(k, own) - q[0]);
     q[1] += part * (misfit(k, k->no_growth) - q[1]);
     for (int b = 0; b < n; b++) most = fmax(most, evidence[b]);
-    if (most > past->change_evidence && q[0] > past->misfit_ratio * q[1])
-        for (int b = 0; b < n; b++) evidence[b] = fmin(evidence[b], past->doubted_evidence);
-    double whole = mean_growth(k, own, 0, 0), seconds = fmin(o->seconds, past->max_seconds);
-    for (int i = 0; i < REWEIGHTINGS; i++) whole = mean_growth(k, own, past->outlier, whole);
+    if (most > constants->change_evidence && q[0] > constants->misfit_ratio * q[1])
+        for (int b = 0; b < n; b++) evidence[b] = fmin(evidence[b], constants->doubted_evidence);
+    double whole = mean_growth(k, own, 0, 0), seconds = fmin(o->seconds, constants->max_seconds);
+    for (int i = 0; i < REWEIGHTINGS; i++) whole = mean_growth(k, own, constants->outlier, whole);
     for (int b = 0; b < n; b++) {
         int other = k->bone_partners[b];
         double both = weight[b] + weight[other], gained = both / 2 * seconds;
         double sides = weight[b] * (sight_growth[b] - whole) + weight[other] * (sight_growth[other] - whole);
         double difference = sides / fmax(both, 1e-12) - growth[b];
-        evidence[b] = fmin(evidence[b] + gained, past->memory);
+        evidence[b] = fmin(evidence[b] + gained, constants->memory);
         growth[b] += fmin(gained / fmax(evidence[b], 1e-12), 1) *
-                     fmin(fmax(difference, -past->max_step), past->max_step);
+                     fmin(fmax(difference, -constants->max_step), constants->max_step);
     }
 }
 
@@ -206,8 +207,8 @@ int set_upright(Plan *k, Object *o, double *directions, double values[3]) {
         length += v[r] * v[r], along += v[r] * up[r];
     }
     length = fmax(sqrt(length), 1e-9);
-    double lean = acos(fmin(fmax(along / length, -1), 1)) / k->past.free_lean;
-    values[2] = k->past.lean_deviation * length * sqrt(1 + lean * lean * lean * lean);
+    double lean = acos(fmin(fmax(along / length, -1), 1)) / k->history.free_lean;
+    values[2] = k->history.lean_deviation * length * sqrt(1 + lean * lean * lean * lean);
     int least = fabs(up[1]) < fabs(up[0]);
     if (fabs(up[2]) < fabs(up[least])) least = 2;
     /* a = up x e, with e the axis that is furthest from up; b = up x a. */

@@ -1,4 +1,4 @@
-"""What a context adds to the lift of one frame, in NumPy: the readable form of `kernel/past.c`."""
+"""What a context adds to the lift of a frame, in NumPy: the readable form of `kernel/history.c`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from deep_nrsfm_ros.lifting.numpy_backend import LifterConstants
 
 
-class Past:
+class HistoryUpdate:
     """What is remembered of the n objects of a frame.
 
     An object that is not lifted changes nothing. A frame that is not later than the last one of its
