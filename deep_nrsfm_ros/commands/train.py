@@ -70,6 +70,12 @@ def parser() -> argparse.ArgumentParser:
     data.add_argument("--stride", type=int, help="take every n-th CMU frame (default: 1)")
     data.add_argument("--camera-seed", type=int, help="seed of the CMU cameras (default: 0)")
     data.add_argument(
+        "--cameras",
+        type=int,
+        help="random cameras that project each CMU frame; 8 typical for a model of people in "
+        "general, the paper has 1 (default: 1)",
+    )
+    data.add_argument(
         "--virtual-people",
         type=int,
         help="learn error covariance and bones from so many virtual people in CMU poses, with "

@@ -215,9 +215,10 @@ def read_trials(
     *,
     seed: int = 0,
     stride: int = 1,
+    cameras: int = 1,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Dataset:
-    """Return a dataset of trials; each frame is projected by a random orthonormal camera.
+    """Return a dataset of trials; random orthonormal cameras project each frame.
 
     Points and ground-truth shapes are centred and in metres. The skeleton is the .asf file of the
     subject, next to the trials.
@@ -227,6 +228,7 @@ def read_trials(
         layout: CMU31 or HUMAN17.
         seed: of the random cameras.
         stride: take every stride-th frame.
+        cameras: cameras of each frame; the images of one camera are consecutive.
         on_progress: called with the number of trials done and their total number.
 
     Raises:
@@ -241,6 +243,7 @@ def read_trials(
         asf = path.parent / f"{path.parent.name}.asf"
         skeleton = skeletons.setdefault(asf, skeletons.get(asf) or read_asf(asf))
         S = centre(KEYPOINTS_OF[layout.name](read_amc(path, skeleton))[::stride])
+        S = np.tile(S, (cameras, 1, 1))
         W = S @ random_cameras(len(S), rng)
         source = f"CMU motion capture, subject {path.parent.name}"
         parts.append(Dataset(W, np.ones(W.shape[:2], bool), layout, source, S))
@@ -258,6 +261,7 @@ class TrialSelection:
         split: "train" or "held-out" by the paper's protocol, or "all".
         stride: every n-th frame is taken.
         camera_seed: seed of the random cameras.
+        cameras: cameras that project each frame.
     """
 
     folder: Path
@@ -265,6 +269,7 @@ class TrialSelection:
     split: str = "train"
     stride: int = 1
     camera_seed: int = 0
+    cameras: int = 1
 
 
 def selected_trials(selection: TrialSelection) -> list[Path]:
@@ -288,5 +293,6 @@ def read_split(
         layout,
         seed=selection.camera_seed,
         stride=selection.stride,
+        cameras=selection.cameras,
         on_progress=on_progress,
     )

@@ -46,6 +46,7 @@ class DataConfig:
         all_trials: take all trials of a subject, not only the paper's first floor(0.8 N).
         stride: take every n-th CMU frame.
         camera_seed: seed of the random cameras of the CMU frames.
+        cameras: random cameras that project each CMU frame, 1 to 8 typical.
         virtual_people: number of virtual people in CMU poses from which the last step learns error
             covariance and bones; 0 is from frames of the training.
     """
@@ -66,6 +67,7 @@ class DataConfig:
     all_trials: bool = False
     stride: int = 1
     camera_seed: int = 0
+    cameras: int = 1
     virtual_people: int = 0
 
     @property

@@ -94,7 +94,9 @@ def read_people(config: TrainingConfig, reporter: Reporter) -> Dataset | None:
 def _selection(data: DataConfig, folder: Path) -> TrialSelection:
     """Return the trials of CMU that the configuration names."""
     trials = "all" if data.all_trials else "train"
-    return TrialSelection(folder, data.subjects, trials, data.stride, data.camera_seed)
+    return TrialSelection(
+        folder, data.subjects, trials, data.stride, data.camera_seed, data.cameras
+    )
 
 
 def _numbered(data: DataConfig, options: ReadOptions) -> KeypointLayout:

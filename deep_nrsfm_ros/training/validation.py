@@ -28,7 +28,7 @@ _OF_BAGS = (
     *("topic", "keypoint_layout", "min_confidence", "mapping", "image_width", "image_height"),
     *("missing_value", "min_score", "category"),
 )
-_OF_CMU = ("subjects", "all_trials", "stride", "camera_seed", "virtual_people")
+_OF_CMU = ("subjects", "all_trials", "stride", "camera_seed", "cameras", "virtual_people")
 
 
 def validate(config: TrainingConfig, names: OptionNames) -> str:
@@ -101,6 +101,7 @@ def _check_ranges(config: TrainingConfig, names: OptionNames) -> None:
     for name, value, least in (
         ("min_confidence", config.data.min_confidence, 0),
         ("stride", config.data.stride, 1),
+        ("cameras", config.data.cameras, 1),
         ("virtual_people", config.data.virtual_people, 0),
         ("threads", config.output.threads, 0),
     ):

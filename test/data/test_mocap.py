@@ -254,6 +254,16 @@ def test_trials_come_in_order(tmp_path: Path) -> None:
     assert names == ["07_01", "07_02", "07_09", "07_10"]
 
 
+def test_each_frame_is_seen_by_as_many_cameras_as_asked_for(tmp_path: Path) -> None:
+    frame: dict[str, list[float]] = {"root": [0] * 6}
+    _, motion_file = written(tmp_path, straight(), [frame, frame | {"root": [0, 0, 0, 0, 90, 0]}])
+    dataset = read_trials([motion_file], cameras=3)
+    assert dataset.shapes is not None and len(dataset) == 6
+    np.testing.assert_array_equal(dataset.shapes[:2], dataset.shapes[4:])
+    distances = np.abs(dataset.points[:, None] - dataset.points).max((-2, -1))
+    assert (distances[~np.eye(6, dtype=bool)] > 1e-3).all()
+
+
 def test_the_protocol_trains_on_the_first_four_fifths() -> None:
     for n in range(200):
         paths = [Path(str(i)) for i in range(n)]

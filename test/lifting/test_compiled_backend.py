@@ -72,6 +72,8 @@ def objects(
     return points, confidence
 
 
+PERTURBATIONS = 3  # draws; one alone may by chance change less than rounding does
+
 # The vectors are the same for all examples of a test.
 each_vectors = [HealthCheck.function_scoped_fixture]
 
@@ -127,7 +129,7 @@ def test_lifts_as_numpy_does(
             np.testing.assert_allclose(ours, numpy, rtol=0, atol=at_most)
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=each_vectors)
+@settings(max_examples=20, deadline=None, suppress_health_check=each_vectors)
 @given(
     seed=st.integers(0, 2**32 - 1),
     layout=st.sampled_from([HUMAN17, NUMBERED]),
@@ -152,14 +154,15 @@ def test_remembers_as_numpy_does(
     gravity: bool,
 ) -> None:
     made = model(seed, layout, (30, 20, 12), 1.0, "rms")
-    # As real ones are: lengths within a tenth of the mean.
-    lengths = made.bone_lengths.mean() * np.ones_like(made.bone_lengths) * [1, 0.1]
-    made = dataclasses.replace(made, bone_lengths=lengths.astype(np.float32))
+    if len(made.bone_lengths):
+        # As real ones are: lengths within a tenth of the mean.
+        lengths = made.bone_lengths.mean() * np.ones_like(made.bone_lengths) * [1, 0.1]
+        made = dataclasses.replace(made, bone_lengths=lengths.astype(np.float32))
     lifter = Lifter(made, options, history=remembers)
     by_numpy = NumpyBackend(lifter.constants)
     rng, p, n = np.random.default_rng(seed), len(layout), MORE_THAN_A_BLOCK
     own = StateLayout(p, len(layout.bone_indices()) if options.correction == "bones" else 0)
-    states = np.full((2, n + 2, own.size), np.nan)
+    states = np.full((1 + PERTURBATIONS, n + 2, own.size), np.nan)
     points, confidence = objects(rng, n, p, 0.0, perspective)
     views = Rotation.random(n, random_state=seed).as_matrix()
     up = np.array([0.0, -0.6, 0.8]) if gravity else None
@@ -173,19 +176,21 @@ def test_remembers_as_numpy_does(
         arrays, lost = lifter.backend(points, shown, perspective, context)
         expected, _ = by_numpy(points, shown, perspective, context._replace(states=states[0]))
         # What the last digits of the input change: so much may the two differ, too.
-        near = points + 1e-6 * rng.standard_normal(points.shape).astype(np.float32)
-        again = Context(states[1], rows, time, up, context.to_view)
-        nearby, _ = by_numpy(near, shown, perspective, again)
-        for ours, numpy, unsure in zip(arrays, expected, nearby, strict=True):
+        nearby = []
+        for state in states[1:]:
+            near = points + 1e-6 * rng.standard_normal(points.shape).astype(np.float32)
+            again = Context(state, rows, time, up, context.to_view)
+            nearby.append(by_numpy(near, shown, perspective, again)[0])
+        for ours, numpy, *unsure in zip(arrays, expected, *nearby, strict=True):
             for i in np.flatnonzero(~lost):
                 close = 1e-3 * np.abs(numpy[~lost]).max()
-                close += 10 * np.abs(unsure[i] - numpy[i]).max()
+                close += 10 * max(np.abs(found[i] - numpy[i]).max() for found in unsure)
                 np.testing.assert_allclose(ours[i], numpy[i], rtol=0, atol=close + 1e-6)
         np.testing.assert_array_equal(np.isnan(context.states), np.isnan(states[0]))
         known = ~np.isnan(states[0])
-        close = 2e-3 + 10 * np.abs(states[1] - states[0])[known].max(initial=0)
+        close = 2e-3 + 10 * np.abs(states[1:] - states[0])[:, known].max(initial=0)
         np.testing.assert_allclose(context.states[known], states[0][known], atol=close)
-        states[1] = states[0]
+        states[1:] = states[0]
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=each_vectors)
