@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.dataset import Dataset, DatasetBuilder
+from deep_nrsfm_ros.data.definitions import ros2_types
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -47,7 +47,6 @@ NO_SCORES = "gives no object a score (a field mapping can name it): leave out mi
 """Why `min_score` cannot act on a bag."""
 
 _SAMPLE = 256  # messages of a bag that `keypoint_count` looks at
-_STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 class TooManyFramesError(BagError):
@@ -280,17 +279,17 @@ def write_bag(
         raise BagError(f"bag {path} exists already; choose another name or remove it")
     kind, count = input_type.replace("/", "/msg/"), 0
     with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
-        connection = writer.add_connection(topic, kind, typestore=_STORE)
+        connection = writer.add_connection(topic, kind, typestore=ros2_types())
         for frame in frames:
             message = _ENCODERS[input_type](frame)
-            writer.write(connection, frame.stamp, _STORE.serialize_cdr(message, kind))
+            writer.write(connection, frame.stamp, ros2_types().serialize_cdr(message, kind))
             count += 1
     return count
 
 
 def _make(kind: str, *values: Any) -> Any:
     """Return a message of type `kind` with the values of its fields, in order."""
-    return _STORE.types[kind](*values)
+    return ros2_types().types[kind](*values)
 
 
 def _header(frame: Frame) -> Any:

@@ -20,9 +20,6 @@ from rosbags.typesys.store import Typestore
 Types = dict[str, Any]
 """Name of a type, e.g. "std_msgs/msg/Header", to its fields, as rosbags has them."""
 
-ROS2 = get_typestore(Stores.ROS2_JAZZY)
-"""The types of ROS 2 itself."""
-
 _HEADER = "std_msgs/msg/Header"
 
 DETECTORS = {
@@ -54,6 +51,15 @@ DETECTORS = {
 """Definitions of detectors whose messages are read without a field mapping."""
 
 _IDL = "=" * 80 + "\nIDL: "  # before each definition in .idl format
+
+
+@cache
+def ros2_types() -> Typestore:
+    """Return the types of ROS 2 itself.
+
+    They are made at the first call, since they take 0.2 s and a node that opens no bag needs none.
+    """
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 class DefinitionError(ValueError):
@@ -167,7 +173,8 @@ def _parse(text: str, name: str) -> Types:
 
 def _of_ros2(name: str) -> Types:
     """Return a type of ROS 2 itself; {} if it is none."""
-    return {name: ROS2.fielddefs[name]} if name in ROS2.fielddefs else {}
+    fields = ros2_types().fielddefs
+    return {name: fields[name]} if name in fields else {}
 
 
 def _shipped(name: str) -> Types:

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import Writer
-from rosbags.typesys import Stores, get_typestore
 
 from deep_nrsfm_ros.data.bag_files import BagError, BagFile, Topic, lifter_topics, open_bag
 from deep_nrsfm_ros.data.bags import STORAGES, point_cloud
+from deep_nrsfm_ros.data.definitions import ros2_types
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import stamp_of
 from deep_nrsfm_ros.large_arrays import release
@@ -26,7 +26,6 @@ KEYPOINTS, POINTS, ROTATION = "/keypoints", "/lifter/points", "/lifter/camera_ro
 """The default topics of the lifter."""
 
 _RELEASED = 1024  # messages after which results that are in files are taken out of memory
-_STORE = get_typestore(Stores.ROS2_JAZZY)
 _CLOUD, _QUATERNION = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/QuaternionStamped"
 
 
@@ -101,7 +100,7 @@ def _messages(
     reason, damaged = "", 0
     for record in bag.records(topic):
         try:
-            message = _STORE.deserialize_cdr(record.raw, topic.type)
+            message = ros2_types().deserialize_cdr(record.raw, topic.type)
             messages.append((record.time, stamp_of(message), message))
         except Exception as error:  # damaged bytes fail in many ways; read the others
             reason, damaged = reason or repr(error), damaged + 1
@@ -133,7 +132,7 @@ def write_lifted_bag(
     with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
         topics = {KEYPOINTS: _CLOUD, POINTS: _CLOUD, ROTATION: _QUATERNION}
         connections = {
-            name: writer.add_connection(name, kind, typestore=_STORE)
+            name: writer.add_connection(name, kind, typestore=ros2_types())
             for name, kind in topics.items()
         }
         for stamp, start, end in zip(stamps.tolist(), ends, ends[1:], strict=False):
@@ -147,7 +146,7 @@ def write_lifted_bag(
                 if not np.isnan(lifted.residual[start]):
                     messages[ROTATION] = _rotation(header, lifted.rotations[start])
             for name, message in messages.items():
-                raw = _STORE.serialize_cdr(message, topics[name])
+                raw = ros2_types().serialize_cdr(message, topics[name])
                 writer.write(connections[name], stamp, raw)
                 count += 1
             if count % _RELEASED == 0:
@@ -157,11 +156,11 @@ def write_lifted_bag(
 
 def _header(stamp: int, frame_id: str) -> Any:
     """Return a std_msgs/Header with a stamp in ns."""
-    time = _STORE.types["builtin_interfaces/msg/Time"](*divmod(stamp, 1_000_000_000))
-    return _STORE.types["std_msgs/msg/Header"](time, frame_id)
+    time = ros2_types().types["builtin_interfaces/msg/Time"](*divmod(stamp, 1_000_000_000))
+    return ros2_types().types["std_msgs/msg/Header"](time, frame_id)
 
 
 def _rotation(header: Any, rotation: NDArray[np.float32]) -> Any:
     """Return a rotation (3, 3) as a QuaternionStamped."""
-    values = _STORE.types["geometry_msgs/msg/Quaternion"](*quaternion(rotation).tolist())
-    return _STORE.types[_QUATERNION](header, values)
+    values = ros2_types().types["geometry_msgs/msg/Quaternion"](*quaternion(rotation).tolist())
+    return ros2_types().types[_QUATERNION](header, values)
