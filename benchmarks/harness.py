@@ -12,17 +12,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
 from benchmarks.table import Table
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.commands.evaluate import evaluate, figures
-from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
+from deep_nrsfm_ros.data.dataset import Dataset, concatenate
+from deep_nrsfm_ros.data.mocap import TrialSelection, read_split, read_trials, selected_trials
 from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
+from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
@@ -53,10 +55,13 @@ class Session:
     seeds: tuple[int, ...]
     steps: int | None  # instead of the steps of the presets
     stride: int  # every n-th frame
+    batches: int = 2  # of 500 frames, on which the baselines are solved; 0: all
+    one_camera: bool = False  # for all frames of a trial, not one for each frame
 
     def mocap(self, subjects: Sequence[str], split: str) -> Dataset:
         """Return the dataset of the trials "train", "held-out" or "all" of CMU subjects."""
-        return _mocap(self.data / "cmu", tuple(subjects), split, self.stride)
+        selection = TrialSelection(self.data / "cmu", tuple(subjects), split, self.stride)
+        return _mocap(selection, self.one_camera)
 
     def preset(self, name: str, seed: int, **recipe: Any) -> Preset:
         """Return the preset `name` with the seed and other fields of the recipe replaced."""
@@ -113,14 +118,23 @@ class Session:
 
 
 @cache
-def _mocap(folder: Path, subjects: tuple[str, ...], split: str, stride: int) -> Dataset:
-    with tqdm(desc=f"reading {' '.join(subjects)}", leave=False) as bar:
+def _mocap(selection: TrialSelection, one_camera: bool) -> Dataset:
+    with tqdm(desc=f"reading {' '.join(selection.subjects)}", leave=False) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
-        return read_split(TrialSelection(folder, subjects, split, stride), CMU31, show)
+        if not one_camera:
+            return read_split(selection, CMU31, show)
+        paths = selected_trials(selection)
+        cameras = random_cameras(len(paths), np.random.default_rng(selection.camera_seed))
+        trials = []
+        for i, (path, M) in enumerate(zip(paths, cameras, strict=True)):
+            trial = read_trials([path], CMU31, stride=selection.stride)
+            trials.append(dataclasses.replace(trial, points=trial.shapes @ M))
+            show(i + 1, len(paths))
+        return concatenate(trials)
 
 
 def _hash(dataset: Dataset, preset: Preset) -> str:
@@ -167,15 +181,29 @@ def run_program(
     parser.add_argument("--data", type=Path, required=True, help="folder that holds cmu/")
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     parser.add_argument("--subjects", nargs="+", default=list(subjects), help="CMU subjects")
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(seeds))
+    parser.add_argument(
+        "--seeds", nargs="*", type=int, default=list(seeds), help="none: without trainings"
+    )
     parser.add_argument("--steps", type=int, help="steps of each training, to shorten a run")
     parser.add_argument("--stride", type=int, default=1, help="use every n-th frame")
+    parser.add_argument(
+        "--batches",
+        type=int,
+        default=2,
+        help="random batches of 500 frames of each subject, on which the baselines are solved "
+        "(default: 2; 0: all)",
+    )
+    parser.add_argument(
+        "--one-camera",
+        action="store_true",
+        help="one random camera for each trial, not for each frame",
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
     session = Session(
         *(args.data, args.output, tuple(args.subjects), tuple(args.seeds)),
-        *(args.steps, args.stride),
+        *(args.steps, args.stride, args.batches, args.one_camera),
     )
     try:
         table = benchmark(session)

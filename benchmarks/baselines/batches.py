@@ -5,91 +5,132 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.baselines.methods import BATCH, Method, block_matrix, em_ppca, in_batches, rigid
+from benchmarks.baselines.methods import BASELINES, BATCH, Baseline, Setting, shuffled_batches
 from benchmarks.harness import Session
+from deep_nrsfm_ros.commands.evaluate import figures
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
 
-RANKS = (2, 3, 4, 5, 6, 7, 8)
-"""Ranks K to choose from."""
-BASELINES: dict[str, Any] = {
-    "rigid factorisation (Tomasi-Kanade)": rigid,
-    "Simple (Dai et al.)": block_matrix,
-    "EM-SfM (Torresani et al., EM-PPCA)": em_ppca,
-}
+Floats = NDArray[Any]
+
+POOL = 16_000
+"""Frames at most, chosen at random, among which like ones are looked for."""
+QUERIES = 60
+"""Frames that are solved with those like them."""
 LEGEND = {
-    "Simple, EM-SfM": f"shuffled batches of {BATCH} frames, each with its own reflection; "
-    "K has the lowest error against the ground truth on the first batch, which favours them",
+    "Simple, EM-SfM, Sparse, SfC": f"shuffled batches of {BATCH} frames, each with its own "
+    "reflection; settings have the lowest error against the ground truth on the first batch, "
+    "which favours them",
+} | {name: baseline.legend for name, baseline in BASELINES.items() if baseline.legend}
+SPENT = {
+    "frames": "that the row is measured on; of baselines a random sample, see --batches",
+    "ms": "CPU time of a frame in ms, without the search for the settings",
 }
 
 
 class Solved(NamedTuple):
-    """The result of a baseline on all frames."""
+    """The result of a baseline on a dataset.
 
+    Attributes:
+        name: of the baseline.
+        errors: means over frames; `proper` and `mirrored` mean nothing where each frame has a
+            reflection of its own.
+        setting: the chosen one.
+        frames: that were solved.
+        cpu_seconds: without the search for the setting.
+        by_neighbours: each frame was solved with frames like it.
+    """
+
+    name: str
     errors: ShapeErrors
-    rank: int  # 0 if the method has no rank
-    cpu_seconds: float  # without the search for the rank
+    setting: Setting
+    frames: int
+    cpu_seconds: float
+    by_neighbours: bool
+
+    @property
+    def label(self) -> str:
+        """The row's name: the method and its setting."""
+        words = (f"{key} = {value}" for key, value in self.setting.items() if value is not False)
+        return ", ".join([self.name, *words]).replace("weighted = True", "weighted")
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Errors, frames and time as tables show them."""
+        shown = figures(self.errors)
+        if self.by_neighbours:
+            # Each frame has a reflection of its own.
+            shown = {name: shown[name] for name in ("shape %", "point cm")}
+        return shown | {"frames": self.frames, "ms": 1000 * self.cpu_seconds / self.frames}
 
 
 def solve(session: Session, name: str, dataset: Dataset) -> Solved:
     """Return a baseline's errors on a dataset with ground truth, kept in the output folder."""
-    digest = hashlib.sha256(name.encode() + dataset.points.tobytes()).hexdigest()[:10]
+    baseline = BASELINES[name]
+    key = f"{name} {baseline.settings} {session.batches} {BATCH} {QUERIES} {POOL}"
+    digest = hashlib.sha256(key.encode() + dataset.points.tobytes()).hexdigest()[:10]
     path = session.output / "baselines" / f"{digest}.json"
     if not path.exists():
-        solved = _solve(name, dataset)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(solved))
-    errors, rank, seconds = json.loads(path.read_text())
-    return Solved(ShapeErrors(*errors), rank, seconds)
-
-
-def _solve(name: str, dataset: Dataset) -> Solved:
-    method, rank = BASELINES[name], 0
-    if method is rigid:
         began = time.process_time()
-        errors = shape_errors(rigid(dataset.points), _truth(dataset))
-        return Solved(errors, rank, time.process_time() - began)
-    first = dataset[np.random.default_rng(0).permutation(len(dataset))[:BATCH]]
-    by_rank = {
-        K: shape_errors(method(first.points, K), _truth(first)).shape
-        for K in tqdm(RANKS, f"{name}, K", leave=False)
-    }
-    rank = min(by_rank, key=by_rank.__getitem__)
+        solved = _solve(name, baseline, dataset, session.batches)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        searched = time.process_time() - began
+        path.write_text(json.dumps([*solved, {"CPU s with search": searched}]))
+    _, errors, *others, _ = json.loads(path.read_text())
+    return Solved(name, ShapeErrors(*errors), *others)
+
+
+def _solve(name: str, baseline: Baseline, dataset: Dataset, count: int) -> Solved:
+    truth, rng = true_shapes(dataset), np.random.default_rng(0)
+    parts: list[NDArray[np.int64]]
+    if baseline.whole:
+        parts = [np.arange(len(dataset))]
+    elif baseline.by_neighbours:
+        pool = rng.permutation(len(dataset))[:POOL]
+        parts = [np.array([frame]) for frame in pool[:QUERIES]]
+    else:
+        parts = shuffled_batches(len(dataset), rng)[: count or None]
+
+    def run(frames: NDArray[np.int64], setting: Setting) -> ShapeErrors:
+        W = dataset.points[frames]
+        extra = (dataset.points[pool],) if baseline.by_neighbours else ()
+        return lowest_errors(baseline.method(W, *extra, **setting), truth[frames])
+
+    first = parts[: QUERIES // 4] if baseline.by_neighbours else parts[:1]
+    setting = baseline.settings[0]
+    if len(baseline.settings) > 1:
+        found = {
+            i: _mean((frames, run(frames, setting)) for frames in first).shape
+            for i, setting in enumerate(tqdm(baseline.settings, f"{name}, settings", leave=False))
+        }
+        setting = baseline.settings[min(found, key=found.__getitem__)]
     began = time.process_time()
-    errors = batch_errors(partial(method, K=rank), dataset, name)
-    return Solved(errors, rank, time.process_time() - began)
+    errors = _mean((frames, run(frames, setting)) for frames in tqdm(parts, name))
+    spent = time.process_time() - began
+    return Solved(name, errors, setting, sum(map(len, parts)), spent, baseline.by_neighbours)
 
 
-def batch_errors(method: Method, dataset: Dataset, title: str = "") -> ShapeErrors:
-    """Return the errors of `method` in batches, each compared by itself, averaged over frames."""
-    count = max(1, round(len(dataset) / BATCH))
-    with tqdm(total=count, desc=title) as bar:
-
-        def counted(W: Any) -> Any:
-            S = method(W)
-            bar.update()
-            return S
-
-        S, frames = in_batches(counted, dataset.points, np.random.default_rng(0))
-    pairs = zip(
-        np.array_split(S, count), np.array_split(_truth(dataset)[frames], count), strict=True
-    )
-    return _mean([(len(part), shape_errors(part, truth)) for part, truth in pairs])
+def lowest_errors(S: Floats, truth: Floats) -> ShapeErrors:
+    """Return the errors of S (f, p, 3), or the lowest of results (n, f, p, 3)."""
+    results = S if S.ndim == 4 else S[None]
+    return min((shape_errors(result, truth) for result in results), key=lambda e: e.shape)
 
 
-def _mean(parts: Sequence[tuple[int, ShapeErrors]]) -> ShapeErrors:
-    sizes = [size for size, _ in parts]
-    return ShapeErrors(*np.average([errors for _, errors in parts], axis=0, weights=sizes).tolist())
+def _mean(parts: Iterable[tuple[Sequence[int] | NDArray[np.int64], ShapeErrors]]) -> ShapeErrors:
+    """Return the mean of errors over frames; each part is its frames and their errors."""
+    sizes, errors = zip(*((len(frames), errors) for frames, errors in parts), strict=True)
+    return ShapeErrors(*np.average(errors, axis=0, weights=sizes).tolist())
 
 
-def _truth(dataset: Dataset) -> Any:
+def true_shapes(dataset: Dataset) -> Floats:
+    """Return the ground truth (f, p, 3); raise ValueError if there is none."""
     if dataset.shapes is None:
         raise ValueError(f"{dataset.source} has no ground truth to compare with")
     return dataset.shapes

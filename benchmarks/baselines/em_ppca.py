@@ -1,66 +1,166 @@
-"""EM-PPCA of Torresani, Hertzmann and Bregler.
+"""EM-PPCA of Torresani, Hertzmann and Bregler: EM-SfM in the paper's Table 1.
 
 Here `basis` (1 + K, 3, p) is the mean shape and the modes, and z (f, 1 + K) their coefficients,
-of which the first is one. Y (f, 2, p) are the images.
+of which the first is one. Y (f, 2, p) are the images, Q (f, 3, 3) the rotations.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines.rigid import rigid_rotations, rigid_shape
-from deep_nrsfm_ros.nrsfm.geometry import rotation_from_camera
+from deep_nrsfm_ros.nrsfm.geometry import align, rotation_from_camera
 
 Floats = NDArray[Any]
 
+ANNEALING = 60.0
+"""Factor of the noise variance at the start, less one, in the authors' program."""
+MIRROR_EVERY = 25
+"""Iterations between two mirror tests."""
 
-def em_ppca(W: Floats, K: int, *, iterations: int = 300) -> Floats:
+
+@dataclass(frozen=True)
+class _Model:
+    """Cameras and shape distribution.
+
+    Attributes:
+        Q: (f, 3, 3) rotations, object to camera.
+        basis: (1 + K, 3, p) mean shape and modes.
+        variance: of the images' noise.
+    """
+
+    Q: Floats
+    basis: Floats
+    variance: float
+
+
+class _Posterior(NamedTuple):
+    """Distribution of the coefficients, given the images.
+
+    Attributes:
+        z: (f, 1 + K) mean.
+        zz: (f, 1 + K, 1 + K) second moment.
+        log_likelihood: (f,) of the images, up to a constant.
+    """
+
+    z: Floats
+    zz: Floats
+    log_likelihood: Floats
+
+
+def em_ppca(
+    W: Floats, K: int, *, annealed: bool = False, mirror_test: bool = False, iterations: int = 300
+) -> Floats:
     """Return the posterior mean of shapes that are a mean shape and K Gaussian modes.
 
     Torresani, Hertzmann and Bregler, "Nonrigid structure-from-motion: estimating shape and
     motion with hierarchical priors", PAMI 2008: EM-PPCA under orthography, without the linear
     dynamics. Starts from rigid factorisation and the principal modes of its residual.
+
+    Args:
+        W: (f, p, 2) images.
+        K: number of modes.
+        annealed: raise the noise variance in the first half of the iterations, as the authors'
+            program does.
+        mirror_test: see `_mirror_test`; not in the authors' program.
+        iterations: of EM.
     """
-    f, p, _ = W.shape
     Y = W.astype(np.float64).swapaxes(1, 2)
+    model = _fit(Y, K, annealed=annealed, mirror_test=mirror_test, iterations=iterations)
+    return _shapes(model, _posterior(Y, model))
+
+
+def em_ppca_by_likelihood(W: Floats, K: int, *, iterations: int = 300) -> Floats:
+    """Return the shapes of the run of highest likelihood: annealed or not, with the mirror test."""
+    Y = W.astype(np.float64).swapaxes(1, 2)
+    best: tuple[float, Floats] | None = None
+    for annealed in (False, True):
+        model = _fit(Y, K, annealed=annealed, mirror_test=True, iterations=iterations)
+        posterior = _posterior(Y, model)
+        likelihood = float(posterior.log_likelihood.sum())
+        if best is None or likelihood > best[0]:
+            best = likelihood, _shapes(model, posterior)
+    assert best is not None
+    return best[1]
+
+
+def _fit(Y: Floats, K: int, *, annealed: bool, mirror_test: bool, iterations: int) -> _Model:
+    """Return the model after `iterations` of EM."""
+    model = _start(Y, K)
+    for i in range(iterations):
+        if mirror_test and i % MIRROR_EVERY == MIRROR_EVERY - 1:
+            model = _mirror_test(Y, model)
+        z, zz, _ = _posterior(Y, model)
+        Q = _update_rotations(Y, model, z, zz)
+        basis, variance = _fit_basis(Y, Q[:, :2], z, zz)
+        if annealed:
+            variance *= 1 + ANNEALING * max(1 - 2 * i / iterations, 0)
+        model = _Model(Q, basis, variance)
+    return model
+
+
+def _start(Y: Floats, K: int) -> _Model:
+    """Return rigid factorisation with the principal modes of its residual."""
+    W = Y.swapaxes(1, 2)
     Q = rotation_from_camera(rigid_rotations(W).swapaxes(1, 2))
     mean = rigid_shape(W, Q[:, :2])
     residual = Y - Q[:, :2] @ mean.T
-    variance = float((residual**2).mean())
-    lifted = (Q[:, :2].swapaxes(1, 2) @ residual).reshape(f, -1)
+    lifted = (Q[:, :2].swapaxes(1, 2) @ residual).reshape(len(Y), -1)
     _, s, Vt = np.linalg.svd(lifted, full_matrices=False)
-    modes = (s[:K, None] / f**0.5 * Vt[:K]).reshape(-1, 3, p)
-    basis = np.concatenate((mean.T[None], modes))  # (1 + K, 3, p)
-    for _ in range(iterations):
-        z, zz = _posterior(Y, Q[:, :2], basis, variance)
-        Q = _update_rotations(Y, Q, basis, z, zz)
-        basis, variance = _fit_basis(Y, Q[:, :2], z, zz)
-    z, _ = _posterior(Y, Q[:, :2], basis, variance)
-    S: Floats = np.einsum("fk,kdp->fpd", z, basis)
+    modes = (s[:K, None] / len(Y) ** 0.5 * Vt[:K]).reshape(-1, 3, Y.shape[2])
+    return _Model(Q, np.concatenate((mean.T[None], modes)), float((residual**2).mean()))
+
+
+def _shapes(model: _Model, posterior: _Posterior) -> Floats:
+    """Return the posterior mean (f, p, 3) in object axes."""
+    S: Floats = np.einsum("fk,kdp->fpd", posterior.z, model.basis)
     return S
 
 
-def _posterior(Y: Floats, R: Floats, basis: Floats, variance: float) -> tuple[Floats, Floats]:
-    """Return E[z] (f, 1 + K) and E[z z^T] (f, 1 + K, 1 + K) given the images Y (f, 2, p)."""
-    f, K = len(Y), len(basis) - 1
-    P = np.einsum("fad,kdp->fkap", R, basis).reshape(f, K + 1, -1)
+def _posterior(Y: Floats, model: _Model) -> _Posterior:
+    """Return the distribution of the coefficients, given the images Y (f, 2, p)."""
+    f, K = len(Y), len(model.basis) - 1
+    P = np.einsum("fad,kdp->fkap", model.Q[:, :2], model.basis).reshape(f, K + 1, -1)
     modes, left = P[:, 1:], Y.reshape(f, -1) - P[:, 0]
-    covariance = np.linalg.inv(np.eye(K) + modes @ modes.swapaxes(1, 2) / variance)
+    precision = np.eye(K) + modes @ modes.swapaxes(1, 2) / model.variance
+    covariance = np.linalg.inv(precision)
+    projected = (modes @ left[..., None])[..., 0] / model.variance
     z = np.ones((f, K + 1))
-    z[:, 1:] = (covariance @ (modes @ left[..., None]))[..., 0] / variance
+    z[:, 1:] = (covariance @ projected[..., None])[..., 0]
     zz = z[:, :, None] * z[:, None, :]
     zz[:, 1:, 1:] += covariance
-    return z, zz
+    distance = (left**2).sum(1) / model.variance - (projected * z[:, 1:]).sum(1)
+    size = left.shape[1] * np.log(model.variance) + np.linalg.slogdet(precision)[1]
+    return _Posterior(z, zz, -0.5 * (distance + size))
 
 
-def _update_rotations(Y: Floats, Q: Floats, basis: Floats, z: Floats, zz: Floats) -> Floats:
+def _mirror_test(Y: Floats, model: _Model) -> _Model:
+    """Return the model with those frames turned whose mirrored depth has a higher likelihood.
+
+    For each frame the shape's depth is negated in the camera's axes, the mean shape is aligned to
+    it by a rotation, three steps refine that, and the better rotation is kept.
+    """
+    posterior = _posterior(Y, model)
+    seen = _shapes(model, posterior) @ model.Q.swapaxes(1, 2)
+    mean = np.broadcast_to(model.basis[0].T, seen.shape)
+    turned = replace(model, Q=align(mean, seen * [1, 1, -1]).rotation.swapaxes(1, 2))
+    for _ in range(3):
+        z, zz, _ = _posterior(Y, turned)
+        turned = replace(turned, Q=_update_rotations(Y, turned, z, zz))
+    better = _posterior(Y, turned).log_likelihood > posterior.log_likelihood
+    return replace(model, Q=np.where(better[:, None, None], turned.Q, model.Q))
+
+
+def _update_rotations(Y: Floats, model: _Model, z: Floats, zz: Floats) -> Floats:
     """Return rotations Q (f, 3, 3) after one Gauss-Newton step of the expected error.
 
     Q <- exp([w]) Q, with E|y - (x + w cross x)|^2 over the first two rows of x = Q s.
     """
+    Q, basis = model.Q, model.basis
     inner = np.einsum("kdp,lep->kdle", basis, basis)
     second = np.einsum("fkl,kdle->fde", zz, inner)  # E[S S^T]
     cross_moment = np.einsum("fap,fk,kdp->fad", Y, z, basis) @ Q.swapaxes(1, 2)  # E[y x^T]

@@ -1,41 +1,85 @@
-"""The classic methods that the paper compares with, written from their papers' equations.
+"""The methods that the paper compares with and their peers, written from their papers' equations.
 
 Each takes W (f, p, 2), one orthographic image a frame, centred on its points, and returns
-S (f, p, 3) in one object frame for all frames. An orthographic image does not determine the
-sign of depth, so the result is up to one reflection of all frames. Cameras are rotations without a
-scale. No method uses the order of the frames.
+S (f, p, 3). An orthographic image does not determine the sign of depth, so the result is up to one
+reflection of all frames. A method that has equally good results for one problem returns all,
+S (n, f, p, 3). Cameras are rotations without a scale. No method uses the order of the frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.baselines.alike import block_matrix_of_neighbours
 from benchmarks.baselines.block_matrix import block_matrix
-from benchmarks.baselines.em_ppca import em_ppca
+from benchmarks.baselines.em_ppca import em_ppca, em_ppca_by_likelihood
 from benchmarks.baselines.rigid import rigid
 
-__all__ = ["BATCH", "Method", "block_matrix", "em_ppca", "in_batches", "rigid"]
+__all__ = ["BASELINES", "BATCH", "Baseline", "block_matrix", "em_ppca", "rigid", "shuffled_batches"]
 
 Floats = NDArray[Any]
-Method = Callable[[Floats], Floats]
+Method = Callable[..., Floats]
+Setting = Mapping[str, Any]
 
 BATCH = 500
-"""Frames per run, as in the paper; no baseline scales to a whole subject."""
+"""Frames of a batch, as in the paper; no baseline scales to a whole subject."""
 
 
-def in_batches(
-    method: Method, W: Floats, rng: np.random.Generator
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Run `method` on shuffled batches of about `BATCH` frames of W (f, p, 2).
+@dataclass(frozen=True)
+class Baseline:
+    """A method and how it is run.
 
-    Returns the shapes (f, p, 3) and the frames (f,) that they belong to, both in the order of
-    the batches, which are those of `numpy.array_split`. Each batch has an object frame and a
-    reflection of its own.
+    Attributes:
+        method: of (W, **setting), or of (W, frames, **setting) if `by_neighbours`.
+        settings: to choose from, by the truth, which favours the method.
+        legend: what the row shows.
+        by_neighbours: each of some frames is solved with the frames most like it.
+        whole: all frames are solved together.
     """
-    frames = rng.permutation(len(W))
-    batches = np.array_split(frames, max(1, round(len(W) / BATCH)))
-    return np.concatenate([method(W[batch]) for batch in batches]), frames
+
+    method: Method
+    settings: tuple[Setting, ...] = ({},)
+    legend: str = ""
+    by_neighbours: bool = False
+    whole: bool = False
+
+
+def _ranks(*ranks: int) -> tuple[Setting, ...]:
+    return tuple({"K": K} for K in ranks)
+
+
+BASELINES: dict[str, Baseline] = {
+    "rigid factorisation (Tomasi-Kanade)": Baseline(rigid, whole=True),
+    "Simple (Dai et al.)": Baseline(block_matrix, _ranks(2, 3, 4, 5, 6, 8)),
+    "Simple, weighted nuclear norm (Kumar)": Baseline(
+        lambda W, K: block_matrix(W, K, weighted=True),
+        _ranks(2, 3, 4, 5, 6, 8),
+        "singular values shrunk in proportion to 1 / (sigma + floor); cameras of Simple",
+    ),
+    "Simple on frames that look alike": Baseline(
+        block_matrix_of_neighbours,
+        tuple({"K": K, "neighbours": n} for K, n in ((2, 12), (2, 25), (2, 50), (4, 150))),
+        "each frame is solved with the frames most like it, found without labels or time",
+        by_neighbours=True,
+    ),
+    "EM-SfM (Torresani et al.)": Baseline(em_ppca, _ranks(3, 5, 8, 12)),
+    "EM-SfM, annealed or not by likelihood": Baseline(
+        em_ppca_by_likelihood,
+        _ranks(5, 8, 12),
+        "of two runs, with the annealing of the authors' program and without, the more likely one; "
+        "and a mirror test of each frame",
+    ),
+}
+
+
+def shuffled_batches(frames: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
+    """Return the indices of shuffled batches of about `BATCH` frames, by `numpy.array_split`.
+
+    Each batch has an object frame and a reflection of its own.
+    """
+    return np.array_split(rng.permutation(frames), max(1, round(frames / BATCH)))

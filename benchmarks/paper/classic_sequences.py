@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.baselines.batches import RANKS
 from benchmarks.baselines.methods import block_matrix, em_ppca, rigid
 from benchmarks.data.mat_files import read_sequence
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
@@ -24,8 +23,10 @@ from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 
 Floats = NDArray[Any]
 
+RANKS = (2, 3, 4, 5, 6, 7, 8)
+"""Ranks K to choose from."""
 SEQUENCES = ("drink", "pickup", "face_mocap")
-BASELINES = {
+BASELINES: dict[str, Any] = {
     "Simple (Dai et al.)": block_matrix,
     "EM-SfM (Torresani et al., EM-PPCA)": em_ppca,
 }

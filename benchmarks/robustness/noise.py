@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from benchmarks.baselines.batches import BASELINES, solve
+from benchmarks.baselines.batches import solve
+from benchmarks.baselines.methods import BASELINES
 from benchmarks.harness import LIFTING_LEGEND, Session, errors_by_column, run_program, with_proper
 from benchmarks.table import Table, lines
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS

@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks import harness
 from benchmarks.baselines import batches
+from benchmarks.baselines.methods import BASELINES, Baseline, block_matrix
 from benchmarks.harness import Session
 from benchmarks.paper import ablation, coherence, mirrored_frames, table1_cmu, table3_unseen
 from benchmarks.robustness import missing_keypoints, noise
@@ -22,6 +23,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 
 LONE = ("--subjects", "01", "--seeds", "0", "1", "--steps", "3")
+SIMPLE = "Simple (Dai et al.)"
 ALL_TABLES = [
     table1_cmu,
     mirrored_frames,
@@ -45,7 +47,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, preset in PRESETS.items():
         small = dataclasses.replace(preset.architecture, widths=(8, 4))
         monkeypatch.setitem(PRESETS, name, preset._replace(architecture=small))
-    monkeypatch.setattr(batches, "RANKS", (2,))
+    for name in list(BASELINES)[1:]:
+        monkeypatch.delitem(BASELINES, name)
+    monkeypatch.setitem(BASELINES, SIMPLE, Baseline(block_matrix, ({"K": 2},)))
     monkeypatch.setattr(harness, "SNAPSHOTS", 2)
     monkeypatch.setattr(table3_unseen, "TRAINED_ON", {"86": ("86",), "union": ("01", "86")})
 
@@ -97,8 +101,7 @@ def test_nrsfm_on_cmu_has_the_papers_figures_beside_ours(data: Path, output: Pat
         *("paper: Deep NRSfM", "paper: Simple", "paper: Sparse", "paper: EM-SfM"),
         "paper's network, ours, network alone",
         *(f"default recipe, {x}" for x in LIFTING),
-        "rigid factorisation (Tomasi-Kanade)",
-        *("Simple (Dai et al.), K = 2", "EM-SfM (Torresani et al., EM-PPCA), K = 2"),
+        *("rigid factorisation (Tomasi-Kanade)", "Simple (Dai et al.), K = 2"),
     ]
     assert found["paper: Deep NRSfM"]["shape %"] == "10.74"
     assert found["paper: Deep NRSfM"]["point cm"] == "5.0638"
@@ -113,8 +116,16 @@ def test_papers_table_is_whole() -> None:
     assert all(len(subjects) == 10 for subjects in table1_cmu.PAPER.values())
 
 
-def test_batches_are_compared_one_by_one(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batches, "BATCH", 8)
+def solved(session: Session, dataset: Dataset, baseline: Baseline) -> batches.Solved:
+    """Return what `batches.solve` finds for a baseline of the test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(BASELINES, "known", baseline)
+        return batches.solve(session, "known", dataset)
+
+
+def test_batches_are_compared_one_by_one(
+    session: Session, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("benchmarks.baselines.methods.BATCH", 8)
     S = known(dataset)
     turns = iter([1, -1, 1, -1])
@@ -124,10 +135,48 @@ def test_batches_are_compared_one_by_one(dataset: Dataset, monkeypatch: pytest.M
         shapes = np.stack([S[points.tobytes()] for points in W])
         return 3 * shapes * np.array([1, 1, next(turns)])
 
-    errors = batches.batch_errors(mirrors_every_other_batch, dataset)
+    whole = dataclasses.replace(session, batches=0)
+    found = solved(whole, dataset, Baseline(mirrors_every_other_batch))
+    assert found.frames == len(dataset) == 32
+    errors = found.errors
     assert errors.shape == pytest.approx(0, abs=1e-5)
     assert errors.proper == pytest.approx(0, abs=1e-5) and errors.mirrored == 0
     assert errors.unscaled == pytest.approx(2, abs=1e-5)
+
+
+def test_some_batches_are_a_sample_that_is_counted(
+    session: Session, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("benchmarks.baselines.methods.BATCH", 8)
+    sizes = []
+
+    def flat(W: Any) -> Any:
+        sizes.append(len(W))
+        return np.concatenate([W, W[..., :1]], -1)
+
+    assert solved(session, dataset, Baseline(flat)).figures["frames"] == 16
+    assert sizes == [8, 8]
+
+
+def test_the_best_of_equally_good_results_counts(session: Session, dataset: Dataset) -> None:
+    S = known(dataset)
+
+    def two(W: Any) -> Any:
+        shapes = np.stack([S[points.tobytes()] for points in W])
+        return np.stack([shapes[:, ::-1], shapes])
+
+    assert solved(session, dataset, Baseline(two)).errors.shape < 1e-5
+
+
+def test_frames_that_look_alike_have_no_proper_error(session: Session, dataset: Dataset) -> None:
+    S = known(dataset)
+
+    def by_neighbours(W: Any, frames: Any) -> Any:
+        assert W.shape[0] == 1 and len(frames) == len(dataset)
+        return S[W[0].tobytes()][None]
+
+    found = solved(session, dataset, Baseline(by_neighbours, by_neighbours=True))
+    assert found.figures["shape %"] < 1e-3 and "proper %" not in found.figures
 
 
 def test_baselines_are_solved_once(
@@ -138,9 +187,7 @@ def test_baselines_are_solved_once(
     assert batches.solve(session, "rigid factorisation (Tomasi-Kanade)", dataset) == first
 
 
-def test_rank_is_the_one_of_lowest_error(
-    session: Session, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_setting_is_the_one_of_lowest_error(session: Session, dataset: Dataset) -> None:
     S = known(dataset)
 
     def best_at_five(W: Any, K: int) -> Any:
@@ -148,9 +195,10 @@ def test_rank_is_the_one_of_lowest_error(
         noise = np.random.default_rng(0).standard_normal(shapes.shape)
         return shapes + 0.01 * abs(K - 5) * noise
 
-    monkeypatch.setitem(batches.BASELINES, "known", best_at_five)
-    solved = batches.solve(session, "known", dataset)
-    assert solved.rank == 5 and solved.errors.shape < 1e-5
+    baseline = Baseline(best_at_five, tuple({"K": K} for K in range(2, 9)))
+    found = solved(session, dataset, baseline)
+    assert found.setting == {"K": 5} and found.errors.shape < 1e-5
+    assert found.label == "known, K = 5"
 
 
 def test_noise_has_the_ratio_asked_for(dataset: Dataset) -> None:

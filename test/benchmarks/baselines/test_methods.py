@@ -1,21 +1,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from benchmarks.baselines.methods import BATCH, block_matrix, em_ppca, in_batches, rigid
-from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from benchmarks.baselines import em_ppca as em_module
+from benchmarks.baselines.alike import block_matrix_of_neighbours, dissimilarity, nearest
+from benchmarks.baselines.em_ppca import em_ppca_by_likelihood
+from benchmarks.baselines.methods import BATCH, block_matrix, em_ppca, rigid, shuffled_batches
+from deep_nrsfm_ros.nrsfm.geometry import align, centre, random_cameras
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 
 Method = Callable[[np.ndarray], np.ndarray]
 MODES = 2
 DEFORMING = {
     "block matrix": partial(block_matrix, K=MODES + 1),  # the mean shape counts
-    "EM-PPCA": partial(em_ppca, K=MODES),
+    "EM-PPCA": partial(em_ppca, K=MODES, iterations=100),
+}
+RECOVERING = DEFORMING | {
+    "weighted": partial(block_matrix, K=MODES + 1, weighted=True),
+    "annealed": partial(em_ppca, K=MODES, annealed=True, iterations=100),
 }
 
 
@@ -52,7 +60,7 @@ def test_rigid_factorisation_gives_every_frame_the_same_shape(deforming: Seen) -
     assert shape_errors(S, deforming.shapes).shape > 0.2
 
 
-@pytest.mark.parametrize("method", DEFORMING.values(), ids=DEFORMING.keys())
+@pytest.mark.parametrize("method", RECOVERING.values(), ids=RECOVERING.keys())
 def test_methods_for_deforming_objects_recover_one_that_is_of_their_rank(
     method: Method, deforming: Seen
 ) -> None:
@@ -72,7 +80,7 @@ def test_methods_for_deforming_objects_take_a_rank_beyond_that_of_the_images(
     method: partial[np.ndarray],
 ) -> None:
     shapes, points = seen(0.0, frames=30)
-    errors = shape_errors(method.func(points, 20), shapes)
+    errors = shape_errors(method.func(points, **method.keywords | {"K": 20}), shapes)
     assert errors.shape < 0.01
 
 
@@ -91,21 +99,50 @@ def test_the_order_of_the_frames_does_not_matter(method: Method, deforming: Seen
     assert shape_errors(shuffled, S[order]).shape < 1e-3
 
 
-def test_batches_cover_every_frame_once_and_say_which() -> None:
-    points = np.random.default_rng(0).standard_normal((2 * BATCH + 100, 4, 2))
-    sizes = []
-
-    def flat(W: np.ndarray) -> np.ndarray:
-        sizes.append(len(W))
-        return np.concatenate([W, np.zeros((*W.shape[:2], 1))], -1)
-
-    S, frames = in_batches(flat, points, np.random.default_rng(1))
-    assert sizes == [550, 550]
-    assert sorted(frames) == list(range(len(points)))
-    assert (frames != np.arange(len(points))).any()
-    np.testing.assert_array_equal(S[..., :2], points[frames])
+def test_batches_cover_every_frame_once() -> None:
+    batches = shuffled_batches(2 * BATCH + 100, np.random.default_rng(1))
+    assert [len(batch) for batch in batches] == [550, 550]
+    frames = np.concatenate(batches)
+    assert sorted(frames) == list(range(1100)) and (frames != np.arange(1100)).any()
 
 
 def test_few_frames_are_one_batch() -> None:
-    S, frames = in_batches(rigid, seen(0.0, frames=10).points, np.random.default_rng(0))
-    assert len(S) == len(frames) == 10
+    assert [len(batch) for batch in shuffled_batches(10, np.random.default_rng(0))] == [10]
+
+
+def test_views_of_one_rigid_object_look_alike_and_others_do_not() -> None:
+    rigid_views, others = seen(0.0, frames=20), seen(0.0, frames=20, seed=1)
+    frames = np.concatenate([rigid_views.points, others.points])
+    distance = dissimilarity(frames[0], frames)
+    assert distance[:20].max() < 1e-12 < 1e-3 < distance[20:].min()
+    found = nearest(frames[:1], frames, 19)
+    assert sorted(found[0]) == list(range(1, 20))  # not itself
+
+
+def test_neighbours_solve_what_all_frames_together_cannot() -> None:
+    # Three rigid objects: each image has views of its own object among the frames.
+    parts = [seen(0.0, frames=30, seed=i) for i in range(3)]
+    points = np.concatenate([part.points for part in parts])
+    shapes = np.concatenate([part.shapes for part in parts])
+    S = block_matrix_of_neighbours(points[::30], points, neighbours=20, K=1)
+    assert shape_errors(S, shapes[::30]).shape < 1e-3
+    assert shape_errors(block_matrix(points, 1), shapes).shape > 0.1
+
+
+def test_mirror_test_turns_frames_that_are_mirrored_and_no_others(deforming: Seen) -> None:
+    Y = deforming.points.swapaxes(1, 2)
+    model = em_module._fit(Y, MODES, annealed=False, mirror_test=False, iterations=40)
+    wrong = np.arange(len(Y)) % 5 == 0
+    mean = model.basis[0].T
+    depth_negated = mean @ model.Q.swapaxes(1, 2) * [1, 1, -1]
+    turned = align(np.broadcast_to(mean, depth_negated.shape), depth_negated).rotation
+    Q = np.where(wrong[:, None, None], turned.swapaxes(1, 2), model.Q)
+    assert np.abs(Q[wrong] - model.Q[wrong]).max((1, 2)).min() > 0.1
+    found = em_module._mirror_test(Y, replace(model, Q=Q)).Q
+    np.testing.assert_array_equal(found[~wrong], model.Q[~wrong])
+    assert np.abs(found[wrong] - model.Q[wrong]).max() < 0.3
+
+
+def test_the_likelier_run_counts(deforming: Seen) -> None:
+    S = em_ppca_by_likelihood(deforming.points, MODES, iterations=60)
+    assert shape_errors(S, deforming.shapes).unscaled < 0.01
