@@ -66,6 +66,7 @@ NO_CURATION = {
     "train.min_change": "0.0",
     "train.outlier_threshold": "0.0",
     "train.min_visible": "0",
+    "train.held_out": "0.0",
     "train.keep_best": "false",
 }
 """Curation and the choice of the best checkpoint off, as for motion capture."""
@@ -116,7 +117,7 @@ def video(session: Session) -> Table:
     """Train on the detections of a real video, with and without the shipped model's knowledge."""
     bag = session.bag("video_bag", partial(_people, session.data / VIDEO))
     arguments = ("--bag", str(bag), "--keypoint-layout", BODY25.name)
-    alone = (*arguments, "--object", HUMAN17.name)
+    alone = (*arguments, "--object", HUMAN17.name, "--from", "none")
     shipped = load_model(find_model("human", model_folders(session.models)))
     models = {
         "this video alone": session.trained("video", "video", *alone),
@@ -256,6 +257,7 @@ def _trained_by_service(
         "train.topic": TOPIC,
         "train.object": CMU31.name,
         "train.name": name,
+        "train.from": "none",
         "train.steps": steps,
         "train.resume": str(record is not None).lower(),
         **options,

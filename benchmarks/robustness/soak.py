@@ -172,7 +172,7 @@ def soak(args: argparse.Namespace, folder: Path) -> bool:
         "models_dir": str(folder / "models"),
         "train.bags": f"[{folder / 'bag'}]",
         "train.steps": 1_000_000,
-        "train.activate": "false",
+        "train.activate": "never",
     }
     headings = (
         "minute",

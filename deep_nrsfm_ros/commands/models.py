@@ -66,7 +66,9 @@ def list_models(folders: Sequence[Path]) -> list[Listed]:
             listed.append(Listed((path.stem, "unusable"), (str(error), *note)))
             continue
         row = (path.stem, model.layout.name, str(len(model.layout)), *_quality(model))
-        listed.append(Listed((*row, _date(model, path)), (str(path), _origin(model), *note)))
+        listed.append(
+            Listed((*row, _date(model, path)), (str(path), _origin(model), *_doubt(model), *note))
+        )
     return listed
 
 
@@ -93,6 +95,14 @@ def _origin(model: Model) -> str:
     if isinstance(start, dict):
         parts.append(f"from model {start.get('model')}")
     return "; ".join(parts)
+
+
+def _doubt(model: Model) -> tuple[str, ...]:
+    """Return a note on a model that the judge of its training doubts."""
+    judgement = model.provenance.get("judgement")
+    if isinstance(judgement, dict) and judgement.get("doubtful"):
+        return (str(judgement.get("reason")),)
+    return ()
 
 
 _COUNTS = {"frames": "frames", "step": "steps"}

@@ -97,7 +97,8 @@ def parser() -> argparse.ArgumentParser:
         "--from",
         dest="start",
         metavar="MODEL",
-        help="start from this model, a name or a file, instead of from random weights",
+        help="start from this model, a name or a file; none = from random weights (default: a "
+        "model that comes with the package and has most keypoints of the object, if there is one)",
     )
     run.add_argument(
         "--preset",
@@ -181,8 +182,14 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
         for text in warnings:
             reporter.warn(text)
         values["warning"] = "; ".join(warnings)
+    message = result.message
+    if judgement := result.judgement:
+        values["judgement"] = "doubtful" if judgement.doubt else "better"
+        message += f"; {judgement}"
+        if judgement.doubt:
+            reporter.warn(str(judgement))
     page = write_page(result, reporter)
-    message = result.message + (f"; report {page}" if page else "")
+    message += f"; report {page}" if page else ""
     reporter.end(result.state, message, model=str(result.path), report=page, **values)
 
 

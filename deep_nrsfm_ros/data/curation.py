@@ -51,9 +51,17 @@ class Curation:
         low=0.0,
         high=1000.0,
     )
+    held_out: float = option(
+        0.1,
+        "share of the frames that the training does not use, where there is a model to compare the "
+        "new one with: the last ones of each quarter of the data; 0 = none, the comparison uses "
+        "the frames of the training, 0.1 typical",
+        low=0.0,
+        high=0.5,
+    )
 
 
-KEEP_ALL = Curation(min_visible=0, min_change=0.0, outlier_threshold=0.0)
+KEEP_ALL = Curation(min_visible=0, min_change=0.0, outlier_threshold=0.0, held_out=0.0)
 """Curation that keeps all frames and keypoints."""
 
 

@@ -33,6 +33,15 @@ def model_folders(models_dir: Path) -> list[Path]:
     return [models_dir, *_shared("models"), _SOURCE_TREE / "models"]
 
 
+def shipped_models() -> list[Path]:
+    """Return the model files that come with the package, each name once."""
+    files: dict[str, Path] = {}
+    for folder in [*_shared("models"), _SOURCE_TREE / "models"]:
+        for path in sorted(folder.glob("*.safetensors")):
+            files.setdefault(path.name, path)
+    return list(files.values())
+
+
 def layout_folders() -> list[Path]:
     """Return the folders of the layout files that come with the package."""
     return [*_shared("config/layouts"), _SOURCE_TREE / "config" / "layouts"]

@@ -44,7 +44,7 @@ class TrainingService:
         self._node, self._request, self._activate = node, request, activate
         self._folder = folder
         self._job: TrainingJob | None = None
-        self._name, self._activate_when_finished = "", True
+        self._name, self._activate_when = "", "if_better"
         self._state, self._last_failure = "idle", "none"
         self._progress: SimpleQueue[JobStatus] = SimpleQueue()
         self._wake = node.create_guard_condition(self._report)
@@ -87,13 +87,15 @@ class TrainingService:
         except (ValueError, OSError) as problem:
             response.success, response.message = False, str(problem)
             return response
-        self._name, self._activate_when_finished = config.output.name, request.activate
+        self._name, self._activate_when = config.output.name, request.activate
         topic = config.data.topic or "the keypoint topic"
         data = f"{topic} of {', '.join(map(str, config.data.bags))}"
         if config.resume:
             data = "the data that it began with"
         response.success = True
         response.message = f"training {self._name!r} on {data}"
+        if config.start and not config.resume:
+            response.message += f", starting from model {Path(config.start).stem!r}"
         if warning:
             response.message += f"; {warning}"
             self._node.get_logger().warning(warning)
@@ -125,7 +127,7 @@ class TrainingService:
                 self._job = None
             if progress.state in ("failed", "cancelled"):
                 progress = self._with_advice(progress)
-            if progress.state == "finished" and self._activate_when_finished:
+            if progress.state == "finished":
                 progress = self._switch(progress)
             self._publish(progress)
 
@@ -137,7 +139,11 @@ class TrainingService:
         return progress._replace(message=f"{progress.message}\n{record}: {record.advice}")
 
     def _switch(self, progress: JobStatus) -> JobStatus:
-        """Activate the model of a finished training and say so."""
+        """Activate the model of a finished training, if it should be, and say so."""
+        if self._activate_when == "never":
+            return progress
+        if self._activate_when == "if_better" and progress.values.get("judgement") != "better":
+            return progress._replace(message=f"{progress.message}; not in use (train.activate)")
         try:
             self._activate(str(progress.values.get("model", "")))
         except ValueError as problem:

@@ -19,7 +19,9 @@ from typing import Any
 
 from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS
+from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -101,6 +103,7 @@ class TrainingConfig:
         object: layout of the model, as `find_layout` takes it, or "numbered"; "" is the layout of
             `start`, or human17.
         start: model file to start from; "" starts from random weights.
+        rival: model file that the new model is compared with, or ""; see `judge`.
         architecture, normaliser, recipe: the parts of a preset.
         layout_loss: weights of the losses that the layout defines.
         curation: which frames and keypoints are left out.
@@ -112,6 +115,7 @@ class TrainingConfig:
     data: DataConfig = field(default_factory=DataConfig)
     object: str = ""
     start: str = ""
+    rival: str = ""
     architecture: Architecture = field(default_factory=Architecture)
     normaliser: Normaliser = field(default_factory=Normaliser)
     recipe: Recipe = field(default_factory=Recipe)
@@ -128,7 +132,9 @@ class TrainingConfig:
         """Return `base` with the options that a command line gives.
 
         Args:
-            arguments: holds only the options that were given, by field name, and `preset`.
+            arguments: holds only the options that were given, by field name, and `preset`. Without
+                `start` and `base`, the training starts from a model that has the object's
+                keypoints, if there is one; "none" starts from random weights.
             base: the options that were not given. None is the defaults: those for motion capture
                 keep all frames and the state after the last step, as that data is clean.
 
@@ -139,14 +145,26 @@ class TrainingConfig:
             name: tuple(value) if isinstance(value, list) else value
             for name, value in vars(arguments).items()
         }
+        has_base = base is not None
         if base is None:
             base = cls(limits=WHOLE, curation=KEEP_ALL) if values.get("cmu") else cls()
         if "preset" in values:
             base = base.with_preset(PRESETS[values["preset"]])
-        if values.get("start"):
+        start = values.pop("start", "")
+        network_options = {"preset"} | {
+            item.name for part in (Architecture, Normaliser) for item in dataclasses.fields(part)
+        }
+        if start and start != FROM_NONE:
             folder = values.get("folder", base.output.folder)
-            base = base.with_start(find_model(values.pop("start"), model_folders(folder)))
-        return base.with_options(values)
+            return base.with_start(find_model(start, model_folders(folder))).with_options(values)
+        config = base.with_options(values)
+        if (has_base and not start) or not (config.data.bags or config.data.inputs):
+            return dataclasses.replace(config, start="") if start else config
+        known = str(known_model(config.object or HUMAN17.name) or "")
+        config = dataclasses.replace(config, start="", rival=known)
+        if known and not start and not network_options & values.keys():
+            return config.with_start(Path(known))
+        return config
 
     def with_preset(self, preset: Preset) -> TrainingConfig:
         """Return the configuration with architecture, normaliser and recipe of `preset`."""
@@ -155,12 +173,15 @@ class TrainingConfig:
     def with_start(self, path: Path) -> TrainingConfig:
         """Return the configuration that starts from a model, with its architecture and normaliser.
 
+        The model is also the one that the new model is compared with.
+
         Raises ValueError for a file that is missing or damaged.
         """
         model = load_model(path)
         return dataclasses.replace(
             self,
             start=str(path),
+            rival=str(path),
             architecture=model.network.architecture,
             normaliser=model.normaliser,
         )
@@ -197,6 +218,7 @@ class TrainingConfig:
             ),
             object=_absolute_file(self.object),
             start=_absolute_file(self.start),
+            rival=_absolute_file(self.rival),
             output=dataclasses.replace(self.output, folder=_absolute(self.output.folder)),
         )
 
@@ -267,7 +289,10 @@ PARAMETERS = OptionNames(
 
 
 def differences(old: TrainingConfig, new: TrainingConfig, names: OptionNames) -> list[str]:
-    """Return in words each option in which `new` differs from `old`, output and resume excepted."""
+    """Return in words each option in which `new` differs from `old`.
+
+    Output, resume and the model to compare with do not count.
+    """
     before, after = (_flat(config) for config in (old, new))
     return [
         f"{names(name)} was {option_text(value)}, is {option_text(after[name])} now"
@@ -283,12 +308,12 @@ def option_text(value: Any) -> str:
 
 
 def _flat(config: TrainingConfig) -> dict[str, Any]:
-    """Return the options of all parts by field name, without output and resume."""
+    """Return the options of all parts by field name, without output, rival and resume."""
     config = config.whole()
     flat: dict[str, Any] = {}
     for part in dataclasses.fields(config):
         value = getattr(config, part.name)
-        if part.name in ("output", "resume"):
+        if part.name in ("output", "rival", "resume"):
             continue
         if dataclasses.is_dataclass(value):
             flat |= {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}

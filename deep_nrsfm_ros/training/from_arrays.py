@@ -16,8 +16,10 @@ from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import from_arrays
 from deep_nrsfm_ros.model_files.find_layout import find_layout
-from deep_nrsfm_ros.model_files.model_file import Model, check_name
+from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
+from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
+from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.progress import Progress
@@ -29,6 +31,7 @@ def train(
     *,
     layout: KeypointLayout | str,
     name: str = "trained",
+    start: Model | str = "",
     recipe: Recipe | None = None,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> Model:
@@ -45,6 +48,8 @@ def train(
         layout: keypoint layout of the points, as an object or by the name of a preset or a layout
             file ("coco17"); it is the model's too.
         name: name of the model.
+        start: model to start from, its name or its file. "" is a model that comes with the package
+            and has most keypoints of the layout, if there is one; "none" is random weights.
         recipe: steps, seed and all else of the training; None stands for the defaults, 30000
             steps, which take minutes. `Recipe(steps=3000, seed=1)` is a first look.
         on_progress: called every few seconds, and at the end.
@@ -56,7 +61,7 @@ def train(
     """
     require_extra("train", "training")
     from deep_nrsfm_ros.training.finish import finish
-    from deep_nrsfm_ros.training.loop import Callbacks
+    from deep_nrsfm_ros.training.loop import DEFAULT_SETUP, Callbacks, Setup
     from deep_nrsfm_ros.training.loop import train as run
 
     check_name("name", name)
@@ -71,9 +76,29 @@ def train(
         if warning:
             warnings.warn(warning, stacklevel=2)
     dataset = curated.dataset
-    preset = PRESETS["default"]._replace(recipe=recipe or Recipe())
+    origin = _origin(start, layout)
+    preset, setup = PRESETS["default"]._replace(recipe=recipe or Recipe()), DEFAULT_SETUP
+    if origin:
+        preset = preset._replace(
+            architecture=origin.network.architecture, normaliser=origin.normaliser
+        )
+        setup = Setup(start_from(origin, layout))
     callbacks = Callbacks(on_progress=on_progress)
-    trainer = run(dataset.points, dataset.visible, preset, callbacks=callbacks)
+    trainer = run(dataset.points, dataset.visible, preset, setup, callbacks)
     model = finish(trainer, name, layout, dataset.source)
+    if origin:
+        model = inherit(model, origin)
     model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
     return model
+
+
+def _origin(start: Model | str, layout: KeypointLayout) -> Model | None:
+    """Return the model to start from; None for random weights."""
+    if isinstance(start, Model):
+        return start
+    if start == FROM_NONE:
+        return None
+    if start:
+        return load_model(start)
+    known = known_model(layout)
+    return load_model(known) if known else None

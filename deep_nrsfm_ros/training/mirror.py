@@ -137,8 +137,11 @@ class MirrorCheck:
 
     def test(self, net: Network) -> MirrorTest:
         """Return which frames of the sample a network of arrays or tensors mirrors."""
-        _, reference = self._reference
-        return mirrored_frames(self.lift(_arrays(net)), self.visible, reference)
+        return self.test_shapes(self.lift(_arrays(net)), self.visible)
+
+    def test_shapes(self, S: Floats, visible: NDArray[np.bool_]) -> MirrorTest:
+        """Return which shapes (n, p, 3) of the sample's frames are mirrored; see `visible`."""
+        return mirrored_frames(S, visible, self._reference[1])
 
     def share(self, net: Network) -> float:
         """Return the share of mirrored frames, 0 to 0.5; NaN where the frames tell too little.

@@ -14,6 +14,7 @@ from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.messages.options import MODEL_ORDER
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
+from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, check_name
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
@@ -46,7 +47,8 @@ class TrainingOptions:
     )
     from_: str = option(
         "",
-        "model to start from, by name or path; keypoints are matched by name; empty = random "
+        "model to start from, by name or path; keypoints are matched by name; empty = the present "
+        "model or one of the package, if it has most keypoints of the object; 'none' = random "
         "weights",
     )
     name: str = option(
@@ -66,7 +68,12 @@ class TrainingOptions:
         "continue the training of train.name that was cut off, with the bags and options that it "
         "began with",
     )
-    activate: bool = option(True, "switch to the new model when the training has finished")
+    activate: str = option(
+        "if_better",
+        "whether to switch to the new model when the training has finished: if_better = unless "
+        "its figures without labels are worse than those of the present one, always, never",
+        choices=("if_better", "always", "never"),
+    )
 
 
 @dataclass(frozen=True)
@@ -107,10 +114,15 @@ class LifterInput:
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """A training that is asked for, and whether the lifter then switches to its model."""
+    """A training that is asked for.
+
+    Attributes:
+        config: its configuration.
+        activate: whether the lifter then switches to its model: "if_better", "always", "never".
+    """
 
     config: TrainingConfig
-    activate: bool = True
+    activate: str = "if_better"
 
     def accept(self) -> tuple[TrainingConfig, str]:
         """Return the configuration to train with, and what the user should know of it, or "".
@@ -155,8 +167,11 @@ def training_request(
         output=OutputConfig(sandbox.models_dir, options.name, options.threads),
         resume=options.resume,
     )
-    if options.from_:
-        config = config.with_start(Path(options.from_))
+    known = known_model(target, [lifter.model])
+    start = Path(options.from_) if options.from_ else known
+    if start and options.from_ != FROM_NONE:
+        config = config.with_start(start)
+    config = dataclasses.replace(config, rival=str(known or config.rival))
     return TrainingRequest(config, options.activate)
 
 
@@ -189,7 +204,8 @@ def choose_layouts(options: TrainingOptions, lifter: LifterInput) -> tuple[str, 
     What `options` leaves empty follows from the lifter's input and model. The layout of the bags is
     "" where the new model is "numbered".
     """
-    target = options.object or options.from_ or str(lifter.model)
+    start = "" if options.from_ == FROM_NONE else options.from_
+    target = options.object or start or str(lifter.model)
     if options.keypoint_layout or target == NUMBERED:
         return options.keypoint_layout, target
     if lifter.keypoint_layout == MODEL_ORDER:
@@ -199,7 +215,8 @@ def choose_layouts(options: TrainingOptions, lifter: LifterInput) -> tuple[str, 
 
 def paths_of(options: TrainingOptions) -> tuple[str, ...]:
     """Return the values of all options that may be paths."""
-    return (*options.bags, options.object, options.keypoint_layout, options.from_)
+    start = "" if options.from_ == FROM_NONE else options.from_
+    return (*options.bags, options.object, options.keypoint_layout, start)
 
 
 def sandboxed(options: TrainingOptions, sandbox: PathSandbox) -> TrainingOptions:
@@ -214,7 +231,11 @@ def sandboxed(options: TrainingOptions, sandbox: PathSandbox) -> TrainingOptions
         bags=tuple(sandbox.bag("train.bags", bag) for bag in options.bags),
         object=sandbox.layout("train.object", options.object),
         keypoint_layout=sandbox.layout("train.keypoint_layout", options.keypoint_layout),
-        from_=str(sandbox.model("train.from", options.from_)) if options.from_ else "",
+        from_=(
+            str(sandbox.model("train.from", options.from_))
+            if options.from_ not in ("", FROM_NONE)
+            else options.from_
+        ),
     )
 
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from safetensors import SafetensorError
 
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.held_out import split
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
@@ -25,6 +27,7 @@ from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
 from deep_nrsfm_ros.training.validation import find_layouts, validate
 
 if TYPE_CHECKING:
+    from deep_nrsfm_ros.training.judge import Judgement
     from deep_nrsfm_ros.training.trainer import Trainer
 
 
@@ -39,6 +42,7 @@ class TrainingResult(NamedTuple):
         message: one line for people about the end.
         detector_layout: layout of the keypoints in the data, where it is not that of the model.
         mapping: field mapping of the messages in the data; "" for none.
+        judgement: whether the model should replace the one at hand; None: it was cut off.
     """
 
     model: Model
@@ -48,6 +52,7 @@ class TrainingResult(NamedTuple):
     message: str
     detector_layout: str = ""
     mapping: str = ""
+    judgement: Judgement | None = None
 
 
 def run(
@@ -95,15 +100,18 @@ def _train_and_save(
     should_stop: Callable[[], bool],
 ) -> TrainingResult | None:
     """Train on the prepared data; the first process saves the model and returns the result."""
-    start = load_model(Path(config.start)) if config.start else None
-    _describe(prepared, reporter, starts_anew=start is None)
-    trainer = _train(config, prepared, checkpoint, reporter, should_stop)
+    start, rival = (load_model(Path(f)) if f else None for f in (config.start, config.rival))
+    _describe(prepared, reporter, start)
+    share = config.curation.held_out if rival else 0.0
+    frames = split(prepared.dataset, share)
+    trainer = _train(config, frames.training, checkpoint, reporter, should_stop)
     if trainer.group.rank:
         return None
     if not trainer.step and config.recipe.steps:
         checkpoint.unlink(missing_ok=True)
         raise CancelledError
     from deep_nrsfm_ros.training.finish import finish
+    from deep_nrsfm_ros.training.judge import judge
 
     dataset = prepared.dataset
     people = read_people(config, reporter)
@@ -112,18 +120,30 @@ def _train_and_save(
     model = dataclasses.replace(model, provenance=model.provenance | {"date": date})
     if start:
         model = inherit(model, start)
+    judgement = judge(frames, model, rival) if trainer.end_reason else None
+    if judgement:
+        model.provenance["judgement"] = judgement.record()
     path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"
+    if judgement and judgement.doubt and path.resolve() == Path(config.rival).resolve():
+        model = dataclasses.replace(model, name=f"{model.name}_doubtful")
+        path = path.with_name(f"{model.name}{MODEL_SUFFIX}")
     save_model(path, model)
     ending = _ending(trainer, path, model, checkpoint)
     named = find_layouts(config, COMMAND_LINE)[0].name
     detector_layout = config.data.keypoint_layout if named != dataset.layout.name else ""
-    return TrainingResult(model, path, prepared, *ending, detector_layout, config.data.mapping)
+    mapping = config.data.mapping
+    return TrainingResult(model, path, prepared, *ending, detector_layout, mapping, judgement)
 
 
-def _describe(prepared: Prepared, reporter: Reporter, *, starts_anew: bool) -> None:
-    """Report the size of the dataset, and what it cannot teach."""
+def _describe(prepared: Prepared, reporter: Reporter, start: Model | None) -> None:
+    """Report the size of the dataset, what it cannot teach, and what the training starts from."""
     dataset = prepared.dataset
-    if dataset.layout.warning and starts_anew:  # a start passes its handedness on
+    reporter.say(
+        f"starts from model {start.name!r} (--from none, train.from none: from random weights)"
+        if start
+        else "starts from random weights"
+    )
+    if dataset.layout.warning and not start:  # a start passes its handedness on
         reporter.warn(dataset.layout.warning)
     times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
     if missing := [name for name, times in times_visible if not times]:
@@ -133,13 +153,13 @@ def _describe(prepared: Prepared, reporter: Reporter, *, starts_anew: bool) -> N
 
 def _train(
     config: TrainingConfig,
-    prepared: Prepared,
+    dataset: Dataset,
     checkpoint: Path,
     reporter: Reporter,
     should_stop: Callable[[], bool],
 ) -> Trainer:
     """Return the trainer after the training loop; this process has left its group then."""
-    dataset, weights = prepared.dataset, config.layout_loss
+    weights = config.layout_loss
     start = start_from(load_model(Path(config.start)), dataset.layout) if config.start else None
     weights.check(dataset.layout, COMMAND_LINE)
     import torch  # takes seconds; a wrong configuration is refused without it

@@ -105,7 +105,10 @@ def test_demo_from_wheel_to_trained_model(start: Start, tmp_path: Path) -> None:
     assert len(read_points(output / "lifted")) >= 60
     assert (output / "demo.png").read_bytes().startswith(b"\x89PNG")
     assert load_model(output / "models" / "demo.safetensors").layout == HUMAN17
-    assert "changed from model 'untrained' to 'demo' and lifted" in said
+    assert said.count("mm aligned") == 2  # of both models
+    changed = "changed from model 'untrained' to 'demo' and lifted" in said
+    assert changed != ("goes on with model 'untrained'" in said)
+    assert changed != ("the new model is doubtful" in said)
     assert not descendants(output)
 
 

@@ -167,7 +167,7 @@ def test_many_kills_each_gone_on_with_end_in_the_model_of_a_training_left_alone(
         SAVING_OFTEN,
         qos_overrides=EVERY_MESSAGE,
         train={"bags": [write(tmp_path / "bag")], "name": "alone", "steps": 2000, "seeds": 2,
-               "screening": 100, "batch": 8, "activate": False},
+               "screening": 100, "batch": 8, "activate": "never"},
     )  # fmt: skip
     client, moments, counts = connect(), random.Random(0), Counter[str]()
     stream, status = Stream(client), client.heard["/lifter/training_status"]

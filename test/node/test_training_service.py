@@ -76,6 +76,13 @@ def test_a_training_from_request_to_use(
     assert client.call("/lifter/cancel_training").success
     assert "kept the best" in client.wait_for_training("cancelled").message
 
+    client.set_parameters(train__name="doubtful")
+    assert client.call("/lifter/train").success
+    doubted = client.wait_for_training("finished")
+    assert "not in use" in doubted.message and values(doubted)["judgement"] == "doubtful"
+    assert (models / "doubtful.safetensors").exists()
+    client.heard["/lifter/training_status"].clear()
+
     client.set_parameters(train__name="finish")
     assert client.call("/lifter/train").success
     finished = client.wait_for_training("finished")
@@ -156,15 +163,17 @@ def test_the_real_training_turns_a_bag_into_the_model_in_use(
     write_bag(tmp_path / "bag", 200)
     lifter = start_lifter(
         input_type="std_msgs/Float32MultiArray",
-        train={"bags": [str(tmp_path / "bag")], "name": "fresh", "steps": 20, "seeds": 1},
+        train={"bags": [str(tmp_path / "bag")], "name": "fresh", "steps": 20, "activate": "always"},
     )
     client = connect()
     publisher = client.publisher(Float32MultiArray)
     before = client.exchange(publisher, keypoints()).data
     accepted = client.call("/lifter/train")
     assert accepted.success, accepted.message
+    assert "starting from model 'person'" in accepted.message
     finished = client.wait_for_training("finished")
-    assert "in use" in finished.message
+    assert "in use from now on" in finished.message
+    assert values(finished)["judgement"] in ("better", "doubtful")
     assert load_model(models / "fresh.safetensors").name == "fresh"
     client.wait_for_health(lambda _, v: v["model"] == "fresh")
     assert client.exchange(publisher, keypoints()).data != before
@@ -182,7 +191,7 @@ def test_an_object_that_is_no_preset_is_trained_anew_from_its_model_and_by_numbe
     paw = Model("paw", network, PAW, Normaliser(), np.eye(3, dtype=np.float32))
     save_model(models / "paw.safetensors", paw)
     source: dict[str, Any] = {"bags": [str(tmp_path / "bag")], "topic": "/keypoints"}
-    train = source | {"name": "anew", "steps": 5, "seeds": 1}
+    train = source | {"name": "anew", "steps": 5, "seeds": 1, "activate": "always", "from": "none"}
     start_lifter(input_type="std_msgs/Float32MultiArray", model="paw", train=train)
     client = connect()
     publisher = client.publisher(Float32MultiArray)

@@ -56,7 +56,8 @@ def main() -> None:
                 f"{config['data']['bags'][0]}.safetensors", folder / f"{behaviour}.safetensors"
             )
         )
-    say("finished", message="done", model=model, step=2, steps=2)
+    judgement = "doubtful" if behaviour == "doubtful" else "better"
+    say("finished", message="done", model=model, step=2, steps=2, judgement=judgement)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from deep_nrsfm_ros.commands.train import parser
 from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.model_files.known_model import known_model
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -64,6 +65,20 @@ def test_every_option_comes_back_from_json() -> None:
     assert config.data != TrainingConfig().data and config.resume
 
 
+def test_a_training_of_people_starts_from_the_model_of_people_unless_told_otherwise() -> None:
+    bag, human = ("--bag", "a"), str(known_model("human17"))
+    assert Path(human).stem == "human"
+    assert (parsed(*bag).start, parsed(*bag).rival) == (human, human)
+    assert parsed(*bag, "--object", "coco17").start == human
+    for words in (("--from", "none"), ("--widths", "8", "4"), ("--preset", "paper")):
+        config = parsed(*bag, *words)
+        assert (config.start, config.rival) == ("", human)
+    for words in (("--object", "hand21"), ("--object", "ap10k17"), ("--object", "numbered")):
+        config = parsed(*bag, *words)
+        assert (config.start, config.rival) == ("", "")
+    assert parsed("--cmu", "c", "--object", "human17").start == ""
+
+
 def test_the_command_line_reaches_every_option_of_the_parts() -> None:
     config = parsed(
         *("--bag", "a", "--bag", "b", "--topic", "/k", "--keypoint-layout", "coco17"),
@@ -100,6 +115,7 @@ def test_the_command_line_reaches_every_option_of_the_parts() -> None:
         curation=Curation(min_visible=5),
         limits=Limits(minutes=2.5, keep_best=False),
         output=OutputConfig(Path("out"), "mine", 3),
+        rival=str(known_model("human17")),
         resume=True,
     )
     assert config.data.image_size == (640, 480) and DataConfig(image_width=3).image_size is None

@@ -12,6 +12,7 @@ import pytest
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.model_files.known_model import known_model
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
@@ -51,9 +52,11 @@ def request(folder: Path, **options: Any) -> TrainingRequest:
 
 def test_every_parameter_reaches_the_configuration(tmp_path: Path) -> None:
     asked = request(
-        tmp_path, bags=("one", "two"), name="mine", threads=3, resume=True, activate=False
+        tmp_path, bags=("one", "two"), name="mine", threads=3, resume=True, activate="never"
     )
-    assert asked.config == TrainingConfig(
+    human = known_model("human17")
+    assert human is not None
+    expected = TrainingConfig(
         data=DataConfig(
             bags=(tmp_path / "one", tmp_path / "two"),
             topic="/camera/keypoints",
@@ -71,7 +74,10 @@ def test_every_parameter_reaches_the_configuration(tmp_path: Path) -> None:
         output=OutputConfig(tmp_path, "mine", 3),
         resume=True,
     )
-    assert not asked.activate
+    assert asked.config == expected.with_start(human)
+    assert asked.activate == "never"
+    anew = request(tmp_path, from_="none").config
+    assert (anew.start, anew.rival) == ("", str(human))
     assert request(tmp_path, topic="/other").config.data.topic == "/other"
     with pytest.raises(ValueError, match="allows at most 2"):
         request(tmp_path, max_minutes=2.0)

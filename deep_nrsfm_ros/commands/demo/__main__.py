@@ -13,7 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +25,10 @@ from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, Session, read_session
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25B
+from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
+from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.training.job import ENDED
 
 WHEEL = "pose2sim-0.6.0-py3-none-any.whl"
@@ -48,7 +50,7 @@ def arguments() -> argparse.ArgumentParser:
     )
     parser.add_argument("--model", default="human", help="model to lift with: a name or a path")
     parser.add_argument(
-        "--train-steps", type=int, default=1500, help="training steps; 0 = no training"
+        "--train-steps", type=int, default=300, help="training steps; 0 = no training"
     )
     return parser
 
@@ -87,7 +89,8 @@ def run(given: argparse.Namespace) -> None:
         OSError: a file cannot be read or written, or the download fails.
     """
     models = given.output / "models"
-    layout = load_model(find_model(given.model, model_folders(models))).layout
+    present = find_model(given.model, model_folders(models))
+    layout = load_model(present).layout
     wheel = fetch_wheel(given.cache)
     say("triangulating the ground truth from the four cameras")
     session = read_session(wheel)
@@ -119,7 +122,7 @@ def run(given: argparse.Namespace) -> None:
         if given.train_steps:
             with Client(process, bags["keypoints"], bags["trained"]) as client:
                 client.meet()
-                train(client, cameras)
+                train(client, session, present)
 
 
 def evaluate(
@@ -161,8 +164,9 @@ def evaluate(
     say(f"lifted points in {bag}, picture in {picture}")
 
 
-def train(client: Client, cameras: Sequence[str]) -> None:
-    """Train on the recording by the lifter's service, while it continues to lift."""
+def train(client: Client, session: Session, present: Path) -> None:
+    """Train on the recording by the lifter's service, while it continues to lift with `present`."""
+    cameras = [view.camera.name for view in session.views]
     before = client.health["model"]
     say(client.train())
     sent = 0
@@ -180,12 +184,36 @@ def train(client: Client, cameras: Sequence[str]) -> None:
     text = NO_LATENCY if np.isnan(p50) else f"p50 {p50:.2f} ms, p99 {p99:.2f} ms"
     print(f"  lifted during training: {len(latencies)} of {sent} messages, {text}")
     say(client.training["message"])
+    models = {before: present, TRAINED: Path(client.training["model"])}
+    print(comparison(session, models), flush=True)
+    if client.training["judgement"] != "better":
+        say(f"the lifter goes on with model {before!r}")
+        return
     client.wait(lambda: client.health["model"] == TRAINED, "the change of models")
     played = client.play(cameras[0])
     say(
         f"the lifter changed from model {before!r} to {client.health['model']!r} and lifted "
         f"{len(played.latencies)} of {len(played.stamps)} messages with it"
     )
+
+
+def comparison(session: Session, models: Mapping[str, Path]) -> str:
+    """Return the errors of models on the detections of all cameras, against the ground truth."""
+    points = np.concatenate([view.points for view in session.views])
+    confidence = np.concatenate([view.confidence for view in session.views])
+    truth = np.concatenate([view.truth for view in session.views])
+    lines = []
+    for name, path in models.items():
+        model = load_model(path)
+        limbs = [model.layout.index(joint) for joint in JOINTS]
+        shapes = Lifter(model, layout=BODY25B)(points, confidence).shapes[:, limbs]
+        lifted = np.isfinite(shapes).all((1, 2))
+        errors = camera_errors(shapes[lifted], truth[lifted])
+        lines.append(
+            f"  model {name!r}: {errors.aligned:.1f} mm aligned, {errors.rotation:.1f} degrees, "
+            f"{errors.mirrored:.1%} of the frames mirrored"
+        )
+    return "\n".join(lines)
 
 
 def say(text: str) -> None:

@@ -1,0 +1,320 @@
+"""Whether a new model is better than the one at hand, judged without labels.
+
+Both models lift the same frames, which the training has not used (`data.held_out`). Errors of 2D
+alone say little: a model that has folded its frames reprojects well. So the rule is conservative: a
+new model is better only if it reprojects at least as well, mirrors no more frames, agrees with the
+one at hand on what is in front, and keeps the lengths of bones nearly as well. Otherwise it is
+doubtful. `benchmarks/real/judge.py` compares figures and rule with true errors.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.data.dataset import Dataset, concatenate
+from deep_nrsfm_ros.data.held_out import Split
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
+from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.nrsfm.geometry import align, centre_visible
+from deep_nrsfm_ros.nrsfm.handedness import MIN_VISIBLE_SHARE, votes
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
+
+Floats = NDArray[Any]
+
+_MOST_FRAMES = 2000
+_NETWORK_ALONE = LiftingOptions(correction="none", test_time_rotations=1)
+
+
+class Figures(NamedTuple):
+    """Figures of a model that need no labels; less is better. NaN: unknown.
+
+    Attributes:
+        residual: relative reprojection error of the network, median over the held-out frames.
+        bone_variation: standard deviation of a bone's length over the held-out frames by its mean,
+            mean over the bones. Lengths are shares of the sum of all; 0.1 typical.
+        mirrored_share: share of all frames with mirrored depth, by the test of their neighbours.
+        front_disagreement: share of all frames whose votes on the front say that it is behind.
+        opposed: share of all frames of which the model compared with has the mirror image.
+        side_difference: difference of the lengths of left and right bones, relative to their
+            mean; mean over bones and held-out frames.
+        flatness: share of the size of a held-out shape that lies within the image plane, 0 to 1.
+        difference: distance from the shapes of the model compared with, relative to their size.
+    """
+
+    residual: float
+    bone_variation: float
+    mirrored_share: float
+    front_disagreement: float
+    opposed: float
+    side_difference: float
+    flatness: float
+    difference: float
+
+
+RULE = {
+    "mirrored_share": (1.0, 0.005, "{:.1%} of its frames are mirrored against their neighbours"),
+    "front_disagreement": (1.0, 0.005, "in {:.1%} of the frames its front is behind"),
+    "opposed": (1.0, 0.05, "it lifts {:.1%} of the frames to the mirror image of the other's"),
+    "bone_variation": (2.0, 0.0, "its bones vary by {:.1%} of their lengths"),
+    "residual": (1.0, 0.0, "its keypoints are off by {:.1%} of the size of the object"),
+}
+"""Figures in which a new model must not be worse: factor and addition up to which it may, in words.
+
+The limits are chosen on the scenes of `benchmarks/real/judge.py`: trainings of it that are better
+than `human` have 1.0 to 2.4 times its variation of bones, one that only seems so 2.8 times.
+"""
+
+MOST_MIRRORED = 0.05
+"""Share of mirrored frames above which a model is doubtful where there is none to compare with."""
+
+
+class Judgement(NamedTuple):
+    """What the judge says of a new model.
+
+    Attributes:
+        doubt: one sentence on why it should not replace the one at hand, and what would help; ""
+            if it should.
+        summary: figures of both in words.
+        figures: of the new model.
+        rival: name of the model at hand; "" where there is none with its keypoints.
+        rival_figures: its figures.
+    """
+
+    doubt: str
+    summary: str
+    figures: Figures
+    rival: str = ""
+    rival_figures: Figures | None = None
+
+    def __str__(self) -> str:
+        """Return the judgement as a sentence."""
+        return f"the new model is doubtful: {self.doubt}" if self.doubt else self.summary
+
+    def record(self) -> dict[str, Any]:
+        """Return the judgement for the provenance of the new model."""
+        result: dict[str, Any] = {"doubtful": bool(self.doubt), "reason": str(self)}
+        result["figures"] = _rounded(self.figures)
+        if self.rival_figures:
+            result |= {"rival": self.rival, "rival_figures": _rounded(self.rival_figures)}
+        return result
+
+
+def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
+    """Return whether a new model should replace the one at hand.
+
+    Args:
+        frames: those that the model was trained on, and those held out.
+        model: the new one.
+        rival: the one at hand; None, or one that lifts none of the frames: the new model is judged
+            by its mirrored frames alone.
+    """
+    court = Judge(frames)
+    old = None
+    if rival is not None:
+        with suppress(ValueError):
+            old = court.figures(rival)
+    new = court.figures(model, rival if old else None)
+    where = "held-out" if frames.held_out is not frames.training else "training"
+    name = rival.name if rival is not None and old else ""
+    than = f"compared with model {name!r} on " if name else "on "
+    than += f"{len(frames.held_out)} {where} frames"
+    shown = [each for each in RULE if each in _known(new) and (old or each != "opposed")]
+    summary = "; ".join(_in_words(each, new, old) for each in shown)
+    doubt = ""
+    if worse := worse_figures(new, old):
+        reasons = "; ".join(_in_words(each, new, old) for each in worse)
+        doubt = f"{than}, {reasons}; {_advice(model, name)} would help"
+    return Judgement(doubt, f"{than}, {summary}", new, name, old)
+
+
+def worse_figures(new: Figures, old: Figures | None) -> list[str]:
+    """Return the names of the figures by which the rule doubts a new model.
+
+    Args:
+        new: of the new model.
+        old: of the one at hand; None where there is none. What is in front of the object is not
+            taken from it where it has more mirrored frames itself.
+    """
+    values, known = _known(new), _known(old) if old else {}
+    shares = ("mirrored_share", "front_disagreement")
+    if not old:
+        return [name for name in shares if values.get(name, 0.0) > MOST_MIRRORED]
+    if any(known.get(name, 0.0) > values.get(name, 1.0) + RULE[name][1] for name in shares):
+        values.pop("opposed", None)
+    return [
+        name
+        for name, (factor, more, _) in RULE.items()
+        if name in values and name in known and values[name] > factor * known[name] + more
+    ]
+
+
+def _known(figures: Figures) -> dict[str, float]:
+    """Return the figures that are known."""
+    return {name: value for name, value in figures._asdict().items() if not math.isnan(value)}
+
+
+def _rounded(figures: Figures) -> dict[str, float]:
+    """Return the figures that are known, for a file."""
+    return {name: round(value, 5) for name, value in _known(figures).items()}
+
+
+def _in_words(name: str, new: Figures, old: Figures | None) -> str:
+    """Return a figure of both models in words."""
+    text = RULE[name][2].format(getattr(new, name))
+    known = _known(old) if old and name != "opposed" else {}
+    return f"{text} (the other's: {known[name]:.1%})" if name in known else text
+
+
+def _advice(model: Model, rival: str) -> str:
+    """Return what would help a doubtful model."""
+    advice = ["more views", "more frames"]
+    if "from" in model.provenance:
+        advice.append("fewer steps")
+    else:
+        advice.append(f"a start from {rival or 'a model of such an object'} (--from, train.from)")
+    if model.layout.edges and model.layout.handedness:
+        advice.append("the layout's losses (bone_length_weight, handedness_weight, depth_penalty)")
+    return f"{', '.join(advice[:-1])} or {advice[-1]}"
+
+
+class Judge:
+    """Compares models on the frames of one dataset."""
+
+    def __init__(self, frames: Split) -> None:
+        """Take up to 2000 frames of each kind.
+
+        Args:
+            frames: of the training and held out.
+        """
+        self._held_out = _spread(frames.held_out)
+        parts = [frames.training]
+        if frames.held_out is not frames.training:
+            parts.append(frames.held_out)
+        self._all = _spread(concatenate(parts))
+        store = FrameStore.of(self._all.points, self._all.visible)
+        self._mirror_check = MirrorCheck(store, Normaliser(), _MOST_FRAMES)
+
+    def figures(self, model: Model, other: Model | None = None) -> Figures:
+        """Return the figures of a model, whose keypoints are matched by name.
+
+        Args:
+            model: the model.
+            other: the one that it is compared with; None: itself.
+
+        Raises:
+            ValueError: one of them shares fewer than 4 keypoints with the data, or lifts no frame.
+        """
+        layout = self._held_out.layout
+        S, residual, visible = _lift(model, self._held_out)
+        T, rival_residual, also_visible = _lift(other or model, self._held_out)
+        sound = np.isfinite(residual) & np.isfinite(rival_residual)
+        if not sound.any():
+            raise ValueError(f"model {model.name!r} lifts none of the held-out frames")
+        S, visible = S[sound], visible[sound]
+        everything, _, shown = _lift(model, self._all)
+        test = self._mirror_check.test_shapes(everything, shown)
+        X = _unit(S, visible)
+        variation, difference = _bones(S, visible, layout)
+        both = visible & also_visible[sound]
+        Y, Z = _unit(S, both), _unit(T[sound], both)
+        return Figures(
+            float(np.median(residual[sound])),
+            variation,
+            test.share if test.tested.mean() >= MIN_TESTED else math.nan,
+            _front_disagreement(everything, shown, layout),
+            self._opposed(everything, shown, other or model),
+            difference,
+            float(np.linalg.norm(X[..., :2], axis=(1, 2)).mean()),
+            float(np.linalg.norm(align(Y, Z).aligned - Z, axis=(1, 2)).mean()),
+        )
+
+    def _opposed(self, S: Floats, visible: NDArray[np.bool_], other: Model) -> float:
+        """Return the share of all frames of which `other` has the mirror image."""
+        T, residual, also_visible = _lift(other, self._all)
+        both, sound = visible & also_visible, np.isfinite(residual)
+        aligned = align(_unit(S, both), _unit(T, both), allow_reflection=True)
+        return float(aligned.mirrored[sound].mean())
+
+
+def _spread(dataset: Dataset) -> Dataset:
+    """Return at most `_MOST_FRAMES` frames of a dataset, evenly spread."""
+    n = len(dataset)
+    return dataset[np.unique(np.linspace(0, n - 1, min(n, _MOST_FRAMES)).astype(int))]
+
+
+def _lift(model: Model, data: Dataset) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return shapes (n, p, 3), residuals (n,) and the visible keypoints (n, p) that have a shape.
+
+    The shapes are in the axes of the camera and the keypoints in the order of the data, 0 where
+    the model lacks one or a frame is not lifted; the residual of such a frame is NaN.
+    """
+    confidence = data.visible.astype(np.float32)
+    mapped = KeypointMap(data.layout, model.layout)(data.points, confidence)
+    lifted = lift_all(Lifter(model, _NETWORK_ALONE).lift, *mapped)
+    sound = np.isfinite(lifted.shapes).all((1, 2)) & np.isfinite(lifted.residual)
+    S = np.zeros((*data.visible.shape, 3))
+    places = {name: i for i, name in enumerate(model.layout.keypoints)}
+    common = [i for i, name in enumerate(data.layout.keypoints) if name in places]
+    source = [places[data.layout.keypoints[i]] for i in common]
+    S[:, common] = np.where(sound[:, None, None], lifted.shapes[:, source], 0)
+    visible = np.zeros_like(data.visible)
+    visible[:, common] = data.visible[:, common] & sound[:, None]
+    return S, np.where(sound, lifted.residual, np.nan), visible
+
+
+def _unit(S: Floats, visible: NDArray[np.bool_]) -> Floats:
+    """Return shapes (n, p, 3) centred over their visible keypoints, 0 elsewhere, of norm 1."""
+    mask = visible[..., None].astype(float)
+    S = centre_visible(S, mask) * mask
+    unit: Floats = S / np.maximum(np.linalg.norm(S, axis=(1, 2), keepdims=True), 1e-12)
+    return unit
+
+
+def _bones(S: Floats, visible: NDArray[np.bool_], layout: KeypointLayout) -> tuple[float, float]:
+    """Return `bone_variation` and `side_difference` of shapes; NaN where there are too few bones.
+
+    A length is relative to the median of the frame's bones, each by its own mean, so that hidden
+    bones do not matter.
+    """
+    pairs = layout.bone_indices()
+    if len(pairs) < 2:
+        return math.nan, math.nan
+    i, j = np.array(pairs).T
+    both = visible[:, i] & visible[:, j]
+    lengths = np.where(both, np.linalg.norm(S[:, i] - S[:, j], axis=2), np.nan)
+    enough = both.mean(0) >= MIN_VISIBLE_SHARE
+    lengths = lengths[:, enough][(both[:, enough].sum(1) >= 2)]
+    if lengths.shape[1] < 2 or len(lengths) < 2:
+        return math.nan, math.nan
+    lengths = lengths / np.nanmedian(lengths, axis=0)
+    lengths /= np.maximum(np.nanmedian(lengths, axis=1, keepdims=True), 1e-9)
+    variation = float(np.nanmean(np.abs(lengths - np.nanmedian(lengths, axis=0))))
+    sides, places = layout.sides(), {frozenset(pair): k for k, pair in enumerate(pairs)}
+    opposite = [places.get(frozenset((sides[a], sides[b])), -1) for a, b in pairs]
+    partners = [(k, other) for k, other in enumerate(opposite) if other > k]
+    if not partners:
+        return variation, math.nan
+    left, right = np.array(partners).T
+    raw = np.where(both, np.linalg.norm(S[:, i] - S[:, j], axis=2), np.nan)
+    gaps = np.abs(raw[:, left] - raw[:, right]) / np.maximum(raw[:, left] + raw[:, right], 1e-9)
+    return variation, float(np.nanmean(2 * gaps)) if np.isfinite(gaps).any() else math.nan
+
+
+def _front_disagreement(S: Floats, visible: NDArray[np.bool_], layout: KeypointLayout) -> float:
+    """Return the share of frames whose votes on the front are negative in sum; NaN without any."""
+    if not layout.handedness:
+        return math.nan
+    corners = np.array([[layout.index(name) for name in four] for four in layout.handedness])
+    counts: NDArray[np.bool_] = np.asarray(visible[:, corners].all(2), bool)
+    sums = (votes(S, layout) * counts).sum(1)[counts.any(1)]
+    return float((sums < 0).mean()) if len(sums) else math.nan
