@@ -140,8 +140,23 @@ def test_an_array_becomes_a_model_that_lifts() -> None:
             on_progress=progress.append,
         )
     assert model.name == "thing" and model.layout == layout and progress
+    assert "rival" not in model.provenance["judgement"]  # no model has such an object
     assert np.isfinite(Lifter(model)(points[:3]).shapes).all()
     visible = np.ones((400, 8), bool)
     visible[:, 5:] = False
     with pytest.raises(ValueError, match="cannot be learned"):
         train(points[:5], visible[:5], layout=layout)
+
+
+def test_a_model_of_people_is_judged_beside_the_one_at_hand(human: Model) -> None:
+    rng = np.random.default_rng(0)
+    rotations = np.linalg.qr(rng.standard_normal((220, 3, 3)))[0]
+    shapes = rng.standard_normal((17, 3)) + 0.1 * rng.standard_normal((220, 17, 3))
+    points = 100 * (shapes @ rotations)[..., :2] + 300  # no person
+    recipe = Recipe(steps=1, learning_rate=0.1, batch=4)
+    with pytest.warns(UserWarning, match="the new model is doubtful: .* would help"):
+        model = train(points, layout=HUMAN17, recipe=recipe)
+    judgement = model.provenance["judgement"]
+    assert judgement["rival"] == "human" and model.provenance["from"]["model"] == "human"
+    assert judgement["doubtful"] and "would help" in judgement["reason"]
+    assert {"residual", "bone_variation"} <= judgement["figures"].keys()

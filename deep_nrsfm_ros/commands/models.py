@@ -1,4 +1,4 @@
-"""List the models that the lifter can use, with their label-free quality and provenance."""
+"""List the models that the lifter can use, with what the judge says of them and provenance."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 
-COLUMNS = ("model", "object", "keypoints", "reprojection", "cycle", "date")
-QUALITY = ("reprojection_error", "cycle_error")
+COLUMNS = ("model", "object", "keypoints", "judged", "date")
+BETTER, DOUBTFUL, NOT_JUDGED = "better", "doubtful", "-"
 EXPLANATION = (
-    "reprojection, cycle: label-free errors on the data of the training, relative, less is better; "
-    "they compare models of the same data; - = not recorded. A date with ~ is that of the file, "
-    "since the model does not record the day of its training"
+    "judged: whether the model was better than the one at hand at its training, without labels; "
+    "- = not compared. Models of one object are in this order: better, not compared, doubtful. "
+    "Errors on the data of a training compare models of these data alone. A date with ~ is that of "
+    "the file, since the model does not record the day of its training"
 )
 
 
@@ -55,27 +56,43 @@ def find_files(folders: Sequence[Path]) -> list[Path]:
 
 
 def list_models(folders: Sequence[Path]) -> list[Listed]:
-    """Return a row and notes for every model file, unusable ones included."""
+    """Return a row and notes for every model file: by object, doubtful and unusable ones last."""
     listed: list[Listed] = []
+    places: dict[str, Path] = {}
     for path in find_files(folders):
-        hidden = any(path.stem == other.row[0] for other in listed)
-        note = ("hidden by the one of this name above",) if hidden else ()
+        first = places.setdefault(path.stem, path)
+        note = (f"hidden by {first}",) if first != path else ()
         try:
             model = load_model(path)
         except ModelFileError as error:
             listed.append(Listed((path.stem, "unusable"), (str(error), *note)))
             continue
-        row = (path.stem, model.layout.name, str(len(model.layout)), *_quality(model))
-        listed.append(
-            Listed((*row, _date(model, path)), (str(path), _origin(model), *_doubt(model), *note))
-        )
-    return listed
+        row = (path.stem, model.layout.name, str(len(model.layout)), _verdict(model))
+        notes = (str(path), _origin(model), *_judgement(model), *_quality(model), *note)
+        listed.append(Listed((*row, _date(model, path)), notes))
+    return sorted(listed, key=_rank)
+
+
+def _rank(listed: Listed) -> tuple[bool, str, int]:
+    """Return the place of a model in the list."""
+    usable = len(listed.row) == len(COLUMNS)
+    verdicts = (BETTER, NOT_JUDGED, DOUBTFUL)
+    return not usable, listed.row[1], verdicts.index(listed.row[3]) if usable else 0
+
+
+def _verdict(model: Model) -> str:
+    """Return what the judge of the training says of a model."""
+    judgement = model.provenance.get("judgement")
+    if not isinstance(judgement, dict) or not ("rival" in judgement or judgement.get("doubtful")):
+        return NOT_JUDGED
+    return DOUBTFUL if judgement.get("doubtful") else BETTER
 
 
 def _quality(model: Model) -> tuple[str, ...]:
-    """Return the label-free figures, "-" where the file has none."""
-    figures = (model.quality.get(name) for name in QUALITY)
-    return tuple(f"{f:.3f}" if isinstance(f, (int, float)) else "-" for f in figures)
+    """Return a note with the errors on the data of the training, if the file has them."""
+    figures = {name: model.quality.get(f"{name}_error") for name in ("reprojection", "cycle")}
+    known = [f"{name} {f:.3f}" for name, f in figures.items() if isinstance(f, (int, float))]
+    return (f"on the data of its training: {', '.join(known)}",) if known else ()
 
 
 def _date(model: Model, path: Path) -> str:
@@ -89,20 +106,25 @@ def _date(model: Model, path: Path) -> str:
 def _origin(model: Model) -> str:
     """Return what the model was trained on, and from what."""
     said: dict[str, Any] = model.provenance
-    parts = [str(said.get("data", "of unknown data"))]
-    parts += [f"{said[key]} {unit}" for key, unit in _COUNTS.items() if key in said]
     start = said.get("from")
-    if isinstance(start, dict):
+    # A training of no steps keeps the network of its start, whose steps count.
+    same_network = said.get("step") == 0 and isinstance(start, dict) and "step" in start
+    counts = said | {"step": start["step"]} if same_network and isinstance(start, dict) else said
+    parts = [str(said.get("data", "of unknown data"))]
+    parts += [f"{counts[key]} {unit}" for key, unit in _COUNTS.items() if key in counts]
+    last = said.get("last_step")
+    if isinstance(last, dict) and "data" in last:
+        parts.append(f"error covariance and bones from {last['data']}")
+    if isinstance(start, dict) and not same_network:
         parts.append(f"from model {start.get('model')}")
     return "; ".join(parts)
 
 
-def _doubt(model: Model) -> tuple[str, ...]:
-    """Return a note on a model that the judge of its training doubts."""
-    judgement = model.provenance.get("judgement")
-    if isinstance(judgement, dict) and judgement.get("doubtful"):
-        return (str(judgement.get("reason")),)
-    return ()
+def _judgement(model: Model) -> tuple[str, ...]:
+    """Return a note with the judgement, if the model was compared with another or is doubtful."""
+    if _verdict(model) == NOT_JUDGED:
+        return ()
+    return (str(model.provenance["judgement"].get("reason")),)
 
 
 _COUNTS = {"frames": "frames", "step": "steps"}

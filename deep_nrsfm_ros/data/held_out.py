@@ -37,5 +37,5 @@ def split(dataset: Dataset, share: float) -> Split:
     if share * n < MIN_HELD_OUT:
         return Split(dataset, dataset)
     place = np.arange(n) * BLOCKS / n % 1
-    last = place >= 1 - share
+    last = place >= 1 - share - 1e-9  # rounding must not take a frame
     return Split(dataset[np.flatnonzero(~last)], dataset[np.flatnonzero(last)])

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
-from deep_nrsfm_ros.data.curation import curate
+from deep_nrsfm_ros.data.curation import Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.held_out import split
 from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -40,6 +41,10 @@ def train(
     The data are curated as the command `train` does it: frames with few keypoints, near-duplicates
     and outliers are left out. Warnings about the data and the result are Python warnings.
 
+    Where the object has a model, the new one is compared with it without labels, on a tenth of the
+    frames that the training does not use: `provenance["judgement"]` of the result has the figures,
+    and a doubtful model gives a warning with the reason and what would help.
+
     Args:
         points: (f, p, 2) keypoints of f frames, in any unit, x right and y down. A keypoint at
             (0, 0) or with a NaN is missing.
@@ -61,6 +66,7 @@ def train(
     """
     require_extra("train", "training")
     from deep_nrsfm_ros.training.finish import finish
+    from deep_nrsfm_ros.training.judge import judge
     from deep_nrsfm_ros.training.loop import DEFAULT_SETUP, Callbacks, Setup
     from deep_nrsfm_ros.training.loop import train as run
 
@@ -75,8 +81,9 @@ def train(
     for warning in (layout.warning, *curated.warnings, *sufficiency.warnings):
         if warning:
             warnings.warn(warning, stacklevel=2)
-    dataset = curated.dataset
     origin = _origin(start, layout)
+    rival = origin or _shipped(layout)
+    frames = split(curated.dataset, Curation().held_out if rival else 0.0)
     preset, setup = PRESETS["default"]._replace(recipe=recipe or Recipe()), DEFAULT_SETUP
     if origin:
         preset = preset._replace(
@@ -84,11 +91,15 @@ def train(
         )
         setup = Setup(start_from(origin, layout))
     callbacks = Callbacks(on_progress=on_progress)
-    trainer = run(dataset.points, dataset.visible, preset, setup, callbacks)
-    model = finish(trainer, name, layout, dataset.source)
+    trainer = run(frames.training.points, frames.training.visible, preset, setup, callbacks)
+    model = finish(trainer, name, layout, curated.dataset.source)
     if origin:
         model = inherit(model, origin)
-    model.provenance["date"] = time.strftime("%Y-%m-%d", time.gmtime())
+    judgement = judge(frames, model, rival)
+    if judgement.doubt:
+        warnings.warn(str(judgement), stacklevel=2)
+    date = time.strftime("%Y-%m-%d", time.gmtime())
+    model.provenance.update(date=date, judgement=judgement.record())
     return model
 
 
@@ -100,5 +111,10 @@ def _origin(start: Model | str, layout: KeypointLayout) -> Model | None:
         return None
     if start:
         return load_model(start)
+    return _shipped(layout)
+
+
+def _shipped(layout: KeypointLayout) -> Model | None:
+    """Return the model of the package that has the keypoints of a layout, if there is one."""
     known = known_model(layout)
     return load_model(known) if known else None

@@ -123,7 +123,11 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
     if rival is not None:
         with suppress(ValueError):
             old = court.figures(rival)
-    new = court.figures(model, rival if old else None)
+    try:
+        new = court.figures(model, rival if old else None)
+    except ValueError as error:  # no training is lost because its model is poor
+        unknown = Figures(*[math.nan] * len(Figures._fields))
+        return Judgement(f"{error}; {_advice(model, '')} would help", "", unknown)
     where = "held-out" if frames.held_out is not frames.training else "training"
     name = rival.name if rival is not None and old else ""
     than = f"compared with model {name!r} on " if name else "on "

@@ -45,9 +45,10 @@ def test_a_model_is_listed_with_all_that_is_known_of_it(
     folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = save(folders[0] / "mine.safetensors")
-    head, row, where, origin, *_ = listing(capsys, folders[0])
+    head, row, where, origin, errors, *_ = listing(capsys, folders[0])
     assert tuple(head.split()) == models.COLUMNS
-    assert row.split() == ["mine", "human17", "17", "0.123", "0.568", "2025-03-04"]
+    assert row.split() == ["mine", "human17", "17", "-", "2025-03-04"]
+    assert errors.strip() == "on the data of its training: reprojection 0.123, cycle 0.568"
     assert where.strip() == str(path)
     assert origin.strip() == "bags kitchen, yard; 321 frames; 4000 steps"
 
@@ -62,13 +63,46 @@ def test_what_a_model_was_started_from_is_said(
     )
 
 
+def test_a_training_of_no_steps_has_those_of_its_start(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = PROVENANCE | {"model": "human", "step": 40000}
+    anew = PROVENANCE | {"step": 0, "last_step": {"data": "virtual people"}, "from": first}
+    save(folders[0] / "human.safetensors", provenance=anew)
+    text = " ".join(" ".join(listing(capsys, folders[0])).split())
+    assert "40000 steps; error covariance and bones from virtual people" in text
+    assert "0 steps; from" not in text.replace("40000 steps", "")
+
+
+def test_models_stand_in_the_order_of_the_judge(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    reasons = {"a": "it mirrors", "b": None, "c": "it is better"}
+    for name, reason in reasons.items():
+        judgement = {"doubtful": name == "a", "reason": reason, "rival": "human"}
+        provenance = PROVENANCE | ({"judgement": judgement} if reason else {})
+        # The doubtful model has the lowest errors: on its own data they say nothing.
+        quality = {"reprojection_error": 0.01 if name == "a" else 0.1}
+        save(folders[0] / f"{name}.safetensors", provenance=provenance, quality=quality)
+    (folders[0] / "aa.safetensors").write_bytes(b"\0" * 9)
+    lines = listing(capsys, folders[0])
+    rows = [line.split() for line in lines[1 : lines.index("")] if not line.startswith(" ")]
+    assert [(row[0], row[3] if len(row) > 3 else "") for row in rows] == [
+        ("c", "better"),
+        ("b", "-"),
+        ("a", "doubtful"),
+        ("aa", ""),
+    ]
+    assert {"it mirrors", "it is better"} <= {line.strip() for line in lines}
+
+
 def test_a_model_that_says_little_is_listed_too(
     folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = save(folders[0] / "old.safetensors", provenance={}, quality={"cycle_error": "good"})
     row, _, origin, *_ = listing(capsys, folders[0])[1:]
-    assert row.split()[:5] == ["old", "human17", "17", "-", "-"]
-    assert row.split()[5].startswith("~20") and path.exists()  # the day of the file
+    assert row.split()[:4] == ["old", "human17", "17", "-"]
+    assert row.split()[4].startswith("~20") and path.exists()  # the day of the file
     assert origin.strip() == "of unknown data"
 
 
@@ -86,12 +120,12 @@ def test_own_models_hide_those_of_the_package(
     names = [row.split()[:3] for row in rows if not row.startswith(" ")]
     assert names == [
         ["again", "human17", "17"],
+        ["human", "human17", "17"],
+        ["human", "human17", "17"],
         ["dog", "points5", "5"],
-        ["human", "human17", "17"],
-        ["human", "human17", "17"],
     ]
-    hidden = lines.index("    hidden by the one of this name above")
-    assert lines[hidden - 2].strip() == str(shared / "human.safetensors")
+    note = [line for line in rows if "hidden by" in line]
+    assert len(note) == 1 and str(own)[:40] in note[0]
 
 
 def test_damaged_files_are_listed_with_the_reason(

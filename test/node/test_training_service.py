@@ -183,41 +183,28 @@ def test_the_real_training_turns_a_bag_into_the_model_in_use(
 PAW = KeypointLayout("paw", ("heel", "toe_1", "toe_2", "toe_3", "toe_4"))
 
 
-def test_an_object_that_is_no_preset_is_trained_anew_from_its_model_and_by_number(
+def test_an_object_that_is_no_preset_is_trained_by_number_and_its_model_is_used(
     start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path
 ) -> None:
     write_bag(tmp_path / "bag", 200, len(PAW))
     network = initialise(Architecture(widths=(8, 4)), len(PAW), np.random.default_rng(0))
     paw = Model("paw", network, PAW, Normaliser(), np.eye(3, dtype=np.float32))
     save_model(models / "paw.safetensors", paw)
-    source: dict[str, Any] = {"bags": [str(tmp_path / "bag")], "topic": "/keypoints"}
-    train = source | {"name": "anew", "steps": 5, "seeds": 1, "activate": "always", "from": "none"}
+    train: dict[str, Any] = {"bags": [str(tmp_path / "bag")], "topic": "/keypoints"}
+    train |= {"name": "counted", "steps": 1, "seeds": 1, "activate": "always", "from": "nobody"}
     start_lifter(input_type="std_msgs/Float32MultiArray", model="paw", train=train)
     client = connect()
     publisher = client.publisher(Float32MultiArray)
     before = client.exchange(publisher, keypoints(p=len(PAW))).data
-
-    def trained(name: str, warning: str) -> Model:
-        client.heard["/lifter/training_status"].clear()
-        accepted = client.call("/lifter/train")
-        assert accepted.success and warning in accepted.message, accepted.message
-        assert "in use" in client.wait_for_training("finished").message
-        client.wait_for_health(lambda _, v: v["model"] == name)
-        return load_model(models / f"{name}.safetensors")
-
-    mirrored = "no handedness: depth may come out mirrored"
-    anew = trained("anew", mirrored)
-    assert anew.layout == PAW and "from" not in anew.provenance
-
-    client.set_parameters(train__from="nobody")
     refused = client.call("/lifter/train")
     assert not refused.success and "no model 'nobody'; there are" in refused.message
-    client.set_parameters(train__from="paw", train__name="tuned")
-    tuned = trained("tuned", "")  # the start passes its handedness on
-    assert tuned.layout == PAW and tuned.provenance["from"]["model"] == "paw"
-    assert tuned.network.architecture == paw.network.architecture
 
-    client.set_parameters(train__from="", train__object="numbered", train__name="counted")
-    assert trained("counted", mirrored).layout == KeypointLayout.numbered(len(PAW))
+    client.set_parameters(train__from="", train__object="numbered")
+    accepted = client.call("/lifter/train")
+    assert accepted.success and "no handedness: depth may come out mirrored" in accepted.message
+    assert "in use from now on" in client.wait_for_training("finished").message
+    client.wait_for_health(lambda _, v: v["model"] == "counted")
+    counted = load_model(models / "counted.safetensors")
+    assert counted.layout == KeypointLayout.numbered(len(PAW)) and "from" not in counted.provenance
     assert client.set_parameters(model="paw") == ""
     assert client.exchange(publisher, keypoints(p=len(PAW))).data == before

@@ -73,7 +73,7 @@ def test_a_training_of_people_starts_from_the_model_of_people_unless_told_otherw
     for words in (("--from", "none"), ("--widths", "8", "4"), ("--preset", "paper")):
         config = parsed(*bag, *words)
         assert (config.start, config.rival) == ("", human)
-    for words in (("--object", "hand21"), ("--object", "ap10k17"), ("--object", "numbered")):
+    for words in (("--object", "ap10k17"), ("--object", "numbered")):
         config = parsed(*bag, *words)
         assert (config.start, config.rival) == ("", "")
     assert parsed("--cmu", "c", "--object", "human17").start == ""

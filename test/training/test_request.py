@@ -11,6 +11,7 @@ import pytest
 
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.known_model import known_model
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
@@ -91,6 +92,26 @@ def test_a_start_brings_its_architecture(tmp_path: Path) -> None:
     save_model(path, Model("old", network, HUMAN17, Normaliser(), frame))
     config = request(tmp_path, bags=(".",), from_="old").config
     assert (config.start, config.architecture) == (str(path), architecture)
+
+
+def test_an_object_that_is_no_preset_starts_from_its_present_model(tmp_path: Path) -> None:
+    paw = KeypointLayout("paw", ("heel", "toe_1", "toe_2", "toe_3", "toe_4"))
+    network = initialise(Architecture(widths=(4,)), len(paw), np.random.default_rng(0))
+    path = tmp_path / "paw.safetensors"
+    save_model(path, Model("paw", network, paw, Normaliser(), np.eye(3, dtype=np.float32)))
+    lifter = dataclasses.replace(INPUT, model=path)
+
+    def asked(**options: Any) -> TrainingConfig:
+        parts = dataclasses.replace(PARTS, options=TrainingOptions(**options))
+        return training_request(parts, lifter, PathSandbox(tmp_path, tmp_path)).config
+
+    config = asked()
+    assert (config.object, config.start, config.rival) == (str(path),) * 3
+    assert config.architecture == network.architecture
+    anew = asked(from_="none")
+    assert (anew.object, anew.start, anew.rival) == (str(path), "", str(path))
+    numbered = asked(object="numbered")
+    assert (numbered.start, numbered.rival) == ("", "")
 
 
 @pytest.mark.parametrize(

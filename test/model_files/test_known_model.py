@@ -1,0 +1,55 @@
+"""The model that a training starts from: one whose keypoints have the names of the object's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17, LAYOUTS
+from deep_nrsfm_ros.model_files.known_model import known_model, knows
+from deep_nrsfm_ros.model_files.model_file import Model, save_model
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+
+DOG = KeypointLayout("dog", ("nose", "tail", "left_paw", "right_paw", "back"))
+
+
+def save(path: Path, layout: KeypointLayout) -> Path:
+    network = initialise(Architecture(widths=(4,)), len(layout), np.random.default_rng(0))
+    model = Model("any", network, layout, Normaliser(), np.eye(3, dtype=np.float32))
+    save_model(path, model)
+    return path
+
+
+@pytest.mark.parametrize("name", ["coco17", "body25", "body25b", "mediapipe33", "halpe26"])
+def test_people_of_every_detector_have_human(name: str) -> None:
+    if name not in LAYOUTS:
+        pytest.skip(f"there is no layout {name}")
+    found = known_model(name)
+    assert found is not None and found.stem == "human"
+
+
+@pytest.mark.parametrize("name", ["hand21", "ap10k17", "numbered", "no such layout"])
+def test_other_objects_have_no_model_of_people(name: str) -> None:
+    found = known_model(name)
+    assert found is None or found.stem != "human"
+
+
+def test_the_present_model_comes_first_if_it_fits(tmp_path: Path) -> None:
+    dog, mine = save(tmp_path / "dog.safetensors", DOG), save(tmp_path / "m.safetensors", HUMAN17)
+    assert known_model(DOG, [mine, dog]) == dog
+    assert known_model("human17", [dog, mine]) == mine
+    damaged = tmp_path / "damaged.safetensors"
+    damaged.write_bytes(b"\0" * 9)
+    assert known_model(DOG, [damaged, tmp_path / "lost.safetensors", dog]) == dog
+
+
+def test_most_names_must_be_the_same() -> None:
+    points = KeypointLayout("other", ("nose", "tail", "left_paw", "ear", "eye"))
+    assert knows(DOG, DOG) and not knows(DOG, points)  # 3 of 5
+    assert knows(DOG, KeypointLayout("more", (*DOG.keypoints[:4], "eye")))  # 4 of 5
+    few = KeypointLayout("few", DOG.keypoints[:3])
+    assert not knows(few, few)  # fewer than 4 are no shape

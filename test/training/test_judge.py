@@ -1,0 +1,145 @@
+"""The judge: a worse model is doubted with its reason, a better one is not; no label is used."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.held_out import Split, split
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.nrsfm.network import initialise
+from deep_nrsfm_ros.training.finish import finish
+from deep_nrsfm_ros.training.judge import Figures, Judge, judge, worse_figures
+from deep_nrsfm_ros.training.trainer import Trainer
+
+GOOD = Figures(
+    residual=0.05,
+    bone_variation=0.04,
+    mirrored_share=0.0,
+    front_disagreement=0.0,
+    opposed=0.0,
+    side_difference=0.1,
+    flatness=0.8,
+    difference=0.0,
+)
+
+
+def with_bones(layout: KeypointLayout) -> KeypointLayout:
+    names = layout.keypoints
+    return dataclasses.replace(layout, edges=tuple((names[0], name) for name in names[1:6]))
+
+
+@pytest.fixture(scope="module")
+def frames(figure: Any) -> Split:
+    points = figure.points[:600]
+    visible = np.ones(points.shape[:2], bool)
+    return split(Dataset(points, visible, with_bones(figure.layout), "test"), 0.1)
+
+
+@pytest.fixture(scope="module")
+def good(figure: Any, trained: Trainer) -> Model:
+    return finish(trained, "good", with_bones(figure.layout), "test")
+
+
+@pytest.fixture(scope="module")
+def bad(good: Model) -> Model:
+    network = initialise(good.network.architecture, len(good.layout), np.random.default_rng(0))
+    return dataclasses.replace(good, name="bad", network=network)
+
+
+def test_a_bad_model_is_doubted_and_told_what_would_help(
+    frames: Split, good: Model, bad: Model
+) -> None:
+    judgement = judge(frames, bad, good)
+    assert "compared with model 'good' on 60 held-out frames" in judgement.doubt
+    assert "its keypoints are off by" in judgement.doubt and "(the other's: " in judgement.doubt
+    assert "would help" in judgement.doubt and "--from" in judgement.doubt
+    assert str(judgement).startswith("the new model is doubtful: ")
+    record = judgement.record()
+    assert record["doubtful"] and record["rival"] == "good"
+    assert record["figures"]["residual"] > record["rival_figures"]["residual"]
+
+
+def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
+    frames: Split, good: Model, bad: Model
+) -> None:
+    for rival in (good, bad):
+        judgement = judge(frames, good, rival)
+        assert judgement.doubt == "" and judgement.rival == rival.name
+        assert not judgement.record()["doubtful"]
+
+
+def test_mirrored_frames_are_seen_without_another_model(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deep_nrsfm_ros.training import judge as module
+
+    assert not judge(frames, good, None).doubt
+    lift = module._lift
+
+    def half_mirrored(model: Model, data: Dataset) -> Any:
+        S, residual, visible = lift(model, data)
+        far = data.points[:, 4, 0] > np.quantile(data.points[:, 4, 0], 0.7)
+        S[far] *= [1, 1, -1]
+        return S, residual, visible
+
+    monkeypatch.setattr(module, "_lift", half_mirrored)
+    mirrored = judge(frames, good, None)
+    assert mirrored.figures.mirrored_share == pytest.approx(0.3, abs=0.05)
+    assert "of its frames are mirrored" in mirrored.doubt
+
+
+def test_figures_follow_names_not_places(frames: Split, good: Model) -> None:
+    shuffled = np.random.default_rng(0).permutation(len(good.layout))
+    layout = dataclasses.replace(
+        frames.held_out.layout,
+        keypoints=tuple(frames.held_out.layout.keypoints[i] for i in shuffled),
+    )
+    other = Split(
+        *(
+            Dataset(part.points[:, shuffled], part.visible[:, shuffled], layout, "test")
+            for part in frames
+        )
+    )
+    expected, found = Judge(frames).figures(good), Judge(other).figures(good)
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_rival_of_another_object_is_none(frames: Split, good: Model) -> None:
+    names = tuple(f"other_{i}" for i in range(len(good.layout)))
+    stranger = dataclasses.replace(good, layout=KeypointLayout("other", names))
+    judgement = judge(frames, good, stranger)
+    assert judgement.rival == "" and not judgement.doubt
+    lost = judge(frames, stranger, None)  # the training that made it is not lost by it
+    assert "keypoints" in lost.doubt and lost.record()["figures"] == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "worse"),
+    [
+        ({}, []),
+        ({"residual": 0.051}, ["residual"]),
+        ({"bone_variation": 0.079}, []),
+        ({"bone_variation": 0.081}, ["bone_variation"]),
+        ({"mirrored_share": 0.01}, ["mirrored_share"]),
+        ({"mirrored_share": math.nan, "front_disagreement": math.nan}, []),
+        ({"front_disagreement": 0.2, "opposed": 0.3}, ["front_disagreement", "opposed"]),
+        ({"side_difference": 9.0, "flatness": 0.0, "difference": 9.0}, []),
+    ],
+)
+def test_the_rule(change: dict[str, float], worse: list[str]) -> None:
+    assert worse_figures(GOOD._replace(**change), GOOD) == worse
+
+
+def test_the_mirror_image_of_a_mirrored_model_is_no_fault() -> None:
+    turned = GOOD._replace(front_disagreement=0.9)
+    assert worse_figures(GOOD._replace(opposed=0.95), turned) == []
+    assert worse_figures(GOOD._replace(opposed=0.95), GOOD) == ["opposed"]
+    assert worse_figures(GOOD._replace(mirrored_share=0.2), None) == ["mirrored_share"]
+    assert worse_figures(GOOD._replace(mirrored_share=0.04), None) == []
