@@ -31,6 +31,8 @@ from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
 
 Floats = NDArray[Any]
 
+_Lifted = tuple[Floats, Floats, NDArray[np.bool_]]
+
 _MOST_FRAMES = 2000
 _NETWORK_ALONE = LiftingOptions(correction="none", test_time_rotations=1)
 
@@ -207,6 +209,7 @@ class Judge:
         self._all = _spread(concatenate(parts))
         store = FrameStore.of(self._all.points, self._all.visible)
         self._mirror_check = MirrorCheck(store, Normaliser(), _MOST_FRAMES)
+        self._lifted: dict[tuple[int, bool], tuple[Model, _Lifted]] = {}
 
     def figures(self, model: Model, other: Model | None = None) -> Figures:
         """Return the figures of a model, whose keypoints are matched by name.
@@ -219,13 +222,13 @@ class Judge:
             ValueError: one of them shares fewer than 4 keypoints with the data, or lifts no frame.
         """
         layout = self._held_out.layout
-        S, residual, visible = _lift(model, self._held_out)
-        T, rival_residual, also_visible = _lift(other or model, self._held_out)
+        S, residual, visible = self._lift(model, held_out=True)
+        T, rival_residual, also_visible = self._lift(other or model, held_out=True)
         sound = np.isfinite(residual) & np.isfinite(rival_residual)
         if not sound.any():
             raise ValueError(f"model {model.name!r} lifts none of the held-out frames")
         S, visible = S[sound], visible[sound]
-        everything, _, shown = _lift(model, self._all)
+        everything, _, shown = self._lift(model)
         test = self._mirror_check.test_shapes(everything, shown)
         X = _unit(S, visible)
         variation, difference = _bones(S, visible, layout)
@@ -242,9 +245,17 @@ class Judge:
             float(np.linalg.norm(align(Y, Z).aligned - Z, axis=(1, 2)).mean()),
         )
 
+    def _lift(self, model: Model, *, held_out: bool = False) -> _Lifted:
+        """Return a model's shapes of all or of the held-out frames, which are computed once."""
+        key = id(model), held_out
+        if key not in self._lifted:  # the model is kept: its id is the key
+            data = self._held_out if held_out else self._all
+            self._lifted[key] = model, _lift(model, data)
+        return self._lifted[key][1]
+
     def _opposed(self, S: Floats, visible: NDArray[np.bool_], other: Model) -> float:
         """Return the share of all frames of which `other` has the mirror image."""
-        T, residual, also_visible = _lift(other, self._all)
+        T, residual, also_visible = self._lift(other)
         both, sound = visible & also_visible, np.isfinite(residual)
         aligned = align(_unit(S, both), _unit(T, both), allow_reflection=True)
         return float(aligned.mirrored[sound].mean())
@@ -256,7 +267,7 @@ def _spread(dataset: Dataset) -> Dataset:
     return dataset[np.unique(np.linspace(0, n - 1, min(n, _MOST_FRAMES)).astype(int))]
 
 
-def _lift(model: Model, data: Dataset) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _lift(model: Model, data: Dataset) -> _Lifted:
     """Return shapes (n, p, 3), residuals (n,) and the visible keypoints (n, p) that have a shape.
 
     The shapes are in the axes of the camera and the keypoints in the order of the data, 0 where

@@ -295,9 +295,17 @@ class Client:
         return future.result()
 
     def wait_for_training(self, state: str) -> DiagnosticStatus:
-        """Wait for the newest training status to say `state`."""
+        """Wait for the newest training status to say `state`.
+
+        Twice as long as for other things: a training has a low priority, so that other programs of
+        a busy machine come first.
+        """
         heard = self.heard["/lifter/training_status"]
-        self.wait(lambda: heard and values(heard[-1])["state"] == state, f"training {state}")
+
+        def said() -> bool:
+            return bool(heard) and values(heard[-1])["state"] == state
+
+        self.wait(said, f"training {state}", 2 * DEADLINE)
         return heard[-1]
 
     def wait_for_health(
