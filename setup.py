@@ -46,7 +46,7 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={
         NAME: [
-            *("py.typed", "kernel/*.pyi", "layouts/presets/*.yaml"),
+            *("py.typed", "kernel/*.pyi", "layouts/presets/*.yaml", "layouts/trees/*.yaml"),
             *("reporting/*.j2", "reporting/*.css", "reporting/*.js"),
         ]
     },
@@ -113,6 +113,7 @@ setup(
             "pytest-xdist",  # several test files at a time: make test TEST_PROCESSES=2
             "pytest-timeout",  # a process that never answers fails its test instead of hanging all
             "h5py",  # writes files as DeepLabCut does
+            "kinpy",  # reads the URDF of a person; its forward kinematics must be ours
             "hypothesis",  # properties over generated input
             "ruff",  # lint and format
             "mypy",  # types

@@ -18,6 +18,7 @@ FLOORS = (
     {"configuration", "yaml_file", "batched", "large_arrays", "extras"},
     {"layouts"},
     {"nrsfm"},
+    {"body"},
     {"kernel"},
     {"model_files"},
     {"lifting"},

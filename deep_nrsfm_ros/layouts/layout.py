@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.layouts.joints import Joint, check_joints
+
 Edge = tuple[str, str]
 Tetrahedron = tuple[str, str, str, str]
 MAX_KEYPOINTS = 1000
@@ -36,6 +38,7 @@ class KeypointLayout:
         rigid: pairs that keep their distance as bones do, and are not drawn.
         top: keypoints whose mean is the upper end of the object when it is upright. (): unknown.
         bottom: keypoints whose mean is its lower end.
+        joints: kinematic tree, parents first: frames of joints, angles, URDF. (): none.
     """
 
     name: str
@@ -48,6 +51,7 @@ class KeypointLayout:
     rigid: tuple[Edge, ...] = ()
     top: tuple[str, ...] = ()
     bottom: tuple[str, ...] = ()
+    joints: tuple[Joint, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise ValueError for a layout that repeats a keypoint or names one that it lacks."""
@@ -84,6 +88,10 @@ class KeypointLayout:
                 f"layout {self.name!r}: top is {', '.join(self.top) or 'nothing'} and bottom is "
                 f"{', '.join(self.bottom) or 'nothing'}; name different keypoints for both"
             )
+        try:
+            check_joints(self.joints, self.keypoints)
+        except ValueError as error:
+            raise ValueError(f"layout {self.name!r}: {error}") from None
         if self.reference_length is not None:
             self._check_reference_length(self.reference_length)
 

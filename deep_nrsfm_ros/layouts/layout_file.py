@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from deep_nrsfm_ros.layouts.joints import Joint, fitting_joints
 from deep_nrsfm_ros.layouts.layout import Edge, KeypointLayout, Tetrahedron
 from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 
@@ -15,7 +16,10 @@ LAYOUT_SUFFIXES = (".yaml", ".yml")
 FIELDS = (
     *("name", "keypoints", "edges", "rigid", "handedness"),
     *("reference", "reference_length", "derived", "top", "bottom"),
+    "joints",
 )
+_OF_JOINTS = ("parent", "at", "angles", "max_twist")
+_TREES = Path(__file__).parent / "trees"
 HANDEDNESS = ("left", "right", "up", "front")
 _MIN_KEYPOINTS = 4  # W = S M has a unique shape from four points on
 
@@ -77,6 +81,56 @@ class _Description:
             reference_length=self._reference_length(),
             top=self._names_or_name("top"),
             bottom=self._names_or_name("bottom"),
+            joints=self._joints(keypoints),
+        )
+
+    def _joints(self, keypoints: tuple[str, ...]) -> tuple[Joint, ...]:
+        """Return the joints of the layout's own tree, or those of a shared one that fit."""
+        value = self._fields.get("joints", {})
+        if not isinstance(value, str):
+            return self._tree(value)
+        trees = sorted(path.stem for path in _TREES.glob("*.yaml"))
+        if value not in trees:
+            raise LayoutFileError(
+                f"joints is {brief_repr(value)}; it must be a mapping, or one of the trees "
+                f"{', '.join(trees)}"
+            )
+        fields = read_fields(_TREES / f"{value}.yaml", "joints: {}")
+        return fitting_joints(self._tree(fields["joints"]), keypoints)
+
+    def _tree(self, value: Any) -> tuple[Joint, ...]:
+        joints = self._mapping("joints", value)
+        return tuple(
+            self._joint(self._text("a name in joints", name), fields)
+            for name, fields in joints.items()
+        )
+
+    def _joint(self, name: str, value: Any) -> Joint:
+        where = f"joints.{name}"
+        fields = self._mapping(where, value)
+        if "at" not in fields:
+            raise LayoutFileError(f"{where} lacks the field 'at'")
+        at = fields["at"]
+        twist = fields.get("max_twist", 180.0)
+        if isinstance(twist, bool) or not isinstance(twist, (int, float)) or not 0 < twist <= 180:
+            raise LayoutFileError(
+                f"{where}.max_twist is {brief_repr(twist)}; it must be in degrees"
+            )
+        angles = self._mapping(f"{where}.angles", fields.get("angles", {}))
+        return Joint(
+            name,
+            (at,) if isinstance(at, str) else self._names(f"{where}.at", at),
+            self._text(f"{where}.parent", fields["parent"]) if "parent" in fields else "",
+            tuple(
+                (self._text(f"a direction of {where}", key), self._pair(f"{where}.{key}", pair))
+                for key, pair in fields.items()
+                if key not in _OF_JOINTS
+            ),
+            tuple(
+                (self._text(f"an angle of {where}", key), self._text(f"{where}.{key}", axis))
+                for key, axis in angles.items()
+            ),
+            float(twist),
         )
 
     def _pairs(self, field: str) -> tuple[Edge, ...]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load, save_file
 
 from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.layouts.joints import joints_from_json
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
@@ -318,17 +319,22 @@ def _layout(header: dict[str, Any]) -> KeypointLayout:
     handedness = header["handedness"] or []
     if handedness and isinstance(handedness[0], str):  # the one of an older file
         handedness = [handedness]
-    header = {"rigid": [], **_ends(header)} | header | {"handedness": handedness}  # of older files
+    header = {"rigid": [], **_of_preset(header)} | header | {"handedness": handedness}
     _check_names(header)
-    return KeypointLayout(**_tuples(header))
+    joints = joints_from_json(_tuples(header["joints"]))
+    return KeypointLayout(**_tuples(header) | {"joints": joints})
 
 
-def _ends(header: dict[str, Any]) -> dict[str, Any]:
-    """Return top and bottom of the preset that a header has the keypoints of."""
+def _of_preset(header: dict[str, Any]) -> dict[str, Any]:
+    """Return top, bottom and joints of the preset that a header has the keypoints of.
+
+    Older files lack these fields.
+    """
     same = LAYOUTS.get(str(header["name"]))
     if same is None or list(same.keypoints) != header["keypoints"]:
-        return {"top": [], "bottom": []}
-    return {"top": list(same.top), "bottom": list(same.bottom)}
+        return {"top": [], "bottom": [], "joints": []}
+    joints = [dataclasses.asdict(joint) for joint in same.joints]
+    return {"top": list(same.top), "bottom": list(same.bottom), "joints": joints}
 
 
 def _check_names(layout: dict[str, Any]) -> None:

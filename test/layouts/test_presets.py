@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -186,7 +187,17 @@ def test_a_preset_says_all_that_it_should(layout: KeypointLayout) -> None:
     fields: dict[str, Any] = {name: tuples(value) for name, value in EXPECTED[layout.name].items()}
     derived = EXPECTED[layout.name]["derived"].items()
     fields["derived"] = {name: tuple(parts) for name, parts in derived}
-    assert layout == KeypointLayout(layout.name, **fields)
+    assert dataclasses.replace(layout, joints=()) == KeypointLayout(layout.name, **fields)
+
+
+@every_preset
+def test_every_person_has_a_kinematic_tree(layout: KeypointLayout) -> None:
+    names = [joint.name for joint in layout.joints]
+    angles = [name for joint in layout.joints for name, _ in joint.angles]
+    person = {"left_hip", "left_wrist"} <= set(layout.keypoints)
+    assert person == ("left_elbow" in names) == ("l_elbow" in angles) == ("r_y_hip" in angles)
+    assert ("y_head" in angles) == (person and "nose" in layout.keypoints)
+    assert ("l_p_foot" in angles) == (person and "left_big_toe" in layout.keypoints)
 
 
 def test_every_file_is_a_preset_and_explains_itself() -> None:
