@@ -20,7 +20,8 @@ from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 from deep_nrsfm_ros.lifting.observation import Observation
-from deep_nrsfm_ros.lifting.tracking import MAX_TRACK_AGE, Tracker, keypoint_tolerances
+from deep_nrsfm_ros.lifting.track_matching import keypoint_tolerances
+from deep_nrsfm_ros.lifting.tracking import MAX_TRACK_AGE, Tracker
 
 Floats = NDArray[Any]
 Identify = Callable[[Observation, float], tuple[str, ...]]

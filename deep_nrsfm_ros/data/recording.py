@@ -21,7 +21,7 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
-from deep_nrsfm_ros.lifting.tracking import keypoint_tolerances
+from deep_nrsfm_ros.lifting.track_matching import keypoint_tolerances
 from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, weak_perspective
 
 _CAUSAL = OverTime()

@@ -122,6 +122,74 @@ def decode_keypoints(
         ValueError: A number is out of range, or the arrays do not fit the data.
     """
 
+def match_tracks(
+    constants: Any,
+    points: Any,
+    confidence: Any,
+    passed: Any,
+    track_points: Any,
+    age: Any,
+    velocity: Any,
+    size: Any,
+    sigma: Any,
+    score: Any,
+    shift: Any,
+    best: Any,
+    /,
+) -> None:
+    """Compare n detections with m tracks of `lifting.track_matching`; fill the outputs.
+
+    Args:
+        constants: float32, in the order of `track_matching`.
+        points: (n, q, 2) float32, pixels.
+        confidence: (n, q) float32, 0 = missing.
+        passed: (m,) float32, seconds since the last detection of the tracks.
+        track_points: (m, q, 2) float32, pixels.
+        age: (m, q) float32, seconds.
+        velocity: (m, 2) float32, pixels per second.
+        size: (m,) float32, pixels.
+        sigma: (q,) float32, sizes of the object.
+        score: output (n, m) float32.
+        shift: output (n, m, 2) float32, pixels.
+        best: output (n,) int32, track of the highest score above 0; -1: none.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: The arrays do not fit each other.
+    """
+
+def update_tracks(
+    constants: Any,
+    points: Any,
+    confidence: Any,
+    passed: Any,
+    track_points: Any,
+    age: Any,
+    velocity: Any,
+    size: Any,
+    assigned: Any,
+    shift: Any,
+    /,
+) -> None:
+    """Update the arrays of m tracks by the detections that are assigned to them.
+
+    Args:
+        constants: as in `match_tracks`.
+        points: as in `match_tracks`.
+        confidence: as in `match_tracks`.
+        passed: as in `match_tracks`.
+        track_points: changed.
+        age: changed.
+        velocity: changed.
+        size: changed.
+        assigned: (n,) int32, track of each detection; below 0: none.
+        shift: (n, m, 2) float32, as `match_tracks` filled it.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: The arrays do not fit each other.
+    """
+
 def choose_vectors(bytes: int, /) -> int:
     """Set how many bytes a vector of the processor has: 16, 32 or 64; return what it supports.
 

@@ -1,4 +1,4 @@
-/* The module `_kernel`: its entry points of lifting and decoding, which hand Python's arrays to C.
+/* The module `_kernel`: its entry points of lifting, decoding and tracking, which hand Python's arrays to C.
 
    No argument is trusted: types, lengths, sizes and indices are checked here and in plan_layout.c, and whatever
    is wrong raises TypeError, ValueError or RuntimeError. Functions of the other files assume what is checked. */
@@ -10,6 +10,7 @@
 
 #include "point_cloud.h"
 #include "plan.h"
+#include "tracking.h"
 #include "training_module.h"
 
 static const char PLAN[] = "deep_nrsfm_ros.kernel._kernel.plan";
@@ -192,6 +193,75 @@ static PyObject *decode_keypoints_entry(PyObject *Py_UNUSED(module), PyObject *a
     Py_RETURN_NONE;
 }
 
+/* Return whether the arrays have the lengths of n detections and m tracks; `arrays` are the constants, points and
+   confidence (n), passed, points, age, velocity and size (m). q is the number of keypoints. */
+static int tracks_match(const Py_buffer *arrays, Py_ssize_t q, Py_ssize_t *n, Py_ssize_t *m) {
+    if (q < 1 || q > MAX_KEYPOINTS) return 0;
+    *n = count_items(arrays + 2) / q, *m = count_items(arrays + 3);
+    const Py_ssize_t of_detection[2] = {2 * q, q}, of_track[5] = {1, 2 * q, q, 2, 1};
+    return count_items(arrays) == TRACKING_CONSTANTS && lengths_match(2, arrays + 1, of_detection, *n) &&
+           lengths_match(5, arrays + 3, of_track, *m);
+}
+
+static const ArrayArgument TRACK_ARGUMENTS[8] = {{"constants", FLOAT32, 0}, {"points", FLOAT32, 0},  {"confidence", FLOAT32, 0},
+                                                 {"passed", FLOAT32, 0},    {"points", FLOAT32, 1},  {"age", FLOAT32, 1},
+                                                 {"velocity", FLOAT32, 1},  {"size", FLOAT32, 1}};
+
+/* match_tracks(constants, points, confidence, passed, track_points, age, velocity, size, sigma, score, shift, best): fill
+   the last three, (n, m), (n, m, 2) and (n,) of int32. */
+static PyObject *match_tracks_entry(PyObject *Py_UNUSED(module), PyObject *args) {
+    static const ArrayArgument expected[4] = {{"sigma", FLOAT32, 0}, {"score", FLOAT32, 1}, {"shift", FLOAT32, 1}, {"best", INT32, 1}};
+    PyObject *o[12];
+    Py_buffer arrays[12];
+    Py_ssize_t n, m, q, pairs;
+    if (!parse_arguments(args, "OOOOOOOOOOOO:match_tracks", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &o[6], &o[7], &o[8],
+                         &o[9], &o[10], &o[11]))
+        return NULL;
+    if (!get_arrays(8, TRACK_ARGUMENTS, o, arrays)) return NULL;
+    if (!get_arrays(4, expected, o + 8, arrays + 8)) return release_arrays(8, arrays), NULL;
+    q = count_items(arrays + 8);
+    const Py_ssize_t sizes[2] = {1, 2};
+    int sound = tracks_match(arrays, q, &n, &m) && !__builtin_mul_overflow(n, m, &pairs) &&
+                lengths_match(2, arrays + 9, sizes, pairs) && count_items(arrays + 11) == n;
+    if (sound) {
+        Detections detections = {n, q, arrays[1].buf, arrays[2].buf};
+        TrackArrays tracks = {m, arrays[4].buf, arrays[5].buf, arrays[6].buf, arrays[7].buf, arrays[3].buf};
+        match_tracks(arrays[0].buf, arrays[8].buf, &detections, &tracks, arrays[9].buf, arrays[10].buf, arrays[11].buf);
+    }
+    release_arrays(12, arrays);
+    if (!sound) return PyErr_Format(PyExc_ValueError, "the arrays do not fit each other");
+    Py_RETURN_NONE;
+}
+
+/* update_tracks(constants, points, confidence, passed, track_points, age, velocity, size, assigned, shift): change the
+   arrays of the tracks; assigned (n,) int32, below 0: none. */
+static PyObject *update_tracks_entry(PyObject *Py_UNUSED(module), PyObject *args) {
+    static const ArrayArgument expected[2] = {{"assigned", INT32, 0}, {"shift", FLOAT32, 0}};
+    PyObject *o[10];
+    Py_buffer arrays[10];
+    Py_ssize_t n, m, q, pairs;
+    if (!parse_arguments(args, "OOOOOOOOOO:update_tracks", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &o[6], &o[7], &o[8],
+                         &o[9]))
+        return NULL;
+    if (!get_arrays(8, TRACK_ARGUMENTS, o, arrays)) return NULL;
+    if (!get_arrays(2, expected, o + 8, arrays + 8)) return release_arrays(8, arrays), NULL;
+    m = count_items(arrays + 3), n = count_items(arrays + 8), q = m ? count_items(arrays + 5) / m : 1;
+    const Py_ssize_t sizes[1] = {2};
+    Py_ssize_t detections_too;
+    int sound = m > 0 && tracks_match(arrays, q, &detections_too, &m) && detections_too == n &&
+                !__builtin_mul_overflow(n, m, &pairs) && lengths_match(1, arrays + 9, sizes, pairs);
+    const int *assigned = arrays[8].buf;
+    for (Py_ssize_t i = 0; sound && i < n; i++) sound = assigned[i] < m;
+    if (sound) {
+        Detections detections = {n, q, arrays[1].buf, arrays[2].buf};
+        TrackArrays tracks = {m, arrays[4].buf, arrays[5].buf, arrays[6].buf, arrays[7].buf, arrays[3].buf};
+        update_tracks(arrays[0].buf, &detections, assigned, arrays[9].buf, &tracks);
+    }
+    release_arrays(10, arrays);
+    if (!sound) return PyErr_Format(PyExc_ValueError, "the arrays do not fit each other");
+    Py_RETURN_NONE;
+}
+
 /* choose_vectors(bytes) -> bytes: for tests, which try them all. */
 static PyObject *choose(PyObject *Py_UNUSED(module), PyObject *bytes) {
     long requested = PyLong_AsLong(bytes);
@@ -213,6 +283,8 @@ static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
                                 {"lift", lift_entry, METH_VARARGS, NULL},
                                 TRAINING_METHODS,
                                 {"decode_keypoints", decode_keypoints_entry, METH_VARARGS, NULL},
+                                {"match_tracks", match_tracks_entry, METH_VARARGS, NULL},
+                                {"update_tracks", update_tracks_entry, METH_VARARGS, NULL},
                                 {"choose_vectors", choose, METH_O, NULL},
                                 {NULL, NULL, 0, NULL}};
 static PyModuleDef_Slot slots[] = {{Py_mod_exec, (void *)module_exec}, {0, NULL}};

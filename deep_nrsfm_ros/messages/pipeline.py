@@ -15,7 +15,7 @@ from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
-from deep_nrsfm_ros.lifting.tracking import keypoint_tolerances
+from deep_nrsfm_ros.lifting.track_matching import keypoint_tolerances
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.serialised import Header, MessageReader

@@ -140,6 +140,28 @@ def decode_keypoints(spoiler: Spoiler) -> Arguments:
     return [data, *steps, 1e9, spoiler.choice((0.0, 0.1)), points, confidence]
 
 
+def match_tracks(spoiler: Spoiler) -> Arguments:
+    """Return arguments of `match_tracks`."""
+    n, m, q = spoiler.choice((0, 1, 5, 40)), spoiler.choice((0, 1, 5)), spoiler.choice((1, 8))
+    tracks = [output(m, q, 2), output(m, q), output(m, 2), output(m)]
+    for part in tracks:
+        part[:] = floats(spoiler, *part.shape)
+    confidence = np.maximum(floats(spoiler, n, q), 0)
+    arrays = [floats(spoiler, 9), floats(spoiler, n, q, 2), confidence, floats(spoiler, m), *tracks]
+    return [*arrays, floats(spoiler, q), output(n, m), output(n, m, 2), output(n, dtype=np.int32)]
+
+
+def update_tracks(spoiler: Spoiler) -> Arguments:
+    """Return arguments of `update_tracks`."""
+    arguments = match_tracks(spoiler)
+    n, m = len(arguments[1]), len(arguments[3])
+    while not m:
+        arguments = match_tracks(spoiler)
+        n, m = len(arguments[1]), len(arguments[3])
+    assigned = np.array([spoiler.randrange(-1, m) for _ in range(n)], np.int32)
+    return [*arguments[:8], assigned, floats(spoiler, n, m, 2)]
+
+
 def worker_pool(spoiler: Spoiler, network: Sizes | None = None) -> Arguments:
     """Return arguments of `worker_pool`."""
     p, widths = network or sizes(spoiler)
@@ -184,6 +206,8 @@ ENTRY_POINTS: dict[str, Callable[[Spoiler], Arguments]] = {
     "plan": plan,
     "lift": lift,
     "decode_keypoints": decode_keypoints,
+    "match_tracks": match_tracks,
+    "update_tracks": update_tracks,
     "choose_vectors": lambda spoiler: [spoiler.choice((16, 32, 64))],
     "worker_pool": worker_pool,
     "activations_per_frame": lambda s: [COMPILED.worker_pool(*worker_pool(s))],

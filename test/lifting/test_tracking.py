@@ -4,13 +4,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.observation import Identities, Observation
-from deep_nrsfm_ros.lifting.tracking import MAX_TRACK_AGE, Tracker, keypoint_tolerances
+from deep_nrsfm_ros.lifting.track_matching import (
+    keypoint_tolerances,
+    match,
+    match_by_numpy,
+    new_tracks,
+    update,
+    update_by_numpy,
+)
+from deep_nrsfm_ros.lifting.tracking import MAX_TRACK_AGE, Tracker
 
 BODY = np.random.default_rng(0).uniform(-50, 50, (8, 2)).astype(np.float32)
 
@@ -221,3 +230,41 @@ def test_a_lone_object_is_followed_as_among_others() -> None:
         second, _ = among(other, frame / 30)
         number = int(second.removeprefix("object"))
         assert int(first.removeprefix("object")) == max(1, number - 1)
+
+
+@pytest.mark.skipif(not kernel.AVAILABLE, reason="no C compiler")
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.sampled_from([1, 2, 40]),
+    m=st.sampled_from([1, 2, 9]),
+    missing=st.sampled_from([0.0, 0.3, 0.8]),
+)
+def test_the_kernel_matches_as_numpy_does(seed: int, n: int, m: int, missing: float) -> None:
+    rng = np.random.default_rng(seed)
+
+    def bodies(count: int) -> tuple[np.ndarray, np.ndarray]:
+        points = 20 * BODY[None] + 50 * rng.standard_normal((count, 1, 2))
+        points += 10 * rng.standard_normal((count, 8, 2))
+        confidence = (rng.random((count, 8)) >= missing).astype(np.float32)
+        confidence[:, 0] = 1
+        return points.astype(np.float32), confidence
+
+    tracks = new_tracks(*bodies(m), 0.0)
+    tracks.velocity[:] = rng.standard_normal(m) + 1j * rng.standard_normal(m)
+    tracks.age[tracks.age == 0] = rng.choice([0, 0.3], (tracks.age == 0).sum())
+    passed = rng.uniform(0, 1, m).astype(np.float32)
+    points, confidence = bodies(n)
+    tolerances = rng.uniform(0.1, 0.3, 8).astype(np.float32)
+    found = match(tracks, passed, points, confidence, tolerances)
+    wanted = match_by_numpy(tracks, passed, points, confidence, tolerances)
+    assume(wanted.score.max() > 0.01)
+    np.testing.assert_allclose(found.score, wanted.score, atol=1e-5)
+    np.testing.assert_allclose(found.shift, wanted.shift, atol=1e-2)  # pixels, of some 1000
+    best = np.where(found.best >= 0, found.score[np.arange(n), found.best], 0)
+    np.testing.assert_allclose(best, wanted.score.max(1), atol=1e-5)
+    assigned = np.full(n, -1, np.int32)
+    assigned[: min(n, m)] = rng.permutation(m)[:n]
+    updated = update(tracks, passed, points, confidence, assigned, wanted.shift)
+    expected = update_by_numpy(tracks, passed, points, confidence, assigned, wanted.shift)
+    for ours, numpy in zip(updated, expected, strict=True):
+        np.testing.assert_allclose(ours, numpy, rtol=1e-5, atol=1e-3)
