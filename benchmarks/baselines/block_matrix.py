@@ -43,12 +43,12 @@ def _block_rotations(W: Floats, K: int) -> Floats:
     U, s, _ = np.linalg.svd(stack(W), full_matrices=False)
     Pi = (U[:, :n] * np.sqrt(s[:n])).reshape(-1, 2, n)
     Pi /= np.sqrt((Pi**2).sum((1, 2)).mean() / 2)
-    G = _refine(Pi, root_of_rank_three(_gram_matrix(Pi)))
+    G = _refine(Pi, root_of_rank_three(gram_matrix(Pi)))
     R: Floats = polar(Pi @ G)
     return R
 
 
-def _gram_matrix(Pi: Floats, *, trace: float = 1e-1, iterations: int = 500) -> Floats:
+def gram_matrix(Pi: Floats, *, trace: float = 1e-1, iterations: int = 500) -> Floats:
     """Return the positive Q (n, n) of low trace that makes Pi Q Pi^T nearly orthogonal.
 
     Q is scaled so that the mean of |Pi G|^2 is one; `trace` is the weight of Q's trace relative

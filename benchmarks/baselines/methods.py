@@ -19,6 +19,8 @@ from benchmarks.baselines.alike import block_matrix_of_neighbours
 from benchmarks.baselines.block_matrix import block_matrix
 from benchmarks.baselines.em_ppca import em_ppca, em_ppca_by_likelihood
 from benchmarks.baselines.rigid import rigid
+from benchmarks.baselines.sparse import sparse
+from benchmarks.baselines.structure_from_category import structure_from_category
 
 __all__ = ["BASELINES", "BATCH", "Baseline", "block_matrix", "em_ppca", "rigid", "shuffled_batches"]
 
@@ -73,6 +75,31 @@ BASELINES: dict[str, Baseline] = {
         _ranks(5, 8, 12),
         "of two runs, with the annealing of the authors' program and without, the more likely one; "
         "and a mirror test of each frame",
+    ),
+}
+
+_SPARSE = tuple(
+    {"K": K, "active": active} for K, active in ((5, 2), (10, 2), (10, 3), (20, 2), (20, 3))
+)
+BASELINES |= {
+    "Sparse (Kong and Lucey), as released": Baseline(
+        lambda W, K, active: sparse(W, K, active, repaired=False),
+        _SPARSE,
+        "absolute eigenvalues, atoms synchronised by two random frames, the first camera",
+    ),
+    "Sparse, repaired": Baseline(
+        sparse,
+        _SPARSE,
+        "positive Gram matrices, atoms synchronised by all frames that they share, cameras from "
+        "all atoms, shapes moved onto the images",
+    ),
+    "SfC (Kong et al.)": Baseline(
+        lambda W, K, sparsity: structure_from_category(
+            W, K, sparsity=sparsity, growth=1.02, starts=2
+        ),
+        tuple({"K": K, "sparsity": w} for K in (1, 3, 5, 7) for w in (0.01, 0.05)),
+        "of 2 starts the lowest objective; the depth signs of the basis shapes, which the method "
+        "leaves open, by the truth, which favours it",
     ),
 }
 
