@@ -43,7 +43,8 @@ def parser() -> argparse.ArgumentParser:
         metavar="INPUT",
         type=Path,
         action="append",
-        help=f"keypoints beside the bags, of any kind that `lift` reads; repeatable: {KINDS}",
+        help="keypoints beside the bags, of any kind that `lift` reads, or a folder of such "
+        f"recordings; repeatable: {KINDS}",
     )
     data.add_argument(
         "--keypoint-layout",
@@ -206,6 +207,8 @@ def write_page(result: TrainingResult, reporter: Reporter) -> str:
         warnings=reporter.warnings,
         detector_layout=result.detector_layout,
         input_type=result.mapping,
+        held_out=result.frames,
+        rival=result.rival,
     )
     folders = model_folders(result.path.parent) if result.state == "finished" else []
     try:

@@ -42,7 +42,15 @@ from deep_nrsfm_ros.messages.decoding import implied_layout
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 from deep_nrsfm_ros.messages.stamps import one_clock
 
-__all__ = ["KINDS", "KeypointFileError", "is_bag", "read_bag", "read_keypoints", "stamp_of"]
+__all__ = [
+    "KINDS",
+    "KeypointFileError",
+    "is_bag",
+    "read_bag",
+    "read_keypoints",
+    "recordings",
+    "stamp_of",
+]
 
 
 class Format(NamedTuple):
@@ -342,6 +350,30 @@ def is_bag(path: Path) -> bool:
     if path.is_dir():
         return any(f.name == "metadata.yaml" or f.suffix in SUFFIXES for f in path.iterdir())
     return path.suffix in SUFFIXES
+
+
+def recordings(path: Path) -> list[Path]:
+    """Return the recordings in a folder of recordings, by name; any other path as it is.
+
+    They are the files of `FORMATS`, the bags, and the folders with a frame in each .json file.
+    Where a folder has .json files and nothing else of these, each of them may be a frame: it is one
+    recording. In a folder in a folder nothing is looked for.
+    """
+    if not path.is_dir() or is_bag(path):
+        return [path]
+    files = [file for file in sorted(path.iterdir(), key=natural) if file.name[:1] != "."]
+    found = [file for file in files if _is_recording(file)]
+    single = [file for file in found if file.suffix.lower() != ".json"]
+    return found if single else [path]
+
+
+def _is_recording(path: Path) -> bool:
+    """Return whether a path in a folder is a bag, a keypoint file or a folder of frames."""
+    if path.is_dir():
+        return is_bag(path) or any(file.suffix.lower() == ".json" for file in path.iterdir())
+    return path.suffix in SUFFIXES or any(
+        path.name.lower().endswith(form.suffixes) for form in FORMATS
+    )
 
 
 def read_bag(

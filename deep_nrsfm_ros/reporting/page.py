@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,12 +15,13 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.curation import Curated, spread_out
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.held_out import Split
 from deep_nrsfm_ros.data.sufficiency import Sufficiency
+from deep_nrsfm_ros.model_files.known_model import knows
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
 from deep_nrsfm_ros.reporting.shapes import (
     LiftedFrames,
-    label_free_errors,
     lift_sample,
     shape_space,
 )
@@ -40,7 +40,13 @@ _CURVES = {
     "cycle_error": "cycle error",
     "coherence": "coherence of the final dictionary",
 }
-_QUALITY = ("combined", "reprojection_error", "cycle_error", "coherence", "mirrored_share")
+_QUALITY = {
+    "reprojection_error": "reprojection",
+    "cycle_error": "cycle",
+    "coherence": "coherence",
+    "mirrored_share": "mirrored",
+}
+_FIGURES = ("residual", "bone_variation", "mirrored_share", "front_disagreement", "opposed")
 _CAMERA_TO_SCREEN = np.array([1, -1, -1])  # x right, y down, z forward to x right, y up, z back
 
 
@@ -60,6 +66,8 @@ class Training:
             keypoints are those of the model.
         input_type: value of `input_type` for its messages, e.g. a field mapping; "" where it need
             not be set.
+        held_out: the frames on which models are compared; None: those of the training.
+        rival: the model at hand, with which they are compared; None: there is none.
     """
 
     model: Model
@@ -71,6 +79,8 @@ class Training:
     warnings: Sequence[str] = ()
     detector_layout: str = ""
     input_type: str = ""
+    held_out: Split | None = None
+    rival: Model | None = None
 
 
 def write_report(training: Training, folders: Sequence[Path]) -> Path:
@@ -78,7 +88,7 @@ def write_report(training: Training, folders: Sequence[Path]) -> Path:
 
     Args:
         training: the content.
-        folders: folders with the models to compare with.
+        folders: folders with the models to compare with; those of other keypoints are left out.
 
     Raises:
         OSError: the file cannot be written.
@@ -124,6 +134,9 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         warnings=[*training.warnings, *training.curated.warnings, *sufficiency.warnings],
         curves=[_curve(training.progress, field, label) for field, label in _CURVES.items()],
         comparison=_comparison(training, folders),
+        compared_frames=len(_split(training).held_out),
+        compared_kind="the training" if training.held_out is None else "this data",
+        quality=[(title, model.quality.get(key)) for key, title in _QUALITY.items()],
         shapes=shapes,
         frames=frames,
         sample=len(lifted.frames),
@@ -151,26 +164,36 @@ def _curve(progress: Sequence[Progress], field: str, label: str) -> Markup:
     return curve(lines, label)
 
 
+def _split(training: Training) -> Split:
+    """Return the frames on which models are compared."""
+    return training.held_out or Split(training.dataset, training.dataset)
+
+
 def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return a row of errors without labels for this model and for each other one."""
-    models = [training.model]
+    """Return a row for this model and each other one of its keypoints, the best first."""
+    from deep_nrsfm_ros.training.judge import standings  # imports torch
+
+    models, rival = [training.model], training.rival
     resolved = {training.path.resolve()}
+    names = {training.model.name} | ({rival.name} if rival else set())
     for file in (f for folder in folders for f in sorted(folder.glob(f"*{MODEL_SUFFIX}"))):
         if file.resolve() not in resolved and len(models) <= _OTHERS:
             resolved.add(file.resolve())
             try:
-                models.append(load_model(file))
+                model = load_model(file)
             except ModelFileError:
                 continue  # a damaged file of another model is no error of this report
-    rows = []
-    for model in models:
-        here = None
-        if model.layout.keypoints == training.dataset.layout.keypoints:
-            with suppress(ValueError):  # it lifts none of these frames
-                here = label_free_errors(model, training.dataset)
-        quality = [model.quality.get(key) for key in _QUALITY]
-        rows.append({"model": model, "quality": quality, "here": here})
-    return rows
+            if model.name not in names and knows(model.layout, training.dataset.layout):
+                models.append(model)
+    return [
+        {
+            "name": standing.model.name,
+            "is_this": standing.model is training.model,
+            "verdict": standing.verdict,
+            "figures": [getattr(standing.figures, name) for name in _FIGURES],
+        }
+        for standing in standings(_split(training), models, rival)
+    ]
 
 
 def _shapes(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,8 @@ from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import (
     align,
     centre,
-    centre_visible,
-    random_cameras,
-    rotation_from_camera,
 )
 from deep_nrsfm_ros.nrsfm.handedness import disagreement
-from deep_nrsfm_ros.nrsfm.network import forward
-from deep_nrsfm_ros.nrsfm.normalisation import normalise
 
 Floats = NDArray[np.float64]
 
@@ -53,21 +48,6 @@ class LiftedFrames(NamedTuple):
 
     frames: NDArray[np.int64]
     lifted: Lifted
-
-
-class LabelFreeErrors(NamedTuple):
-    """Mean errors of a model that need no labels, relative to the size of the object; 0 = perfect.
-
-    Attributes:
-        reprojection: of the network, before correction; 0.05 typical.
-        cycle: difference between a lifted shape and the shape that the network lifts from a random
-            view of it, as training measures it.
-        lifter_cycle: the same by the whole lifter, including the rotation of the camera.
-    """
-
-    reprojection: float
-    cycle: float
-    lifter_cycle: float
 
 
 def lift_sample(model: Model, dataset: Dataset, most: int = _SAMPLE) -> LiftedFrames:
@@ -139,45 +119,3 @@ def _to_screen(model: Model, mean: Floats) -> Floats:
     rotation: Floats = axes[:, [1, 2, 0]]
     rotation[:, 2] *= np.sign(np.linalg.det(rotation))
     return rotation
-
-
-def label_free_errors(model: Model, dataset: Dataset, most: int = 128) -> LabelFreeErrors:
-    """Return the errors of a model on up to `most` frames of its own layout.
-
-    Raises:
-        ValueError: the model lifts none of them.
-    """
-    frames, lifted = lift_sample(model, dataset, most)
-    T = centre(lifted.shapes) @ _fixed_rotations(len(frames))
-    views, confidence = T[..., :2].astype(np.float32), np.ones(T.shape[:2], np.float32)
-    again = lift_all(Lifter(model).lift, views, confidence)
-    sound = np.isfinite(again.scale)
-    lifted_again = again.shapes[sound] * again.scale[sound, None, None]
-    return LabelFreeErrors(
-        float(lifted.residual.mean()),
-        cycle_error(model, dataset[frames]),
-        _difference(lifted_again, T[sound]),
-    )
-
-
-def cycle_error(model: Model, dataset: Dataset) -> float:
-    """Return the mean of ||S' - S|| / ||S||, S' being the network's shape of a random view of S."""
-    mask = dataset.visible[..., None].astype(np.float32)
-    W, gain, _, _ = normalise(model.network, model.normaliser, dataset.points, mask)
-    S, M = forward(model.network, W * gain)
-    S = centre(S + centre_visible(W - S @ M, mask) @ M.swapaxes(1, 2))
-    again = model.normaliser.encode(S @ _fixed_rotations(len(S))[..., :2], np.ones_like(mask))
-    S_again, _ = forward(model.network, again.W)
-    return _difference(centre(S_again), S / again.unit)
-
-
-def _fixed_rotations(n: int) -> NDArray[np.float32]:
-    """Return n random rotations (n, 3, 3), the same in each call."""
-    M = random_cameras(n, np.random.default_rng(0))
-    return rotation_from_camera(M).swapaxes(1, 2)
-
-
-def _difference(S: NDArray[Any], T: NDArray[Any]) -> float:
-    """Return the mean of ||S - T|| / ||T|| over frames (f, p, 3)."""
-    size = np.maximum(np.linalg.norm(T, axis=(1, 2)), 1e-12)
-    return float((np.linalg.norm(S - T, axis=(1, 2)) / size).mean()) if len(T) else float("nan")

@@ -12,7 +12,7 @@ from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.bags import TooManyFramesError, keypoint_count, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
-from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints
+from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints, recordings
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
@@ -103,8 +103,14 @@ def _numbered(data: DataConfig, options: ReadOptions) -> KeypointLayout:
     """Return the layout of points without names, as many as the objects in the data have."""
     if data.bags:
         return KeypointLayout.numbered(keypoint_count(data.bags, options))
-    first = read_keypoints(data.inputs[0].expanduser(), _options_for(data.inputs[0], options))
-    return KeypointLayout.numbered(first.confidence.shape[1])
+    first = _paths(data)[0]
+    detections = read_keypoints(first, _options_for(first, options))
+    return KeypointLayout.numbered(detections.confidence.shape[1])
+
+
+def _paths(data: DataConfig) -> list[Path]:
+    """Return the files of keypoints, also those in folders of recordings."""
+    return [path for named in data.inputs for path in recordings(named.expanduser())]
 
 
 def _read_bags(
@@ -134,11 +140,12 @@ def _read_inputs(
     cannot be read is left out with a warning, unless no data is left. Where there are several
     sources, the names that a file has for its keypoints go before the layout of the configuration.
     """
-    is_only_source = len(data.inputs) == 1 and not data.bags
+    paths = _paths(data)
+    is_only_source = len(paths) == 1 and not data.bags
     named = keypoint_map.source if data.keypoint_layout and is_only_source else None
     options = dataclasses.replace(options, layout=named, fallback=keypoint_map.source)
     parts, failures = [], []
-    for path in map(Path.expanduser, data.inputs):
+    for path in paths:
         try:
             detections = read_keypoints(path, _options_for(path, options), reporter.reading)
             layout = detections.layout or keypoint_map.source

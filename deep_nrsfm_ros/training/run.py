@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from safetensors import SafetensorError
 
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.held_out import split
+from deep_nrsfm_ros.data.held_out import Split, split
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
@@ -43,6 +43,8 @@ class TrainingResult(NamedTuple):
         detector_layout: layout of the keypoints in the data, where it is not that of the model.
         mapping: field mapping of the messages in the data; "" for none.
         judgement: whether the model should replace the one at hand; None: it was cut off.
+        frames: those of the training and those held out; None: nothing is held out.
+        rival: the model at hand; None: there is none.
     """
 
     model: Model
@@ -53,6 +55,8 @@ class TrainingResult(NamedTuple):
     detector_layout: str = ""
     mapping: str = ""
     judgement: Judgement | None = None
+    frames: Split | None = None
+    rival: Model | None = None
 
 
 def run(
@@ -131,8 +135,14 @@ def _train_and_save(
     ending = _ending(trainer, path, model, checkpoint)
     named = find_layouts(config, COMMAND_LINE)[0].name
     detector_layout = config.data.keypoint_layout if named != dataset.layout.name else ""
-    mapping = config.data.mapping
-    return TrainingResult(model, path, prepared, *ending, detector_layout, mapping, judgement)
+    return TrainingResult(
+        *(model, path, prepared, *ending),
+        detector_layout,
+        config.data.mapping,
+        judgement,
+        None if frames.held_out is frames.training else frames,
+        rival,
+    )
 
 
 def _describe(prepared: Prepared, reporter: Reporter, start: Model | None) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
-from deep_nrsfm_ros.data.keypoint_files import is_bag
+from deep_nrsfm_ros.data.keypoint_files import is_bag, recordings
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -129,9 +129,10 @@ def _check_data(config: TrainingConfig, names: OptionNames) -> None:
         for path in getattr(data, field):
             if not path.expanduser().exists():
                 raise ValueError(f"{names(field)} names {path}, which does not exist")
-    if data.category and not any(not is_bag(p.expanduser()) for p in data.inputs):
+    files = [path for named in data.inputs for path in recordings(named.expanduser())]
+    if data.category and not any(not is_bag(path) for path in files):
         raise ValueError(f"{names('category')} has no effect on bags: leave it out")
-    if data.topic and not (data.bags or data.cmu or any(map(is_bag, data.inputs))):
+    if data.topic and not (data.bags or data.cmu or any(map(is_bag, files))):
         raise ValueError(f"{names('topic')} is {data.topic!r}, but there is no bag; leave it out")
 
 

@@ -15,7 +15,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import initialise
 from deep_nrsfm_ros.training.finish import finish
-from deep_nrsfm_ros.training.judge import Figures, Judge, judge, worse_figures
+from deep_nrsfm_ros.training.judge import Figures, Judge, judge, standings, worse_figures
 from deep_nrsfm_ros.training.trainer import Trainer
 
 GOOD = Figures(
@@ -58,7 +58,10 @@ def test_a_bad_model_is_doubted_and_told_what_would_help(
 ) -> None:
     judgement = judge(frames, bad, good)
     assert "compared with model 'good' on 60 held-out frames" in judgement.doubt
-    assert "its keypoints are off by" in judgement.doubt and "(the other's: " in judgement.doubt
+    assert (
+        "are mirrored against their neighbours" in judgement.doubt
+        and "(the other's: " in judgement.doubt
+    )
     assert "would help" in judgement.doubt and "--from" in judgement.doubt
     assert str(judgement).startswith("the new model is doubtful: ")
     record = judgement.record()
@@ -124,12 +127,16 @@ def test_a_rival_of_another_object_is_none(frames: Split, good: Model) -> None:
     ("change", "worse"),
     [
         ({}, []),
-        ({"residual": 0.051}, ["residual"]),
-        ({"bone_variation": 0.079}, []),
-        ({"bone_variation": 0.081}, ["bone_variation"]),
+        ({"residual": 0.051}, ["misfit"]),
+        ({"residual": 0.04, "bone_variation": 0.049}, []),
+        ({"residual": 0.04, "bone_variation": 0.051}, ["misfit"]),
+        ({"residual": 0.0, "bone_variation": 0.11}, ["bone_variation", "misfit"]),
         ({"mirrored_share": 0.01}, ["mirrored_share"]),
         ({"mirrored_share": math.nan, "front_disagreement": math.nan}, []),
-        ({"front_disagreement": 0.2, "opposed": 0.3}, ["front_disagreement", "opposed"]),
+        ({"bone_variation": math.nan}, []),
+        ({"front_disagreement": 0.2, "opposed": 0.3}, ["front_disagreement"]),
+        ({"residual": 0.01, "opposed": 0.06}, ["opposed"]),
+        ({"residual": 0.09, "opposed": 0.3, "bone_variation": 0.01}, []),  # the other is folded
         ({"side_difference": 9.0, "flatness": 0.0, "difference": 9.0}, []),
     ],
 )
@@ -143,3 +150,18 @@ def test_the_mirror_image_of_a_mirrored_model_is_no_fault() -> None:
     assert worse_figures(GOOD._replace(opposed=0.95), GOOD) == ["opposed"]
     assert worse_figures(GOOD._replace(mirrored_share=0.2), None) == ["mirrored_share"]
     assert worse_figures(GOOD._replace(mirrored_share=0.04), None) == []
+
+
+def test_standings_have_the_best_first_and_doubtful_ones_last(
+    frames: Split, good: Model, bad: Model
+) -> None:
+    names = tuple(f"other_{i}" for i in range(len(good.layout)))
+    stranger = dataclasses.replace(good, layout=KeypointLayout("other", names))
+    found = standings(frames, [bad, stranger], good)
+    assert [(each.model.name, each.verdict) for each in found] == [
+        ("good", "at hand"),
+        ("bad", "doubtful"),
+    ]
+    alone = standings(frames, [bad, good], None)
+    assert [each.model.name for each in alone] == ["good", "bad"]
+    assert found[0].figures.score < found[1].figures.score

@@ -96,6 +96,19 @@ def test_files_are_trained_on_as_bags_are(tmp_path: Path) -> None:
         assert read(*named, "--object", "numbered").layout.keypoints[16] == "point_16"
 
 
+def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
+    write_files(tmp_path)
+    (tmp_path / "notes.txt").write_text("no recording")
+    (tmp_path / "pictures").mkdir()
+    everything = read("--input", str(tmp_path), "--object", "human17")
+    points = pixels(6)
+    expected = [points, points, points[[1, 3, 5, 0, 2, 4]], points]
+    np.testing.assert_allclose(everything.points, np.concatenate(expected), rtol=1e-6)
+    assert everything.source == "file a.npz; file bag; file coco.json; file openpose"
+    with pytest.raises(ValueError, match="neither a bag nor .json files"):
+        read("--input", str(tmp_path / "pictures"))
+
+
 def test_one_bad_file_is_left_out_and_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
