@@ -250,7 +250,7 @@ def measure(name: str, data: Path, output: Path) -> Result:
         models[str(run)] = trained(scene, run, output / f"{name}_{run}{MODEL_SUFFIX}")
     errors = np.array([truth(model, scene) for model in models.values()])
     figures = [[court.figures(new, old) for old in models.values()] for new in models.values()]
-    return Result(list(models), *errors.T, figures)
+    return Result(list(models), errors[:, 0], errors[:, 1], figures)
 
 
 def rows(name: str, result: Result) -> list[str]:
@@ -320,7 +320,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         summaries = [summarise(result) for result in results.values()]
         for row in summaries[0]:
             each = [summary[row] for summary in summaries]
-            cells = ("" if math.isnan(v) else f"{v:.3g}" for v in (*each, np.nanmean(each)))
+            values: list[float] = [*each, float(np.nanmean(each))]
+            cells = ("" if math.isnan(value) else f"{value:.3g}" for value in values)
             print(f"| {row} | {' | '.join(cells)} |")
 
 
