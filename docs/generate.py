@@ -14,6 +14,7 @@ from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
+from deep_nrsfm_ros.node.bodies import BodyOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
 from deep_nrsfm_ros.node.gravity import GravitySources
 from deep_nrsfm_ros.node.parameter_bridge import parameter_name
@@ -32,6 +33,7 @@ _GROUPS: tuple[tuple[str, type, str], ...] = (
     ("Gravity", GravityOptions, "gravity."),
     ("Gravity: sources", GravitySources, "gravity."),
     ("Smoothing", SmoothingOptions, "smoothing."),
+    ("Joints", BodyOptions, "body."),
     ("Training: data and result", TrainingOptions, "train."),
     ("Training: recipe", Recipe, "train."),
     ("Training: losses of the layout", LayoutLossWeights, "train."),

@@ -379,6 +379,24 @@ def _cross(a: Floats, b: Floats) -> Floats:
     return product
 
 
+def quaternions(R: Floats) -> Floats:
+    """Return the unit quaternions (..., 4), x y z w, w >= 0, of rotations (..., 3, 3)."""
+    a, b, c, d, e, f, g, h, i = np.moveaxis(R.reshape(*R.shape[:-2], 9), -1, 0)
+    trace = a + e + i
+    columns = (
+        *(h - f, c - g, d - b, 1 + trace),
+        *(1 + 2 * a - trace, b + d, g + c, h - f),
+        *(b + d, 1 + 2 * e - trace, f + h, c - g),
+        *(g + c, f + h, 1 + 2 * i - trace, d - b),
+    )
+    candidates = np.stack(columns, -1).reshape(*trace.shape, 4, 4)
+    # The largest component is computed first: the others would lose digits near 0.
+    best = np.stack((trace, a, e, i), -1).argmax(-1)[..., None, None]
+    q = np.take_along_axis(candidates, best, -2)[..., 0, :]
+    size = np.sqrt(_dot(q, q))
+    return np.asarray(q / np.where(q[..., 3] < 0, -size, size)[..., None])
+
+
 def _free(group: _Group, parents: Floats, v: Floats, w: Floats) -> tuple[Floats, Floats]:
     """Return frames (n, k, 3, 3) that follow measured directions, and their angles (n, k, m).
 

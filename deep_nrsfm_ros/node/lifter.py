@@ -9,6 +9,8 @@ For every message on `keypoints` the node publishes, with the header of that mes
   first object is not lifted. The axes are x front, y left, z up if the layout has a handedness.
 - ~/objects: identity of the object in each row, and its transform; only with a subscriber.
 - ~/markers: shapes for RViz; only with a subscriber.
+- ~/skeleton: names of keypoints and joints, latched; ~/joints, ~/joint_states, ~/tracks: frames,
+  angles and states of tracking; only with a subscriber. See `node/bodies.py` for more of them.
 - /tf: a frame for each object; only with the parameter tf_prefix.
 
 The node does not import torch: lifting needs NumPy only, and training is a process of its own.
@@ -53,6 +55,7 @@ from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameter_bridge, publishing
+from deep_nrsfm_ros.node.bodies import BodyOptions, BodyPublishers, Scene
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
@@ -74,6 +77,7 @@ from deep_nrsfm_ros.training.request import (
 _SMOOTHING = "smoothing."
 _HISTORY = "history."
 _GRAVITY = "gravity."
+_BODY = "body."
 _TRAIN = "train."
 _REPORT_PERIOD = 1.0  # seconds
 _FRAME_LOG_PERIOD = 60.0  # seconds
@@ -102,6 +106,7 @@ class LifterNode(Node):
         parameter_bridge.declare(self, SmoothingOptions, _SMOOTHING)
         self._up = parameter_bridge.declare(self, GravityOptions, _GRAVITY).direction
         sources = parameter_bridge.declare(self, GravitySources, _GRAVITY)
+        body = parameter_bridge.declare(self, BodyOptions, _BODY)
         training = parameter_bridge.declare(self, TrainingOptions, _TRAIN)
         parameter_bridge.declare(self, Recipe, _TRAIN)
         parameter_bridge.declare(self, LayoutLossWeights, _TRAIN)
@@ -130,6 +135,8 @@ class LifterNode(Node):
         self._rotation = self._quiet_publisher(QuaternionStamped, "~/camera_rotation")
         self._objects = self._quiet_publisher(MultiDOFJointState, "~/objects")
         self._markers = self._quiet_publisher(MarkerArray, "~/markers")
+        self._bodies = BodyPublishers(self, body, camera.tf_prefix)
+        self._bodies.describe(self._pipeline.model.layout)
         self._diagnostics_publisher = self._quiet_publisher(DiagnosticArray, "/diagnostics")
         self._training = TrainingService(
             *(self, self._training_request, self._activate, self._sandbox.models_dir)
@@ -184,7 +191,8 @@ class LifterNode(Node):
             header, observation = self._pipeline.read(raw, source.reader, self._camera.size)
             moment = self._moment(source, header.stamp if header else 0)
             has_subscriber = self._objects.get_subscription_count()
-            if has_subscriber or self._tf or self._pipeline.needs_identities:
+            needed = has_subscriber or self._tf or self._bodies.wanted
+            if needed or self._pipeline.needs_identities:
                 identities = source.tracker(
                     observation, moment.seconds, moment.period, self._pipeline.tolerances
                 )
@@ -195,6 +203,7 @@ class LifterNode(Node):
                 header = header._replace(frame_id=self._frame(source, header.frame_id))
             self._last_frame = header.frame_id
             up = self._gravity(self._up, header.frame_id)
+            detected = len(identities)
             lifted, identities = self._pipeline.lift(
                 observation, intrinsics, identities, source.topic, moment, up
             )
@@ -204,6 +213,7 @@ class LifterNode(Node):
             return
         if not identities:
             self._lifter_diagnostics.empty()
+            self._publish_bodies(source, Scene(header, lifted, (), 0, moment))
             return
         self._stream.lifted(lifted)
         positioned = self._camera.enabled
@@ -223,9 +233,22 @@ class LifterNode(Node):
                     positioned=positioned,
                 )
             )
+        self._publish_bodies(source, Scene(header, lifted, identities, detected, moment))
         self._lifter_diagnostics.lifted(
             time.perf_counter() - started, lifted.residual, lifted.confidence
         )
+
+    def _publish_bodies(self, source: KeypointTopic, scene: Scene) -> None:
+        """Publish what is asked of the joints; a failure must not end the node."""
+        if not self._bodies.has_subscriber():
+            return
+        try:
+            self._bodies.publish(source.topic, scene, positioned=self._camera.enabled)
+        except Exception as problem:
+            self.get_logger().warning(
+                f"joints of {source.topic} not published: {_error_text(problem)}",
+                throttle_duration_sec=LOG_PERIOD,
+            )
 
     def _search_layout(self) -> None:
         """Choose the layout of the keypoints from the first messages; see `StreamCheck.search`."""
@@ -440,6 +463,7 @@ class LifterNode(Node):
         if self._proposed.model is not self._pipeline.model:
             self.get_logger().info(f"lifting with model {self._proposed.model.name!r}")
         search = parameter_bridge.read(self, InputOptions).keypoint_layout == AUTO
+        self._bodies.describe(self._proposed.model.layout)
         if self._proposed.model is not self._pipeline.model or search != self._auto:
             self._auto, self._chosen = search, None
             self._stream.restart(search=search)

@@ -1,8 +1,9 @@
 """Declare the options of a dataclass as ROS parameters, and read them back.
 
 A parameter's default, range and description stand in the dataclass: `lifting/options.py`,
-`lifting/smoothing.py`, `messages/options.py`, `node/camera.py`, and for train.*
-`training/request.py`, `training/limits.py`, `nrsfm/recipe.py` and `data/curation.py`.
+`lifting/smoothing.py`, `messages/options.py`, `node/camera.py`, `node/gravity.py`,
+`node/bodies.py`, and for train.* `training/request.py`, `training/limits.py`,
+`nrsfm/recipe.py` and `data/curation.py`.
 """
 
 from __future__ import annotations

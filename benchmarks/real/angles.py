@@ -1,0 +1,212 @@
+"""Joint angles of lifted people against those of the truth by the same formulas, and their closure.
+
+The angles of both follow from the 12 limb joints, so that the table shows what lifting costs.
+Closure: forward kinematics of the angles with a person's mean bone lengths, against the points.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.data.people_scenes import CMU, HELD_OUT, HUMANEVA, people_scenes
+from benchmarks.real.people import SYSTEMS, lift_track
+from benchmarks.table import Table, bars
+from deep_nrsfm_ros.body.kinematic_tree import KinematicTree
+from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
+from deep_nrsfm_ros.data.pose2sim import JOINTS
+from deep_nrsfm_ros.layouts.joints import fitting_joints
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.model_files.model_file import load_model
+from deep_nrsfm_ros.nrsfm.metrics import rotation_angles
+
+Floats = NDArray[Any]
+
+LIMBS = KeypointLayout("limbs12", JOINTS, joints=fitting_joints(HUMAN17.joints, JOINTS))
+SYSTEM = "in time"
+SCENES = (CMU, HUMANEVA)
+SUBJECTS = ("01", "05", "14", "86", "127", *HELD_OUT)
+"""Of CMU, whose poses are closed."""
+HEIGHT = 3.5
+"""A person's height in lengths of the trunk, from mid-hip to neck: 1.75 m with 0.5 m."""
+_LEVELLED = 5.0
+"""Degrees: a hanging arm within this angle has no y_shoulder and r_shoulder of its own."""
+FIGURES = {
+    "median deg": "of the absolute error",
+    "mean deg": "of the absolute error",
+    "p90 deg": "90th percentile of the absolute error",
+    "fixed deg": "median absolute error of a constant, the median of the truth",
+    "frame deg": "median angle between lifted and true frame of the joint, relative to its parent",
+}
+CLOSURE = {
+    "RMS %": "distance of forward kinematics from the points, RMS, of the height (3.5 trunks)",
+    "p99 %": "99th percentile of that distance",
+    "REP-155 alone %": "the RMS without r_waist and y_waist, which REP-155 does not have",
+}
+
+
+def scene_angles(
+    lifter: Lifter, data: Path, output: Path, stride: int, chosen: Sequence[str]
+) -> Table:
+    """Return the table of angle errors.
+
+    Args:
+        lifter: a model with its options.
+        data: folder that holds cmu/ and scenes/.
+        output: folder of results.
+        stride: every n-th trial or sequence only.
+        chosen: names of the scenes.
+    """
+    tree = KinematicTree(LIMBS)
+    table = Table(
+        *("angles", "Angles of lifted people against those of the truth", ("scene", "angle")),
+        *(tuple(FIGURES), FIGURES | {"angle": "means of left and right"}),
+        bars("median deg", "fixed deg"),
+    )
+    layout = lifter.model.layout
+    limbs = [layout.index(joint) for joint in JOINTS]
+    for scene, tracks in people_scenes(data, output, stride, chosen):
+        lifted, truth = [], []
+        for track in tracks:
+            S = lift_track(lifter, track, SYSTEMS[SYSTEM], intrinsics=True).shapes[:, limbs]
+            known = np.isfinite(S).all((1, 2)) & np.isfinite(track.truth).all((1, 2))
+            lifted.append(S[known].astype(float))
+            truth.append(track.truth[known])
+        for name, row in angle_errors(tree, np.concatenate(lifted), np.concatenate(truth)):
+            table.add((scene, name), row)
+        print(scene, "done", file=sys.stderr)
+    return table
+
+
+def angle_errors(
+    tree: KinematicTree, lifted: Floats, truth: Floats
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield the name of each angle, of both sides together, and its `FIGURES`.
+
+    Args:
+        tree: of both.
+        lifted: (n, p, 3).
+        truth: (n, p, 3), in another unit or not.
+    """
+    found, true = tree(lifted), tree(truth)
+    error = np.abs(_wrapped(found.angles - true.angles))
+    middle = np.arctan2(np.median(np.sin(true.angles), 0), np.median(np.cos(true.angles), 0))
+    fixed = np.abs(_wrapped(true.angles - middle))
+    locked = _locked(tree, true.angles)
+    columns: dict[str, list[int]] = {}
+    for column, name in enumerate(tree.angle_names):
+        side, _, part = name.partition("_")
+        is_side = side in ("l", "r") and tree.names[tree.angle_joints[column]] != "waist"
+        columns.setdefault(part if is_side else name, []).append(column)
+    relative = [
+        rotations[:, list(tree.parents)].swapaxes(-1, -2) @ rotations
+        for rotations in (found.rotations, true.rotations)
+    ]
+    apart = relative[0].swapaxes(-1, -2) @ relative[1]
+    for name, members in columns.items():
+        use = ~locked[:, members]
+        if name == "waist":  # no keypoint shows it
+            continue
+        values = np.degrees(error[:, members][use])
+        turned = rotation_angles(
+            apart[:, [tree.angle_joints[c] for c in members]].reshape(-1, 3, 3)
+        )
+        yield (
+            name,
+            {
+                "median deg": float(np.median(values)),
+                "mean deg": float(values.mean()),
+                "p90 deg": float(np.percentile(values, 90)),
+                "fixed deg": float(np.median(np.degrees(fixed[:, members][use]))),
+                "frame deg": float(np.median(turned)),
+            },
+        )
+
+
+def _locked(tree: KinematicTree, angles: Floats) -> NDArray[np.bool_]:
+    """Return which angles (n, a) a hanging arm leaves undetermined: the shoulder's y and r."""
+    locked = np.zeros(angles.shape, bool)
+    for side in "lr":
+        raised = angles[:, tree.angle_names.index(f"{side}_p_shoulder")]
+        for angle in "yr":
+            column = tree.angle_names.index(f"{side}_{angle}_shoulder")
+            locked[:, column] = np.abs(raised) < np.radians(_LEVELLED)
+    return locked
+
+
+def _wrapped(angles: Floats) -> Floats:
+    """Return angles in radians, in -pi to pi."""
+    wrapped: Floats = (angles + np.pi) % (2 * np.pi) - np.pi
+    return wrapped
+
+
+def closure_table(data: Path, frames: int) -> Table:
+    """Return the table of closures on the poses of CMU.
+
+    Args:
+        data: folder that holds cmu/.
+        frames: of a subject at most.
+    """
+    tree = KinematicTree(HUMAN17)
+    table = Table(
+        *("closure", "Forward kinematics of a person's angles against the points", ("subject",)),
+        *((*CLOSURE, "poses"), CLOSURE, bars("RMS %", "REP-155 alone %")),
+    )
+    for subject in SUBJECTS:
+        skeleton = read_asf(data / "cmu" / subject / f"{subject}.asf")
+        paths = trials(data / "cmu", subject)
+        poses = np.concatenate([human17(read_amc(path, skeleton)) for path in paths])
+        poses = poses[:: max(len(poses) // frames, 1)].astype(float)
+        table.add((subject,), closure(tree, poses))
+    return table
+
+
+def closure(tree: KinematicTree, points: Floats) -> dict[str, float]:
+    """Return the `CLOSURE` of the poses (n, p, 3) of one person."""
+    pose = tree(points)
+    offsets = tree.offsets(pose).mean(0)
+    height = HEIGHT * float(np.linalg.norm(offsets[tree.names.index("torso")]))
+    ours = [name not in ("r_waist", "y_waist") for name in tree.angle_names]
+    distances = []
+    for angles in (pose.angles, pose.angles * ours):
+        again = tree.forward(pose.origins[:, 0], pose.rotations[:, 0], angles, offsets)
+        distances.append(100 / height * np.linalg.norm(again.origins - pose.origins, axis=-1))
+    rms = [float(np.sqrt(np.square(d).mean())) for d in distances]
+    p99 = float(np.percentile(distances[0], 99))
+    return {"RMS %": rms[0], "p99 %": p99, "REP-155 alone %": rms[1], "poses": len(points)}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("model", nargs="?", default="human", help="name or file of a model")
+    parser.add_argument("--data", type=Path, required=True, help="folder with cmu/ and scenes/")
+    parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
+    parser.add_argument("--stride", type=int, default=1, help="use every n-th trial or sequence")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of scenes")
+    parser.add_argument("--frames", type=int, default=10_000, help="poses of a subject to close")
+    args = parser.parse_args(argv)
+    try:
+        lifter = Lifter(load_model(args.model))
+        tables = [
+            closure_table(args.data, args.frames),
+            scene_angles(lifter, args.data, args.output, args.stride, args.scenes),
+        ]
+    except (ValueError, OSError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        sys.exit(2)
+    for table in tables:
+        print(table.markdown())
+        table.write(args.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,214 @@
+"""Messages about the joints of objects: frames, angles, state of tracking, names."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import (
+    PointStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
+from numpy.typing import NDArray
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState, MultiDOFJointState
+from std_msgs import msg as std_msgs
+
+from deep_nrsfm_ros.body.kinematic_tree import Pose, quaternions
+from deep_nrsfm_ros.body.motion import BRIDGED, LOST, Motion
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.messages.serialised import Header
+from deep_nrsfm_ros.node import publishing
+from deep_nrsfm_ros.node.serialised_template import STAMP, SerialisedTemplate, mark
+
+Floats = NDArray[Any]
+
+_MAX_TEMPLATES = 32  # kept of each kind of message: one per set of names
+_NUMBERS = 7  # of a transform
+_LEVELS = {BRIDGED: DiagnosticStatus.WARN, LOST: DiagnosticStatus.STALE}
+
+
+def skeleton(layout: KeypointLayout) -> std_msgs.String:
+    """Return names of keypoints, edges and joints of a layout as JSON."""
+    description = {
+        "layout": layout.name,
+        "keypoints": list(layout.keypoints),
+        "edges": [list(edge) for edge in layout.edges],
+        "joints": [
+            {
+                "name": j.name,
+                "parent": j.parent,
+                "at": list(j.at),
+                "angles": [a for a, _ in j.angles],
+            }
+            for j in layout.joints
+        ],
+    }
+    return std_msgs.String(data=json.dumps(description))
+
+
+def joint_names(identities: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the name of each joint or angle of each object: IDENTITY/NAME."""
+    return tuple(f"{identity}/{name}" for identity in identities for name in names)
+
+
+def joints(header: Header, names: tuple[str, ...], pose: Pose, velocities: Floats) -> bytes:
+    """Return the serialised MultiDOFJointState of all joints of n objects.
+
+    Args:
+        header: of the message; transforms are to its frame.
+        names: n j names, object by object.
+        pose: of the objects.
+        velocities: (n, j, 3) linear, in the axes of the header's frame.
+    """
+    n, j = pose.origins.shape[:2]
+    template = _joints(header.frame_id, names)
+    numbers = np.concatenate([pose.origins, quaternions(pose.rotations)], -1).reshape(n * j, -1)
+    return template(header, np.concatenate([numbers.ravel(), velocities.ravel()]))
+
+
+@lru_cache(_MAX_TEMPLATES)
+def _joints(frame_id: str, names: tuple[str, ...]) -> SerialisedTemplate:
+    """Return the template of the joints' transforms and velocities."""
+    message = MultiDOFJointState(header=_header(frame_id), joint_names=list(names))
+    count = len(names)
+    message.transforms = [_transform(i) for i in range(count)]
+    start = _NUMBERS * count
+    message.twist = [
+        Twist(linear=Vector3(**{k: mark(start + 3 * i + d) for d, k in enumerate("xyz")}))
+        for i in range(count)
+    ]
+    return SerialisedTemplate(message, start + 3 * count)
+
+
+def angles(header: Header, names: tuple[str, ...], values: Floats) -> bytes:
+    """Return the serialised JointState of angles (n, a) in radians with n a names."""
+    return _angles(header.frame_id, names)(header, values)
+
+
+@lru_cache(_MAX_TEMPLATES)
+def _angles(frame_id: str, names: tuple[str, ...]) -> SerialisedTemplate:
+    """Return the template of angles."""
+    message = JointState(header=_header(frame_id), name=list(names))
+    message.position = [mark(i) for i in range(len(names))]
+    return SerialisedTemplate(message, len(names))
+
+
+class FrameMessages:
+    """Makes the serialised TFMessages of joints, each in the frame of its parent.
+
+    tf2_msgs is not imported here: ROS has it, PyPI has not.
+    """
+
+    def __init__(self, kind: Any, serialise: Callable[[Any], bytes] = serialize_message) -> None:
+        """Prepare messages of a type.
+
+        Args:
+            kind: class TFMessage.
+            serialise: returns the bytes of such a message.
+        """
+        self._kind, self._serialise = kind, serialise
+
+    def __call__(
+        self, header: Header, pose: Pose, parents: tuple[int, ...], names: tuple[str, ...]
+    ) -> bytes:
+        """Return the serialised TFMessage of the j joints of n objects.
+
+        Args:
+            header: of the message; a joint without a parent is given in its frame.
+            pose: of the objects.
+            parents: j indices, -1 for none.
+            names: n j names of frames, object by object.
+        """
+        above = [max(parent, 0) for parent in parents]
+        upper = pose.rotations[:, above].swapaxes(-1, -2)
+        R = upper @ pose.rotations
+        t = (upper @ (pose.origins - pose.origins[:, above])[..., None])[..., 0]
+        R[:, 0], t[:, 0] = pose.rotations[:, 0], pose.origins[:, 0]
+        template = _frames(self._kind, header.frame_id, names, parents, self._serialise)
+        return template(header, np.concatenate([t, quaternions(R)], -1))
+
+
+@lru_cache(_MAX_TEMPLATES)
+def _frames(
+    kind: Any,
+    frame_id: str,
+    names: tuple[str, ...],
+    parents: tuple[int, ...],
+    serialise: Callable[[Any], bytes],
+) -> SerialisedTemplate:
+    """Return the template of a TFMessage."""
+    j = len(parents)
+    transforms = []
+    for i, name in enumerate(names):
+        parent = parents[i % j]
+        above = names[i - i % j + parent] if parent >= 0 else frame_id
+        transforms.append(
+            TransformStamped(header=_header(above), child_frame_id=name, transform=_transform(i))
+        )
+    return SerialisedTemplate(kind(transforms=transforms), _NUMBERS * len(names), serialise)
+
+
+def tracks(
+    header: Header, identities: Sequence[str], motion: Motion, confidence: Floats
+) -> DiagnosticArray:
+    """Return the state of tracking of each identity, and those that are lost.
+
+    Args:
+        header: of the message.
+        identities: n.
+        motion: of them.
+        confidence: (n,) of the objects.
+    """
+    message = DiagnosticArray(header=publishing.to_header(header))
+    for i, (identity, state) in enumerate(zip(identities, motion.states, strict=True)):
+        values = {"age": f"{motion.ages[i]:.3f}", "confidence": f"{confidence[i]:.3f}"}
+        message.status.append(_track(identity, state, values))
+    message.status += [_track(identity, LOST, {}) for identity in motion.lost]
+    return message
+
+
+def _track(identity: str, state: str, values: dict[str, str]) -> DiagnosticStatus:
+    """Return the state of one identity."""
+    return DiagnosticStatus(
+        level=_LEVELS.get(state, DiagnosticStatus.OK),
+        name=identity,
+        message=state,
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )
+
+
+def position(header: Header, point: Floats) -> PointStamped:
+    """Return the PointStamped of a point (3,)."""
+    message = PointStamped(header=publishing.to_header(header))
+    message.point.x, message.point.y, message.point.z = point.tolist()
+    return message
+
+
+def velocity(header: Header, linear: Floats) -> TwistStamped:
+    """Return the TwistStamped of a linear velocity (3,)."""
+    message = TwistStamped(header=publishing.to_header(header))
+    v = message.twist.linear
+    v.x, v.y, v.z = linear.tolist()
+    return message
+
+
+def _header(frame_id: str) -> std_msgs.Header:
+    """Return a template's header."""
+    return std_msgs.Header(stamp=STAMP, frame_id=frame_id)
+
+
+def _transform(index: int) -> Transform:
+    """Return transform `index` of a template."""
+    x, y, z, *q = (mark(_NUMBERS * index + k) for k in range(_NUMBERS))
+    rotation = Quaternion(x=q[0], y=q[1], z=q[2], w=q[3])
+    return Transform(translation=Vector3(x=x, y=y, z=z), rotation=rotation)

@@ -1,0 +1,20 @@
+"""Show the angle of each person's left elbow, live: ros2 run deep_nrsfm_ros lifter, then this."""
+
+import math
+
+import rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+
+def show(message: JointState) -> None:
+    """Print the elbows of all people of a message."""
+    for name, radians in zip(message.name, message.position, strict=True):
+        if name.endswith("/l_elbow"):
+            print(f"{name}: {math.degrees(radians):5.1f} degrees", flush=True)
+
+
+rclpy.init()
+node = Node("elbow_angle")
+node.create_subscription(JointState, "lifter/joint_states", show, 10)
+rclpy.spin(node)
