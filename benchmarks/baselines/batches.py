@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -75,15 +73,10 @@ def solve(session: Session, name: str, dataset: Dataset) -> Solved:
     """Return a baseline's errors on a dataset with ground truth, kept in the output folder."""
     baseline = BASELINES[name]
     key = f"{name} {baseline.settings} {session.batches} {BATCH} {QUERIES} {POOL}"
-    digest = hashlib.sha256(key.encode() + dataset.points.tobytes()).hexdigest()[:10]
-    path = session.output / "baselines" / f"{digest}.json"
-    if not path.exists():
-        began = time.process_time()
-        solved = _solve(name, baseline, dataset, session.batches)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        searched = time.process_time() - began
-        path.write_text(json.dumps([*solved, {"CPU s with search": searched}]))
-    _, errors, *others, _ = json.loads(path.read_text())
+    result = session.kept(
+        key, dataset.points.tobytes(), lambda: _solve(name, baseline, dataset, session.batches)
+    )
+    _, errors, *others = result
     return Solved(name, ShapeErrors(*errors), *others)
 
 

@@ -117,14 +117,14 @@ def _start(Y: Floats, K: int) -> _Model:
 
 def _shapes(model: _Model, posterior: _Posterior) -> Floats:
     """Return the posterior mean (f, p, 3) in object axes."""
-    S: Floats = np.einsum("fk,kdp->fpd", posterior.z, model.basis)
+    S: Floats = np.tensordot(posterior.z, model.basis, 1).swapaxes(1, 2)
     return S
 
 
 def _posterior(Y: Floats, model: _Model) -> _Posterior:
     """Return the distribution of the coefficients, given the images Y (f, 2, p)."""
     f, K = len(Y), len(model.basis) - 1
-    P = np.einsum("fad,kdp->fkap", model.Q[:, :2], model.basis).reshape(f, K + 1, -1)
+    P = (model.Q[:, None, :2] @ model.basis).reshape(f, K + 1, -1)
     modes, left = P[:, 1:], Y.reshape(f, -1) - P[:, 0]
     precision = np.eye(K) + modes @ modes.swapaxes(1, 2) / model.variance
     covariance = np.linalg.inv(precision)
@@ -161,9 +161,10 @@ def _update_rotations(Y: Floats, model: _Model, z: Floats, zz: Floats) -> Floats
     Q <- exp([w]) Q, with E|y - (x + w cross x)|^2 over the first two rows of x = Q s.
     """
     Q, basis = model.Q, model.basis
-    inner = np.einsum("kdp,lep->kdle", basis, basis)
-    second = np.einsum("fkl,kdle->fde", zz, inner)  # E[S S^T]
-    cross_moment = np.einsum("fap,fk,kdp->fad", Y, z, basis) @ Q.swapaxes(1, 2)  # E[y x^T]
+    inner = basis[:, None] @ basis.swapaxes(1, 2)  # (1 + K, 1 + K, 3, 3)
+    second = np.tensordot(zz, inner, 2)  # E[S S^T]
+    shapes = np.tensordot(z, basis, 1)
+    cross_moment = Y @ shapes.swapaxes(1, 2) @ Q.swapaxes(1, 2)  # E[y x^T]
     B = Q @ second @ Q.swapaxes(1, 2)  # E[x x^T]
     E = cross_moment - B[:, :2]  # E[(y - x) x^T]
     # The first row moves by w_y x_z - w_z x_y, the second by w_z x_x - w_x x_z.
@@ -192,8 +193,10 @@ def _rotation(w: Floats) -> Floats:
 def _fit_basis(Y: Floats, R: Floats, z: Floats, zz: Floats) -> tuple[Floats, float]:
     """Return mean and modes (1 + K, 3, p) and the noise variance of highest likelihood."""
     k, p = z.shape[1], Y.shape[2]
-    normal = np.einsum("fkl,fad,fae->kdle", zz, R, R, optimize=True).reshape(3 * k, -1)
-    right = np.einsum("fk,fad,fap->kdp", z, R, Y, optimize=True).reshape(3 * k, p)
+    f, Rt = len(Y), R.swapaxes(1, 2)
+    normal = zz.reshape(f, -1).T @ (Rt @ R).reshape(f, -1)
+    normal = normal.reshape(k, k, 3, 3).swapaxes(1, 2).reshape(3 * k, -1)
+    right = (z.T @ (Rt @ Y).reshape(f, -1)).reshape(3 * k, p)
     B = np.linalg.lstsq(normal, right, rcond=None)[0]
     variance = ((Y**2).sum() - (B * right).sum()) / Y.size
     return B.reshape(k, 3, p), max(float(variance), 1e-12)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks import harness
-from benchmarks.baselines import batches
+from benchmarks.baselines import batches, pursuit
 from benchmarks.baselines.methods import BASELINES, Baseline, block_matrix
 from benchmarks.harness import Session
 from benchmarks.paper import ablation, coherence, mirrored_frames, table1_cmu, table3_unseen
@@ -20,6 +20,7 @@ from benchmarks.robustness import missing_keypoints, noise
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import ALONE, LIFTING
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
 
 LONE = ("--subjects", "01", "--seeds", "0", "1", "--steps", "3")
@@ -52,6 +53,11 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(BASELINES, SIMPLE, Baseline(block_matrix, ({"K": 2},)))
     monkeypatch.setattr(harness, "SNAPSHOTS", 2)
     monkeypatch.setattr(table3_unseen, "TRAINED_ON", {"86": ("86",), "union": ("01", "86")})
+    monkeypatch.setattr(table3_unseen, "TESTED_ON", ("14",))
+    monkeypatch.setattr(table3_unseen, "DICTIONARIES", ((3, 0.1), (3, 1.0)))
+    monkeypatch.setattr(table3_unseen, "PURSUIT_FRAMES", 1)
+    monkeypatch.setattr(pursuit, "MAX_ATOMS", 1)
+    monkeypatch.setattr(table3_unseen, "POSE_STRIDE", 1)
 
 
 @pytest.fixture
@@ -80,7 +86,8 @@ def rows(output: Path, name: str) -> list[dict[str, str]]:
 def test_runs_end_to_end(
     module: ModuleType, data: Path, output: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    module.main(["--data", str(data), "--output", str(output), *LONE])
+    parts = ["--subjects", "01", "15-joints"] if module is table3_unseen else []
+    module.main(["--data", str(data), "--output", str(output), *LONE, *parts])
     name = module.__name__.rsplit(".", 1)[-1]
     printed = capsys.readouterr().out
     assert printed.strip() == (output / f"{name}.md").read_text().strip()
@@ -224,6 +231,40 @@ def test_similarity_forgives_the_scale_only(session: Session, dataset: Dataset) 
     model = session.trained("a title", dataset, session.preset("default", 0))
     found = table3_unseen.errors(model, dataset, ALONE)
     assert 0 < found["similarity %"] < found["proper %"] + 1e-6 or found["mirrored %"] > 0
+    assert found["relative %"] < found["similarity %"] + 1e-6
+
+
+def test_readings_of_table_3_are_of_one_alignment() -> None:
+    rng = np.random.default_rng(0)
+    truth = centre(rng.standard_normal((5, 15, 3)))
+    mirrored = 7 * truth * np.array([1, 1, -1]) + 3
+    found = table3_unseen.errors_of_shapes(mirrored, truth)
+    assert found["distance"] < 1e-6 and found["relative %"] < 1e-4
+    moved = truth.copy()
+    moved[:, 0, 0] += 0.01  # so little that alignment hardly follows
+    found = table3_unseen.errors_of_shapes(moved, truth)
+    size = np.linalg.norm(truth, axis=(1, 2))
+    assert found["relative %"] == pytest.approx(100 * (0.01 / size).mean(), rel=0.2)
+    ratio = found["relative %"] / 100 / found["distance"]
+    assert 0 < ratio * truth.std(1).mean() ** -1 < 2
+
+
+def test_turntable_cameras_see_the_vertical_as_it_is() -> None:
+    M = table3_unseen.turntable_cameras(20, np.random.default_rng(0))
+    np.testing.assert_allclose(
+        M.swapaxes(1, 2) @ M, np.broadcast_to(np.eye(2), (20, 2, 2)), atol=1e-6
+    )
+    np.testing.assert_array_equal(np.array([0, 1, 0]) @ M, np.tile([0, 1], (20, 1)))
+    assert np.ptp(M[:, 0, 0]) > 1
+
+
+def test_one_camera_sees_all_frames_of_a_trial(session: Session, dataset: Dataset) -> None:
+    trial = dataclasses.replace(session, one_camera=True).mocap(["01"], "train")
+    assert trial.shapes is not None and dataset.shapes is not None
+    np.testing.assert_array_equal(trial.shapes, dataset.shapes)
+    cameras = [np.linalg.pinv(S) @ W for S, W in zip(trial.shapes, trial.points, strict=True)]
+    np.testing.assert_allclose(np.ptp(cameras[:8], axis=0), 0, atol=1e-5)  # 8 frames a trial
+    assert np.abs(cameras[7] - cameras[8]).max() > 0.1
 
 
 def test_correlation_has_its_sign_and_choice_its_error() -> None:
