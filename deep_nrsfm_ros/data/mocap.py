@@ -6,17 +6,17 @@ angles L of its degrees of freedom, so that its rotation to the world is R_paren
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
+from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17, HUMAN25
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
 METRES = 0.0254 / 0.45
@@ -53,11 +53,13 @@ class Motion:
 
     Attributes:
         joints: (f, 31, 3) positions of the keypoints of CMU31 in metres, y up.
-        head: (f, 3, 3) rotations from the head bone's frame to the world.
+        head: (f, 3, 3) rotations from the head bone's frame to the world: left, up, front.
+        feet: (f, 2, 3, 3) the same of the left and the right foot.
     """
 
     joints: NDArray[np.float32]
     head: NDArray[np.float32]
+    feet: NDArray[np.float32]
 
 
 def _euler(angles: NDArray[np.float64], axes: str) -> NDArray[np.float64]:
@@ -152,7 +154,22 @@ def _pose(skeleton: Skeleton, columns: dict[str, list[list[str]]]) -> Motion:
             rotation[bone.name] = rotation[bone.parent] @ bone.axis @ local @ bone.axis.T
         position[bone.name] = position[bone.parent] + rotation[bone.name] @ bone.offset
     joints = np.stack([position[name] for name in CMU31.keypoints], 1)
-    return Motion(joints.astype(np.float32), rotation["head"].astype(np.float32))
+    bones = {bone.name: bone for bone in skeleton}
+    feet = [rotation[side + "foot"] @ _foot_axes(bones, side) for side in "lr"]
+    return Motion(
+        joints.astype(np.float32),
+        rotation["head"].astype(np.float32),
+        np.stack(feet, 1).astype(np.float32),
+    )
+
+
+def _foot_axes(bones: Mapping[str, Bone], side: str) -> NDArray[np.float64]:
+    """Return left, up and front of a foot (3, 3), as columns, in the rest pose of the skeleton."""
+    up = -bones[side + "tibia"].offset
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    left = np.cross(up, [0.0, 0.0, 1.0])  # the skeleton faces z
+    left = left / max(float(np.linalg.norm(left)), 1e-9)
+    return np.stack((left, up, np.cross(left, up)), 1)
 
 
 # Bones whose ends are keypoints of HUMAN17. A detector's wrist is the end of `lwrist`, not of
@@ -170,6 +187,24 @@ _HUMAN17_FROM_CMU = {
 
 def human17(motion: Motion) -> NDArray[np.float32]:
     """Return the keypoints of HUMAN17 (f, 17, 3) in metres, where a detector places them."""
+    return np.stack([_body(motion)[name] for name in HUMAN17.keypoints], 1)
+
+
+def human25(motion: Motion) -> NDArray[np.float32]:
+    """Return the keypoints of HUMAN25 (f, 25, 3) in metres, where a detector places them.
+
+    Motion capture has no eyes, ears, heels and small toes: `face` and `foot` place them.
+    """
+    points = _body(motion)
+    points |= face(points["nose"], motion.head, FaceShape())
+    for i, side in enumerate(("left", "right")):
+        ankle, ball = (motion.joints[:, CMU31.index(side[0] + bone)] for bone in ("tibia", "foot"))
+        points |= foot(side, ankle, ball, motion.feet[:, i])
+    return np.stack([points[name] for name in HUMAN25.keypoints], 1).astype(np.float32)
+
+
+def _body(motion: Motion) -> dict[str, NDArray[Any]]:
+    """Return the keypoints (f, 3) of HUMAN17 by their names."""
     at = CMU31.index
     points: dict[str, NDArray[Any]] = {}
     for side in ("left", "right"):
@@ -181,7 +216,67 @@ def human17(motion: Motion) -> NDArray[np.float32]:
     # The head bone ends at the crown; the nose is 35 % up the bone and 0.11 m in front of it.
     forward = motion.head @ np.array([0, 0, 0.11], np.float32)
     points["nose"] = base + np.float32(0.35) * (top - base) + forward
-    return np.stack([points[name] for name in HUMAN17.keypoints], 1)
+    return points
+
+
+class FaceShape(NamedTuple):
+    """Where eyes and ears are from the tip of the nose, in metres; one number, or one a frame.
+
+    The defaults are rounded means of adults: eyes 64 mm apart, ears at the tragus, 145 mm apart.
+
+    Attributes:
+        eye_up, eye_back, eye_apart: up, back and half the distance of the eyes.
+        ear_up, ear_back, ear_apart: the same of the ears.
+    """
+
+    eye_up: Any = 0.035
+    eye_back: Any = 0.025
+    eye_apart: Any = 0.032
+    ear_up: Any = 0.02
+    ear_back: Any = 0.105
+    ear_apart: Any = 0.0725
+
+
+def face(nose: NDArray[Any], head: NDArray[Any], shape: FaceShape) -> dict[str, NDArray[Any]]:
+    """Return eyes and ears (f, 3) of a head that moves as one.
+
+    Args:
+        nose: (f, 3) its tip, in metres.
+        head: (f, 3, 3) rotation of the head's axes: left, up, front.
+        shape: each number a scalar or (f, 1).
+    """
+    left, up, front = head[:, :, 0], head[:, :, 1], head[:, :, 2]
+    eyes = nose + shape.eye_up * up - shape.eye_back * front
+    ears = nose + shape.ear_up * up - shape.ear_back * front
+    return {
+        "left_eye": eyes + shape.eye_apart * left,
+        "right_eye": eyes - shape.eye_apart * left,
+        "left_ear": ears + shape.ear_apart * left,
+        "right_ear": ears - shape.ear_apart * left,
+    }
+
+
+HEEL_DOWN, HEEL_BACK, SMALL_TOE_FORWARD, SMALL_TOE_OUT = 0.045, 0.045, 0.02, 0.065
+"""Metres: heel below the ankle and behind it, small toe before the ball and to the outside."""
+
+
+def foot(
+    side: str, ankle: NDArray[Any], ball: NDArray[Any], axes: NDArray[Any]
+) -> dict[str, NDArray[Any]]:
+    """Return heel and small toe (f, 3) of a foot that moves as one.
+
+    Args:
+        side: "left" or "right".
+        ankle: (f, 3) in metres.
+        ball: (f, 3) where the toes begin.
+        axes: (f, 3, 3) rotation of the foot's axes: left, up, front.
+    """
+    left, up, front = axes[:, :, 0], axes[:, :, 1], axes[:, :, 2]
+    outward = left if side == "left" else -left
+    return {
+        f"{side}_heel": ankle - HEEL_DOWN * up - HEEL_BACK * front,
+        f"{side}_small_toe": ball + SMALL_TOE_FORWARD * front + SMALL_TOE_OUT * outward,
+    }
 
 
 def cmu31(motion: Motion) -> NDArray[np.float32]:
@@ -192,6 +287,7 @@ def cmu31(motion: Motion) -> NDArray[np.float32]:
 KEYPOINTS_OF: dict[str, Callable[[Motion], NDArray[np.float32]]] = {
     "cmu31": cmu31,
     "human17": human17,
+    "human25": human25,
 }
 
 

@@ -21,13 +21,17 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import (
+    FaceShape,
     Motion,
     TrialSelection,
+    face,
+    foot,
     read_amc,
     read_asf,
     selected_trials,
 )
-from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17, HUMAN25
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
 Floats = NDArray[Any]
@@ -38,6 +42,8 @@ NOSE_FORWARD = (0.08, 0.13)  # m
 HIPS_APART, SHOULDERS_APART = (0.9, 1.4), (0.8, 1.02)  # times the distance of CMU's joints
 HIP_SPREAD, TOE_SPREAD = 0.02, 0.015  # m, per axis
 JOINT_SPREAD = 0.03  # of the bone that ends at a joint, along it
+FACE = ((0.02, 0.05), (0.01, 0.04), (0.028, 0.038), (0.0, 0.04), (0.08, 0.13), (0.06, 0.085))
+"""Ranges in metres of the numbers of `FaceShape`, in their order."""
 _PARTS = (
     ("root", ("hipjoint",)),
     ("hipjoint", ("femur",)),
@@ -56,6 +62,7 @@ _SIDES = ("left", "right")
 def read_virtual_people(
     selection: TrialSelection,
     count: int,
+    layout: KeypointLayout = HUMAN17,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Dataset:
     """Return virtual people as a dataset, each before an orthonormal camera of its own.
@@ -64,35 +71,45 @@ def read_virtual_people(
         selection: the motion capture; `camera_seed` seeds all random numbers.
         count: of people; each has the pose of another frame, so there are at most as many as there
             are frames.
+        layout: HUMAN17 or HUMAN25.
         on_progress: called with the number of trials done and their total number.
+
+    Raises:
+        ValueError: the layout is another.
     """
+    if not set(layout.keypoints) <= set(HUMAN25.keypoints):
+        raise ValueError(f"virtual people have the keypoints of human25, not of {layout.name}")
     motions, paths = [], selected_trials(selection)
     for done, path in enumerate(paths):
         motion = read_amc(path, read_asf(path.parent / f"{path.parent.name}.asf"))
-        motions.append(
-            Motion(*(part[:: selection.stride] for part in (motion.joints, motion.head)))
-        )
+        motions.append([part[:: selection.stride] for part in _parts(motion)])
         on_progress(done + 1, len(paths))
-    joints, head = (
-        np.concatenate([getattr(motion, part) for motion in motions]) for part in ("joints", "head")
-    )
+    parts = [np.concatenate(part) for part in zip(*motions, strict=True)]
     rng = np.random.default_rng(selection.camera_seed)
-    chosen = rng.permutation(len(joints))[:count]
-    S = centre(virtual_people(Motion(joints[chosen], head[chosen]), rng))
+    chosen = rng.permutation(len(parts[0]))[:count]
+    S = centre(virtual_people(Motion(*(part[chosen] for part in parts)), layout, rng))
     W = (S @ random_cameras(len(S), rng)).astype(np.float32)
     source = f"virtual people in poses of CMU, subjects {' '.join(selection.subjects)}"
-    return Dataset(W, np.ones(W.shape[:2], bool), HUMAN17, source, S)
+    return Dataset(W, np.ones(W.shape[:2], bool), layout, source, S)
 
 
-def virtual_people(motion: Motion, rng: np.random.Generator) -> NDArray[np.float32]:
+def _parts(motion: Motion) -> tuple[NDArray[np.float32], ...]:
+    """Return the arrays of a motion, each of f frames."""
+    return motion.joints, motion.head, motion.feet
+
+
+def virtual_people(
+    motion: Motion, layout: KeypointLayout, rng: np.random.Generator
+) -> NDArray[np.float32]:
     """Return people in the poses of a motion, one a frame, with other bodies and joints.
 
     Args:
         motion: f frames of motion capture.
+        layout: HUMAN17 or HUMAN25.
         rng: draws the bodies and the definitions of the joints.
 
     Returns:
-        (f, 17, 3) keypoints of HUMAN17 in metres.
+        (f, p, 3) keypoints of the layout in metres.
     """
     joints = motion.joints.astype(np.float64)
     n = len(joints)
@@ -150,7 +167,16 @@ def virtual_people(motion: Motion, rng: np.random.Generator) -> NDArray[np.float
     base, top = place["upperneck"], place["head"]
     nose = base + uniform(NOSE_UP) * (top - base)
     points["nose"] = nose + uniform(NOSE_FORWARD) * motion.head[:, :, 2]
-    return np.stack([points[name] for name in HUMAN17.keypoints], 1).astype(np.float32)
+    # Drawn last, so that the other keypoints are the same in both layouts.
+    points |= face(points["nose"], motion.head, FaceShape(*map(uniform, FACE)))
+    ends = TOE_SPREAD * rng.standard_normal((2, 3, n, 1))
+    for i, (side, sign) in enumerate(zip(_SIDES, (1, -1), strict=True)):
+        axes = motion.feet[:, i].astype(np.float64)
+        found = foot(side, points[f"{side}_ankle"], place[side[0] + "foot"], axes)
+        for (name, end), (right, rise, ahead) in zip(found.items(), ends, strict=True):
+            shifted = sign * right * axes[:, :, 0] + rise * axes[:, :, 1] + ahead * axes[:, :, 2]
+            points[name] = end + shifted
+    return np.stack([points[name] for name in layout.keypoints], 1).astype(np.float32)
 
 
 def _grow(place: dict[str, Floats], joints: Floats, chain: Sequence[str], growth: Floats) -> None:

@@ -83,12 +83,15 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
     return dataset
 
 
-def read_people(config: TrainingConfig, reporter: Reporter) -> Dataset | None:
-    """Return the virtual people of the configuration; None if it has none."""
+def read_people(
+    config: TrainingConfig, layout: KeypointLayout, reporter: Reporter
+) -> Dataset | None:
+    """Return the virtual people of the configuration in a layout; None if it has none."""
     data = config.data
     if not data.cmu or not data.virtual_people:
         return None
-    return read_virtual_people(_selection(data, data.cmu), data.virtual_people, reporter.reading)
+    selection = _selection(data, data.cmu)
+    return read_virtual_people(selection, data.virtual_people, layout, reporter.reading)
 
 
 def _selection(data: DataConfig, folder: Path) -> TrialSelection:

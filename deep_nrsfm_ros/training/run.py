@@ -118,7 +118,7 @@ def _train_and_save(
     from deep_nrsfm_ros.training.judge import judge
 
     dataset = prepared.dataset
-    people = read_people(config, reporter)
+    people = read_people(config, dataset.layout, reporter)
     model = finish(trainer, config.output.name, dataset.layout, dataset.source, people)
     date = time.strftime("%Y-%m-%d", time.gmtime())
     model = dataclasses.replace(model, provenance=model.provenance | {"date": date})

@@ -13,7 +13,7 @@ from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN17, HUMAN25
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
@@ -52,10 +52,11 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
     if target != _NUMBERED_LAYOUT:
         KeypointMap(source, target)
     config.layout_loss.check(target, names)
-    if config.data.virtual_people and target.keypoints != HUMAN17.keypoints:
+    people = (HUMAN17.keypoints, HUMAN25.keypoints)
+    if config.data.virtual_people and target.keypoints not in people:
         raise ValueError(
-            f"{names('virtual_people')} has the keypoints of {HUMAN17.name}, and the model those "
-            f"of {target.name!r}: leave it out"
+            f"{names('virtual_people')} has the keypoints of {HUMAN17.name} or {HUMAN25.name}, "
+            f"and the model those of {target.name!r}: leave it out"
         )
     if not config.recipe.steps and not config.start:
         raise ValueError(f"{names('steps')} is 0: name the model to keep with {names('start')}")

@@ -14,13 +14,14 @@ from deep_nrsfm_ros.data.mocap import (
     METRES,
     Motion,
     human17,
+    human25,
     protocol_split,
     read_amc,
     read_asf,
     read_trials,
     trials,
 )
-from deep_nrsfm_ros.layouts.presets import CMU31, COCO17, HUMAN17, preset
+from deep_nrsfm_ros.layouts.presets import CMU31, COCO17, HUMAN17, HUMAN25, preset
 from deep_nrsfm_ros.nrsfm.handedness import votes
 
 PARENT = dict(CMU31.edges)
@@ -292,7 +293,7 @@ def test_every_frame_is_seen_by_an_orthonormal_camera_fixed_by_the_seed(tmp_path
 
 
 def test_only_some_layouts_can_be_made_of_motion_capture(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="cmu31, human17, not 'coco17'"):
+    with pytest.raises(ValueError, match="cmu31, human17, human25, not 'coco17'"):
         read_trials([tmp_path / "01.amc"], COCO17)
 
 
@@ -301,6 +302,7 @@ def test_keypoints_of_a_person() -> None:
     motion = Motion(
         rng.standard_normal((3, 31, 3)).astype(np.float32),
         np.tile(turn("y", 90).astype(np.float32), (3, 1, 1)),
+        np.tile(turn("y", 90).astype(np.float32), (3, 2, 1, 1)),
     )
     points = human17(motion)
 
@@ -318,6 +320,24 @@ def test_keypoints_of_a_person() -> None:
     # The head's z axis is its front; turned by 90 degrees about y it is x.
     skull = 0.65 * joint("upperneck") + 0.35 * joint("head")
     np.testing.assert_allclose(of("nose") - skull, [[0.11, 0, 0]] * 3, atol=1e-6)
+    more = human25(motion)
+    np.testing.assert_array_equal(more[:, : len(HUMAN17)], points)
+    part = {name: more[:, i] for i, name in enumerate(HUMAN25.keypoints)}
+    # The head's x axis is its left; turned by 90 degrees about y it is -z.
+    apart = part["left_ear"] - part["right_ear"]
+    np.testing.assert_allclose(apart, [[0, 0, -0.145]] * 3, atol=1e-5)
+    heel = part["right_heel"] - part["right_ankle"]
+    np.testing.assert_allclose(heel, [[-0.045, -0.045, 0]] * 3, atol=1e-5)
+    small_toe = part["right_small_toe"] - joint("rfoot")
+    np.testing.assert_allclose(small_toe, [[0.02, 0, 0.065]] * 3, atol=1e-5)
+
+
+def test_feet_stand_flat_in_the_rest_pose(tmp_path: Path) -> None:
+    frame: dict[str, list[float]] = {"root": [0] * 6}
+    skeleton_file, motion_file = written(tmp_path, straight(), [frame])
+    (feet,) = read_amc(motion_file, read_asf(skeleton_file)).feet
+    np.testing.assert_allclose(feet.mT @ feet, [np.eye(3)] * 2, atol=1e-6)
+    np.testing.assert_allclose(feet[:, 2, 2], 1, atol=1e-6)  # the front is z
 
 
 @needs_data

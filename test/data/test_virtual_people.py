@@ -10,7 +10,7 @@ import pytest
 from deep_nrsfm_ros.data import virtual_people as module
 from deep_nrsfm_ros.data.mocap import Motion, TrialSelection, human17
 from deep_nrsfm_ros.data.virtual_people import read_virtual_people, virtual_people
-from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
+from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17, HUMAN25, preset
 
 F = 400
 
@@ -42,7 +42,12 @@ def motion() -> Motion:
         if name[0] == "r" and name != "root":
             joints[:, CMU31.index("l" + name[1:])] = place * np.array([-1, 1, 1])
     joints[:, CMU31.index("lfemur"), 2] = 0.2
-    return Motion(joints.astype(np.float32), np.tile(np.eye(3, dtype=np.float32), (F, 1, 1)))
+    upright = np.eye(3, dtype=np.float32)
+    return Motion(
+        joints.astype(np.float32),
+        np.tile(upright, (F, 1, 1)),
+        np.tile(upright, (F, 2, 1, 1)),
+    )
 
 
 def joint(S: np.ndarray, name: str) -> np.ndarray:
@@ -55,7 +60,7 @@ def length(S: np.ndarray, a: str, b: str) -> np.ndarray:
 
 
 def test_bodies_and_joints_are_drawn_in_their_ranges(motion: Motion) -> None:
-    S = virtual_people(motion, np.random.default_rng(0))
+    S = virtual_people(motion, HUMAN17, np.random.default_rng(0))
     plain = human17(motion)
     for bone in (("shoulder", "elbow"), ("elbow", "wrist"), ("knee", "ankle")):
         relative = [
@@ -78,7 +83,7 @@ def test_bodies_and_joints_are_drawn_in_their_ranges(motion: Motion) -> None:
 
 
 def test_both_sides_are_alike(motion: Motion) -> None:
-    S = virtual_people(motion, np.random.default_rng(0))
+    S = virtual_people(motion, HUMAN17, np.random.default_rng(0))
     mirror = np.array([-1, 1, 1])
     for part in ("shoulder", "elbow", "wrist", "hip", "big_toe"):
         # The left knee is bent: what hangs from it is elsewhere.
@@ -107,3 +112,22 @@ def test_a_dataset_of_them_is_before_cameras_of_their_own(
     assert len(read_virtual_people(selection, 1000)) == 2 * F // 20
     again = read_virtual_people(selection, 30)
     np.testing.assert_array_equal(people.points, again.points)
+
+
+def test_eyes_ears_heels_and_small_toes_are_added_to_the_same_people(motion: Motion) -> None:
+    fewer = virtual_people(motion, HUMAN17, np.random.default_rng(0))
+    S = virtual_people(motion, HUMAN25, np.random.default_rng(0))
+    np.testing.assert_array_equal(S[:, :17], fewer)
+    part = {name: S[:, i].astype(float) for i, name in enumerate(HUMAN25.keypoints)}
+    for side, sign in (("left", 1), ("right", -1)):
+        assert (sign * (part[f"{side}_ear"] - part["nose"])[:, 0] > 0.05).all()
+        assert (sign * (part[f"{side}_eye"] - part["nose"])[:, 0] > 0.02).all()
+        assert ((part[f"{side}_eye"] - part[f"{side}_ear"])[:, 2] > 0.03).all()
+        out = sign * (part[f"{side}_small_toe"] - part[f"{side}_heel"])[:, 0]
+        assert out.mean() == pytest.approx(0.065, abs=0.01)
+        assert (part[f"{side}_heel"] - part[f"{side}_ankle"])[:, 1].mean() < -0.03
+
+
+def test_other_layouts_have_no_virtual_people() -> None:
+    with pytest.raises(ValueError, match="human25, not of coco_wholebody133"):
+        read_virtual_people(TrialSelection(Path("cmu"), ("01",)), 3, preset("coco_wholebody133"))

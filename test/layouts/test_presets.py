@@ -78,8 +78,10 @@ PLACES = {
     "12 left_shoulder 17 right_wrist 18 left_hip 23 right_ankle 24 left_big_toe 29 right_heel "
     "30 left_thumb_tip 32 left_index_mcp 34 left_middle_tip 37 right_pinky_mcp",
     "human17": "0 left_shoulder 1 right_shoulder 12 neck 13 mid_hip 14 nose 15 left_big_toe",
+    "human25": "0 left_shoulder 12 neck 16 right_big_toe 17 left_eye 19 left_ear 21 left_heel "
+    "24 right_small_toe",
 }
-COUNTS = {"human17": 17, "cmu31": 31, "coco17": 17, "body25": 25, "body25b": 25}
+COUNTS = {"human17": 17, "human25": 25, "cmu31": 31, "coco17": 17, "body25": 25, "body25b": 25}
 COUNTS |= {"openpose18": 18, "rep155": 18, "mediapipe33": 33}
 COUNTS |= {"halpe26": 26, "halpe136": 136, "coco_wholebody133": 133, "mpii16": 16, "h36m17": 17}
 COUNTS |= {"crowdpose14": 14, "openpose135": 135, "hand21": 21, "ap10k17": 17, "posetrack15": 15}
@@ -140,6 +142,8 @@ def test_layouts_that_contain_others() -> None:
     assert preset("halpe136").keypoints[:26] == preset("halpe26").keypoints
     assert preset("coco_wholebody133").keypoints[:17] == preset("coco17").keypoints
     assert preset("halpe26").keypoints[:17] == preset("coco17").keypoints
+    assert preset("human25").keypoints[:17] == preset("human17").keypoints
+    assert set(preset("human25").keypoints) == set(preset("body25").keypoints)
     assert preset("openpose135").keypoints[:25] == preset("body25b").keypoints
     assert preset("zed18").keypoints == preset("openpose18").keypoints
     hand = preset("hand21").keypoints[1:]
@@ -167,7 +171,7 @@ def test_edges_are_pairs_of_places(layout: KeypointLayout) -> None:
     assert len(bones) == len(pairs) + len(layout.rigid)
 
 
-@pytest.mark.parametrize("name", ["human17", "cmu31"])
+@pytest.mark.parametrize("name", ["human17", "human25", "cmu31"])
 def test_layouts_of_models_know_their_hand_and_their_length(name: str) -> None:
     assert preset(name).handedness and preset(name).reference
 

@@ -14,7 +14,8 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import read_layout
 
 NAMES = [
-    *("human17", "cmu31", "coco17", "body25", "body25b", "openpose18", "rep155", "mediapipe33"),
+    *("human17", "human25", "cmu31", "coco17", "body25", "body25b", "openpose18", "rep155"),
+    "mediapipe33",
     *("halpe26", "halpe136", "coco_wholebody133", "mpii16", "h36m17", "crowdpose14"),
     *("openpose135", "hand21", "ap10k17", "posetrack15", "posetrack18_17"),
     *("zed18", "zed34", "zed38"),
@@ -23,6 +24,7 @@ _FOLDER = Path(__file__).parent
 
 # Without values, so that `__getattr__` reads the file of a layout at its first use.
 HUMAN17: KeypointLayout
+HUMAN25: KeypointLayout
 CMU31: KeypointLayout
 COCO17: KeypointLayout
 BODY25: KeypointLayout
