@@ -114,24 +114,29 @@ def limb_coefficients(
     A = _centred(M @ B).reshape(len(B), -1).T
     C = (B[:, :, i] - B[:, :, j]).reshape(len(B), -1).T
     d = -(mean[:, i] - mean[:, j]).ravel()
-    lengths = float(d @ d)
     values, V = eigh(A.T @ A, C.T @ C + 1e-9 * np.trace(C.T @ C) / len(B) * np.eye(len(B)))
     b, limb = V.T @ (A.T @ left.ravel()), V.T @ (C.T @ d)
 
-    def coefficients(multiplier: float) -> Floats:
-        a: Floats = V @ ((b + multiplier * limb) / (values + multiplier))
-        return a
+    def scaled(multiplier: float) -> Floats:
+        """Return V^-1 a(l); the columns of C V are orthonormal."""
+        q: Floats = (b + multiplier * limb) / (values + multiplier)
+        return q
 
     def excess(multiplier: float) -> float:
-        return float(((C @ coefficients(multiplier) - d) ** 2).sum()) - lengths
+        """Return |C a(l) - d|^2 - |d|^2."""
+        q = scaled(multiplier)
+        return float(q @ q - 2 * q @ limb)
 
     pole, scale = -float(values[0]), float(values[-1]) + 1e-12
     low, high = pole + 1e-9 * scale, pole + scale
     while excess(high) > 0 and high < 1e9 * scale:
         high = pole + 10 * (high - pole)
     if excess(low) <= 0 or excess(high) > 0:
-        return coefficients(low if excess(low) <= 0 else high)
-    return coefficients(float(brentq(excess, low, high, xtol=1e-12 * scale, maxiter=200)))
+        root = low if excess(low) <= 0 else high
+    else:
+        root = float(brentq(excess, low, high, xtol=1e-12 * scale, maxiter=200))
+    a: Floats = V @ scaled(root)
+    return a
 
 
 def _camera(y: Floats, X: Floats) -> Floats:

@@ -50,10 +50,10 @@ PARTS = (*HELD_OUT, SINGLE_VIEW, *TRAINED_ON)
 CMU15 = KeypointLayout(
     "cmu15", JOINTS15, edges=tuple((JOINTS15[i], JOINTS15[j]) for i, j in LIMBS15)
 )
-TEST_FRAMES, PURSUIT_FRAMES, POSE_STRIDE = 200, 40, 12
+TEST_FRAMES, PURSUIT_FRAMES, POSE_STRIDE = 60, 20, 24
 """Random test frames; frames of PMP, which takes a second for each; every n-th pose of subject 86
 enters the dictionaries."""
-DICTIONARIES = ((64, 0.1), (64, 1.0), (128, 1.0), (64, 10.0))
+DICTIONARIES = ((64, 0.1), (64, 1.0))
 """Atoms and sparsity of the dictionaries of Alternate and Convex."""
 # Kong and Lucey, arXiv 1902.10840, Table 3: trained on subject 86.
 PAPER = {

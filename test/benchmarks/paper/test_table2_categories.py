@@ -11,7 +11,7 @@ from benchmarks.baselines.methods import BASELINES, Baseline, block_matrix
 from benchmarks.data.synthetic_furniture import CATEGORIES
 from benchmarks.harness import Session
 from benchmarks.paper import table2_categories
-from benchmarks.paper.table2_categories import CAMERAS, FACES, images, main
+from benchmarks.paper.table2_categories import CAMERAS, CHAIR_CORE, CHAIRS, FACES, images, main
 from deep_nrsfm_ros.commands.evaluate import LIFTING
 
 
@@ -23,6 +23,11 @@ def data(tmp_path: Path) -> Path:
     folder = tmp_path / "data" / "nrsfm"
     folder.mkdir(parents=True)
     savemat(folder / "FRGC_X.mat", {"X": faces.transpose(2, 1, 0)})
+    chairs = rng.standard_normal((30, 21, 3))
+    chairs[3, 0] = chairs[4, 7] = np.nan  # no top of the back; no arm rest, which is not needed
+    scenes = folder.parent / "scenes" / "chairs_keypointnet"
+    scenes.mkdir(parents=True)
+    np.savez(scenes / "chairs_keypointnet_dev.npz", truth=chairs)
     return folder.parent
 
 
@@ -48,6 +53,12 @@ def test_each_object_is_seen_by_cameras_of_its_own(
         np.testing.assert_allclose(S @ M, W, atol=1e-4)
     again = images(session, category)
     np.testing.assert_array_equal(dataset.points, again.points)
+
+
+def test_chairs_are_those_with_all_points_of_the_core(session: Session) -> None:
+    dataset = images(session, CHAIRS)
+    assert dataset.points.shape == (29 * CAMERAS, len(CHAIR_CORE), 2)
+    assert np.isfinite(dataset.points).all()
 
 
 def test_command_compares_all_methods_on_each_category(
