@@ -5,14 +5,17 @@ from __future__ import annotations
 import mmap
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from deep_nrsfm_ros.batched import slices
+
 LARGE = 1 << 22
 """Bytes from which on an array is kept in a file."""
+_RELEASED = 64  # slices that are copied before their pages are taken out of memory
 
 
 def empty(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
@@ -37,6 +40,35 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     except (OSError, AttributeError):  # no room, or a system without posix_fallocate
         return np.empty(shape, dtype)
     return np.frombuffer(pages, dtype).reshape(shape)
+
+
+def take(array: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
+    """Return rows of an array as another one, which is in a file if it is large."""
+    result = empty((len(rows), *array.shape[1:]), array.dtype)
+    for done, part in enumerate(slices(len(rows))):
+        result[part] = array[rows[part]]
+        if done % _RELEASED == _RELEASED - 1:
+            release((array, result))
+    return result
+
+
+def concatenated(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return arrays one after the other as one, which is in a file if it is large.
+
+    Each is taken out of memory when it is copied, if it is one of `empty`.
+
+    Args:
+        arrays: at least one.
+    """
+    if len(arrays) == 1:
+        return arrays[0]
+    total = sum(len(array) for array in arrays)
+    result, start = empty((total, *arrays[0].shape[1:]), arrays[0].dtype), 0
+    for array in arrays:
+        result[start : start + len(array)] = array
+        start += len(array)
+        release((array, result))
+    return result
 
 
 def release(arrays: Iterable[NDArray[Any]]) -> None:

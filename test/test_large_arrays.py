@@ -14,7 +14,7 @@ import pytest
 from deep_nrsfm_ros import large_arrays
 from deep_nrsfm_ros.commands import lift as command
 from deep_nrsfm_ros.data.lifted_files import write_recording
-from deep_nrsfm_ros.large_arrays import empty, release
+from deep_nrsfm_ros.large_arrays import concatenated, empty, release, take
 
 
 def coco_file(path: Path, people: int) -> Path:
@@ -51,6 +51,24 @@ def peak(path: Path, output: Path, *options: str) -> int:
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("large", [1, 1 << 40])
+def test_rows_and_joined_arrays_are_the_same_in_files_and_memory(
+    large: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(large_arrays, "LARGE", large)
+    monkeypatch.setattr(large_arrays, "_RELEASED", 1)
+    rng = np.random.default_rng(0)
+    array = rng.random((9000, 2, 3), np.float32)
+    rows = np.flatnonzero(rng.random(9000) > 0.3)
+    chosen = take(array, rows)
+    np.testing.assert_array_equal(chosen, array[rows])
+    assert isinstance(chosen.base, np.ndarray) == (large == 1)
+    joined = concatenated([chosen, array, array[:0]])
+    np.testing.assert_array_equal(joined, np.concatenate([array[rows], array]))
+    assert concatenated([array]) is array
+    assert take(array, rows[:0]).shape == (0, 2, 3)
 
 
 def test_a_large_array_keeps_its_values_when_released(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.dataset import Dataset, DatasetBuilder
 from deep_nrsfm_ros.data.definitions import ros2_types
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
+from deep_nrsfm_ros.data.share import WHOLE_SHARE, Share
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import (
@@ -58,7 +59,7 @@ class BagReading(NamedTuple):
 
     Attributes:
         dataset: a frame for every object of every readable message, in the order of the bags.
-        messages: number of messages on the topic, readable or not.
+        messages: number of messages of the share, readable or not.
         unreadable: number of them that could not be read.
         reason: why the first unreadable message could not be read; "" if all could.
         warnings: a sentence for each damaged bag that says what is missing, and for each bag that
@@ -78,6 +79,7 @@ def read_bags(
     target: KeypointLayout,
     options: ReadOptions = DEFAULT_READ_OPTIONS,
     on_progress: Progress | None = None,
+    share: Share = WHOLE_SHARE,
 ) -> BagReading:
     """Return the keypoints of all bags as one dataset; memory stays below about twice its size.
 
@@ -87,6 +89,7 @@ def read_bags(
         target: layout of the dataset.
         options: topic, mapping and limits.
         on_progress: called after every 256 messages.
+        share: the part of the messages to read; others are not decoded.
 
     Raises:
         BagError: every bag is missing, damaged beyond reading or without such a topic; no message
@@ -111,7 +114,7 @@ def read_bags(
             read.append(path.name)
             for topic, input_type, decode in topics:
                 before, reader = messages, MessageReader(input_type, decode)
-                for raw in bag.messages(topic):
+                for raw in share.of(bag.messages(topic), len(read) - 1):
                     messages += 1
                     try:
                         read_one = _add(builder, reader, raw, len(source), options)
@@ -126,7 +129,8 @@ def read_bags(
                             "that are read (max_frames); name fewer bags, or allow more"
                         )
                     if on_progress and messages % 256 == 0:
-                        on_progress(messages, max(messages, before + topic.total))
+                        total = before + topic.total // share.size
+                        on_progress(messages, max(messages, total))
                 if warning := bag.warning(topic):
                     warnings.append(warning)
     if not read:

@@ -13,6 +13,7 @@ from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.configuration import check, option
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.outliers import find_outliers
+from deep_nrsfm_ros.large_arrays import empty, release
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible, rms_radius
 
 Bools = NDArray[np.bool_]
@@ -178,14 +179,18 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
             "the detector, --min-confidence and the keypoint layout"
         )
     frames = np.flatnonzero(enough)
+    candidates = dataset if enough.all() else dataset[frames]
     if options.min_change:
-        points, visible = dataset.points[frames], dataset.visible[frames]
-        frames = frames[changed_frames(points, visible, options.min_change)]
-    visible = dataset.visible[frames]
-    outliers: Bools = np.zeros_like(visible)
+        changed = changed_frames(candidates.points, candidates.visible, options.min_change)
+        if not changed.all():
+            frames = frames[changed]
+            candidates = dataset[frames]
+    visible = candidates.visible
+    outliers: Bools = empty(visible.shape, bool)
+    outliers[:] = False
     worst: NDArray[np.float64] = np.zeros(len(frames))
     if options.outlier_threshold:
-        outliers, worst = find_outliers(dataset.points[frames], visible, options.outlier_threshold)
+        outliers, worst = find_outliers(candidates.points, visible, options.outlier_threshold)
     number = outliers.sum(1)
     keep = (number <= _MAX_OUTLIER_SHARE * visible.sum(1)) & (
         (number == 0) | (visible.sum(1) - number >= options.min_visible)
@@ -204,8 +209,14 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
         if number[i]
     )
     kept = dataset[frames[keep]]  # a copy, which may be changed
-    kept.visible[outliers[keep]] = False
-    kept.points[~kept.visible] = 0
+    rows = np.flatnonzero(keep)
+    hidden = np.zeros(visible.shape[1], np.int64)
+    for part in slices(len(rows)):
+        wrong = outliers[rows[part]]
+        kept.visible[part] &= ~wrong
+        kept.points[part][~kept.visible[part]] = 0
+        hidden += wrong.sum(0)
+    release((kept.points, kept.visible))
     return Curated(
         dataset=kept,
         frames=frames[keep],
@@ -214,7 +225,7 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
         near_duplicates=int(enough.sum()) - len(frames),
         inconsistent=int((~keep).sum()),
         corrected=int((number[keep] > 0).sum()),
-        hidden=outliers[keep].sum(0),
+        hidden=hidden,
         outlier_frames=examples,
     )
 

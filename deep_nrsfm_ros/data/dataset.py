@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.large_arrays import concatenated, empty, release, take
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.messages.serialised import SerialisedFormat
 
 _BLOCK = 4096  # objects that are mapped and stored together
+_CHUNK = 2**18  # objects that are put into files together
 _RUN_BYTES = 2**20  # messages of one format that are read together
 
 
@@ -50,9 +53,17 @@ class Dataset:
         return len(self.points)
 
     def __getitem__(self, frames: slice | NDArray[np.int64]) -> Dataset:
-        """Return the dataset of a slice, or of indices, of the frames."""
-        shapes = None if self.shapes is None else self.shapes[frames]
-        return Dataset(self.points[frames], self.visible[frames], self.layout, self.source, shapes)
+        """Return the dataset of a slice, or of indices, of the frames.
+
+        The arrays of indices are copies, in files where they are large.
+        """
+        arrays = (self.points, self.visible, self.shapes)
+        points, visible, shapes = (
+            a if a is None else a[frames] if isinstance(frames, slice) else take(a, frames)
+            for a in arrays
+        )
+        assert points is not None and visible is not None
+        return Dataset(points, visible, self.layout, self.source, shapes)
 
 
 def concatenate(datasets: list[Dataset]) -> Dataset:
@@ -72,16 +83,18 @@ def concatenate(datasets: list[Dataset]) -> Dataset:
         raise ValueError(f"the sources have {len(layouts)} different keypoint layouts; use one")
     shapes = [e.shapes for e in datasets if e.shapes is not None]
     return Dataset(
-        np.concatenate([e.points for e in datasets]),
-        np.concatenate([e.visible for e in datasets]),
+        concatenated([e.points for e in datasets]),
+        concatenated([e.visible for e in datasets]),
         datasets[0].layout,
         "; ".join(dict.fromkeys(e.source for e in datasets)),
-        np.concatenate(shapes) if len(shapes) == len(datasets) else None,
+        concatenated(shapes) if len(shapes) == len(datasets) else None,
     )
 
 
 class DatasetBuilder:
     """Builds a dataset from messages, block by block, so that memory holds arrays, not messages.
+
+    Large datasets are in temporary files (`large_arrays`).
 
     Attributes:
         count: number of objects added.
@@ -102,6 +115,8 @@ class DatasetBuilder:
         self._pending_objects = 0
         self._points: list[NDArray[np.float32]] = []
         self._visible: list[NDArray[np.bool_]] = []
+        self._unsaved = 0  # objects in them
+        self._saved: tuple[list[NDArray[Any]], list[NDArray[Any]]] = ([], [])
 
     def add_serialised(self, known_format: SerialisedFormat, raw: bytes) -> None:
         """Add the objects of a serialised message; messages of one format are read together."""
@@ -139,12 +154,27 @@ class DatasetBuilder:
             points, confidence = self._map(points, confidence)
             self._points.append(points)
             self._visible.append(confidence > 0)
+            self._unsaved += len(points)
+            if self._unsaved >= _CHUNK:
+                self._save()
             self._pending.clear()
             self._pending_objects = 0
+
+    def _save(self) -> None:
+        """Put the mapped objects together, into files if they are large."""
+        if self._points:
+            arrays = (np.concatenate(self._points), np.concatenate(self._visible))
+            for array, saved in zip(arrays, self._saved, strict=True):
+                chunk = empty(array.shape, array.dtype)
+                chunk[:] = array
+                release((chunk,))
+                saved.append(chunk)
+        self._points, self._visible, self._unsaved = [], [], 0
 
     def dataset(self, source: str) -> Dataset:
         """Return the dataset of all objects, in the order in which they were added."""
         self._read_run()
         self._map_pending()
-        points, visible = np.concatenate(self._points), np.concatenate(self._visible)
+        self._save()
+        points, visible = map(concatenated, self._saved)
         return Dataset(points, visible, self._map.target, source)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.batched import slices
+from deep_nrsfm_ros.large_arrays import empty
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -187,7 +188,7 @@ def find_outliers(
         `PointModel.deviations`.
     """
     model = PointModel.fit(points, visible, threshold)
-    outliers, worst = np.zeros_like(visible), np.zeros(len(points))
+    outliers, worst = empty(visible.shape, bool), np.zeros(len(points))
     for part in slices(len(points)):
         outliers[part], worst[part] = _find_outliers(model, points[part], visible[part], threshold)
     return outliers, worst

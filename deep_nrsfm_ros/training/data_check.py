@@ -25,6 +25,7 @@ from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.training.reporter import Reporter
 
 _PERSON = {"left_hip", "left_ankle", "left_shoulder"}  # keypoints of every layout of people
+_MOST_CHECKED = 100_000  # frames
 _PEOPLE = "human"  # the model that comes with the package
 
 
@@ -40,7 +41,7 @@ def check_dataset(
             multiplied; None: unknown.
         reporter: takes the warnings.
     """
-    points = to_pixels(dataset.points, dataset.visible.astype(np.float32), image_size)
+    points = to_pixels(dataset.points, dataset.visible, image_size)
     if points is not dataset.points:
         dataset = dataclasses.replace(dataset, points=np.asarray(points, np.float32))
     for finding in _findings(dataset, source, image_size):
@@ -50,6 +51,8 @@ def check_dataset(
 
 def _findings(dataset: Dataset, source: KeypointLayout, image_size: Size | None) -> list[Finding]:
     """Return what looks wrong; people are lifted, to see whether they fit a model of people."""
+    step = max(1, len(dataset) // _MOST_CHECKED)
+    dataset = dataset[::step]
     confidence = dataset.visible.astype(np.float32)
     findings = check(dataset.points, confidence, None, image_size)
     if not set(dataset.layout.keypoints) >= _PERSON:

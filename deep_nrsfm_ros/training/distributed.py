@@ -1,6 +1,7 @@
 """Several processes that train one model, as torchrun starts them; one process alone pays nothing.
 
-Each process has its shard of the frames and draws its share of every batch from it. Gradients are
+Each process reads its share of bags and files, or takes its shard of frames that all of them have,
+and draws its share of every batch from it. Gradients are
 summed after each step, so all processes have the same weights without sending them. Decisions for
 all, to stop or that the time is up, are made every few steps, at the same steps everywhere. Only
 the first process reports and writes files.
@@ -10,6 +11,8 @@ from __future__ import annotations
 
 import os
 from typing import TYPE_CHECKING, TypeVar
+
+from deep_nrsfm_ros.data.share import WHOLE_SHARE, Share
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -106,6 +109,11 @@ class _TorchrunGroup(ProcessGroup):
         tensor = self._torch.tensor(values, dtype=self._torch.float64, device=self._device)
         self._group.all_reduce(tensor, operation)
         return [float(value) for value in tensor]
+
+
+def own_share() -> Share:
+    """Return the share of the data that this process reads: all of it, unless there are several."""
+    return Share(rank(), int(os.environ["WORLD_SIZE"])) if _started_by_torchrun() else WHOLE_SHARE
 
 
 def rank() -> int:

@@ -98,7 +98,9 @@ def inherit(trained: Model, start: Model) -> Model:
     """Return the model `trained` from `start` with the origin in its provenance.
 
     Where the layout names no handedness, the object frame is that of `start` too: the network keeps
-    the axes of its start and the sign of depth.
+    the axes of its start and the sign of depth. So are the bones where `start` has learned them
+    from many people, as a training on one person from few sides does not see their lengths
+    (docs/devlog/training.md has the errors with either). The error covariance is the new network's.
     """
     origin = {"model": start.name, "data": start.provenance.get("data", "unknown")}
     if trained.provenance["recipe"]["steps"] == 0:  # the network is that of the start
@@ -106,4 +108,17 @@ def inherit(trained: Model, start: Model) -> Model:
     model = dataclasses.replace(trained, provenance=trained.provenance | {"from": origin})
     if not trained.layout.handedness:
         model = dataclasses.replace(model, object_frame=start.object_frame)
+    if _has_better_bones(start, trained):
+        model.provenance["from"]["bones"] = "kept"
+        model = dataclasses.replace(
+            model, bone_lengths=start.bone_lengths, bone_correlation=start.bone_correlation
+        )
     return model
+
+
+def _has_better_bones(start: Model, trained: Model) -> bool:
+    """Return whether the bones of `start` are of the same layout and of more people."""
+    same = trained.layout.keypoints == start.layout.keypoints
+    same = same and trained.layout.bone_indices() == start.layout.bone_indices()
+    anew = trained.provenance["recipe"]["steps"] == 0  # what such a training is for
+    return same and not anew and start.bone_correlation.size > trained.bone_correlation.size

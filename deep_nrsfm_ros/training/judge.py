@@ -280,10 +280,12 @@ class Judge:
             frames: of the training and held out.
         """
         self._held_out = _spread(frames.held_out)
-        parts = [frames.training]
+        self._all = _spread(frames.training)
         if frames.held_out is not frames.training:
-            parts.append(frames.held_out)
-        self._all = _spread(concatenate(parts))
+            share = len(frames.held_out) / (len(frames.training) + len(frames.held_out))
+            most = round(share * _MOST_FRAMES)
+            kept = _spread(frames.training, _MOST_FRAMES - most)
+            self._all = concatenate([kept, _spread(frames.held_out, most)])
         store = FrameStore.of(self._all.points, self._all.visible)
         self._mirror_check = MirrorCheck(store, Normaliser(), _MOST_FRAMES)
         self._lifted: dict[tuple[int, bool], tuple[Model, _Lifted]] = {}
@@ -338,10 +340,10 @@ class Judge:
         return float(aligned.mirrored[sound].mean())
 
 
-def _spread(dataset: Dataset) -> Dataset:
-    """Return at most `_MOST_FRAMES` frames of a dataset, evenly spread."""
+def _spread(dataset: Dataset, most: int = _MOST_FRAMES) -> Dataset:
+    """Return at most `most` frames of a dataset, evenly spread."""
     n = len(dataset)
-    return dataset[np.unique(np.linspace(0, n - 1, min(n, _MOST_FRAMES)).astype(int))]
+    return dataset[np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))]
 
 
 def _lift(model: Model, data: Dataset) -> _Lifted:

@@ -47,12 +47,14 @@ class Setup:
         layout_loss: loss of the keypoint layout that is added to the recipe's; None is none.
         limits: when the training ends before its last step, and which state it keeps.
         group: the processes that share the training.
+        own_frames: whether each process has frames of its own; else all have all frames.
     """
 
     start: Network | None = None
     layout_loss: LayoutLoss | None = None
     limits: Limits = WHOLE
     group: ProcessGroup = ALONE
+    own_frames: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,8 @@ def train(
     The same seed gives the same network, unless `setup.limits.minutes` is set: the learning rate
     follows the clock then. The minutes count from this call, plus those of a checkpoint that the
     training continues from. All processes of `setup.group` call this function with the same
-    arguments, all frames included, and each trains on its own part of the frames; only the first
-    one reports progress and uses the checkpoint.
+    arguments, all frames included, and each trains on its own part of the frames, or with frames
+    of its own (`setup.own_frames`); only the first one reports progress and uses the checkpoint.
 
     Args:
         points: (f, p, 2) keypoints in any unit, x right and y down. They are not copied: do not
@@ -128,12 +130,13 @@ def train(
         raise ValueError("steps is 0 and there is no network to start from; it must be at least 1")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     frames, group = _frames_with_extent(points, visible), setup.group
-    if group.size > min(len(frames), preset.recipe.batch):
+    if group.size > min(len(frames) * (group.size if setup.own_frames else 1), preset.recipe.batch):
         raise ValueError(
             f"{group.size} processes are more than the {len(frames)} frames or the batch of "
             f"{preset.recipe.batch} can be shared out to"
         )
-    part = dataclasses.replace(frames, usable=group.shard(frames.usable)).to(device)
+    usable = frames.usable if setup.own_frames else group.shard(frames.usable)
+    part = dataclasses.replace(frames, usable=usable).to(device)
     if group.rank:
         checkpointing = dataclasses.replace(checkpointing, file=None)
     loop = _Loop(part, preset, setup, callbacks, checkpointing)

@@ -15,12 +15,14 @@ from deep_nrsfm_ros.data.dataset import Dataset, concatenate
 from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints, recordings
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.read_options import ReadOptions
+from deep_nrsfm_ros.data.share import Share
 from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
 from deep_nrsfm_ros.data.virtual_people import read_virtual_people
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
 from deep_nrsfm_ros.training.config import COMMAND_LINE, DataConfig, TrainingConfig
+from deep_nrsfm_ros.training.distributed import own_share
 from deep_nrsfm_ros.training.reporter import Reporter
 from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
 
@@ -46,6 +48,8 @@ class Prepared:
 def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
     """Return the dataset that the configuration names, and report what was lost on the way.
 
+    Each of several processes reads its own share of bags and files; all read the motion capture.
+
     Raises ValueError where there is no such data, or none that can be read.
     """
     data = config.data
@@ -57,7 +61,7 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
         min_confidence=data.min_confidence,
         mapping=read_field_mapping(data.mapping),
         image_size=data.image_size,
-        max_frames=config.limits.max_frames,
+        max_frames=-(-config.limits.max_frames // own_share().size),
         missing_value=data.missing_value,
         min_score=data.min_score,
         category=data.category,
@@ -75,9 +79,10 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
     if data.inputs:
         parts += _read_inputs(data, KeypointMap(source, target), options, reporter, bool(parts))
     dataset = concatenate(parts)
-    if len(dataset) > config.limits.max_frames:
+    if len(dataset) > -(-config.limits.max_frames // own_share().size):
+        total = len(dataset) * own_share().size
         raise ValueError(
-            f"bags and files have {len(dataset)} frames; at most {config.limits.max_frames} are "
+            f"bags and files have {total} frames; at most {config.limits.max_frames} are "
             "read (max_frames); name fewer files, or allow more"
         )
     return dataset
@@ -121,7 +126,7 @@ def _read_bags(
 ) -> Dataset:
     """Return all objects in the bags as one dataset, and report what could not be read."""
     layouts = keypoint_map.source, keypoint_map.target
-    reading = read_bags(data.bags, *layouts, options, reporter.reading)
+    reading = read_bags(data.bags, *layouts, options, reporter.reading, own_share())
     for warning in reading.warnings:
         reporter.warn(warning)
     if reading.unreadable:
@@ -142,9 +147,13 @@ def _read_inputs(
     So near-duplicates of one person follow one another, as the curation expects. A file that
     cannot be read is left out with a warning, unless no data is left. Where there are several
     sources, the names that a file has for its keypoints go before the layout of the configuration.
+    Each of several processes reads every n-th file; where there are fewer files than processes, it
+    takes its share of the objects in each.
     """
-    paths = _paths(data)
+    paths, share = _paths(data), own_share()
     is_only_source = len(paths) == 1 and not data.bags
+    if len(paths) >= share.size:
+        paths, share = paths[share.index :: share.size], Share()
     named = keypoint_map.source if data.keypoint_layout and is_only_source else None
     options = dataclasses.replace(options, layout=named, fallback=keypoint_map.source)
     parts, failures = [], []
@@ -161,6 +170,7 @@ def _read_inputs(
         for warning in (*detections.warnings, *map(str, detections.findings)):
             reporter.warn(f"{path.name}: {warning}")
         order = np.lexsort((detections.frame, detections.identities))
+        order = order[share.rows(len(order))]
         points, confidence = to_target(detections.points[order], detections.confidence[order])
         parts.append(Dataset(points, confidence > 0, keypoint_map.target, f"file {path.name}"))
     if not parts and not may_be_none:

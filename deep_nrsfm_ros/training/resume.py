@@ -30,7 +30,8 @@ def resume_arguments(arguments: argparse.Namespace, say: Callable[[str], None]) 
     """
     config = TrainingConfig.from_arguments(arguments)
     folder, name = config.output.folder.expanduser(), config.output.name
-    record, has_data = read_record(folder, name), config.data.bags or config.data.cmu
+    record, data = read_record(folder, name), config.data
+    has_data = bool(data.bags or data.inputs or data.cmu)
     if record is None:
         if not has_data:
             raise ValueError(

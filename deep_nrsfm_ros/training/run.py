@@ -189,6 +189,7 @@ def _train(
             LayoutLoss(weights, dataset.layout) if weights != LayoutLossWeights() else None,
             config.limits,
             group,
+            own_frames=not config.data.cmu,
         ),
         Callbacks(on_progress=reporter.training, should_stop=should_stop),
         Checkpointing(checkpoint),

@@ -166,6 +166,30 @@ def test_it_inherits_its_origin_and_the_axes_that_it_cannot_find(
     np.testing.assert_array_equal(unknown.object_frame, mirrored)
 
 
+def test_bones_of_many_people_are_kept_by_a_training_on_few_views(
+    source: Model, figure: Any
+) -> None:
+    names = figure.layout.keypoints
+    layout = dataclasses.replace(figure.layout, edges=tuple((names[0], n) for n in names[1:5]))
+    lengths = np.full((len(layout.bone_indices()), 2), 0.25, np.float32)
+    correlation = np.eye(len(lengths), dtype=np.float32)
+    people = dataclasses.replace(
+        source, layout=layout, bone_lengths=lengths, bone_correlation=correlation
+    )
+    one = dataclasses.replace(people, bone_correlation=np.zeros((0, 0), np.float32))
+    trainer = tuned(source, figure.layout, figure.points, steps=1)
+    trained = finish(trainer, "new", layout, "new data")
+    kept = inherit(trained, people)
+    np.testing.assert_array_equal(kept.bone_lengths, lengths)
+    np.testing.assert_array_equal(kept.bone_correlation, correlation)
+    np.testing.assert_array_equal(kept.error_covariance, trained.error_covariance)
+    assert kept.provenance["from"]["bones"] == "kept"
+    nameless = finish(trainer, "new", figure.layout, "new data")  # it has no edges
+    for model, own in ((inherit(trained, one), trained), (inherit(nameless, people), nameless)):
+        np.testing.assert_array_equal(model.bone_lengths, own.bone_lengths)
+        assert "bones" not in model.provenance["from"]
+
+
 def test_no_steps_keep_the_network_and_learn_the_last_step_from_other_people(
     source: Model, figure: Any
 ) -> None:

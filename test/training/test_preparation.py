@@ -109,6 +109,24 @@ def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
         read("--input", str(tmp_path / "pictures"))
 
 
+def test_each_process_reads_its_share_of_the_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_files(tmp_path)
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "test")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    sources = []
+    for process in range(2):
+        monkeypatch.setenv("RANK", str(process))
+        both = ("--input", f"{tmp_path}/a.npz", "--input", f"{tmp_path}/coco.json")
+        sources.append(read(*both, "--object", "human17").source)
+    assert sources == ["file a.npz", "file coco.json"]
+    np.savez(tmp_path / "many.npz", points=pixels(40))
+    monkeypatch.setenv("RANK", "1")
+    one = read("--input", f"{tmp_path}/many.npz", "--object", "human17")
+    np.testing.assert_array_equal(one.points, pixels(40)[16:32])  # fewer files than processes
+
+
 def test_one_bad_file_is_left_out_and_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
