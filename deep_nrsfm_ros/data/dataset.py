@@ -57,12 +57,12 @@ class Dataset:
 
         The arrays of indices are copies, in files where they are large.
         """
-        arrays = (self.points, self.visible, self.shapes)
-        points, visible, shapes = (
-            a if a is None else a[frames] if isinstance(frames, slice) else take(a, frames)
-            for a in arrays
-        )
-        assert points is not None and visible is not None
+
+        def chosen(array: NDArray[Any]) -> NDArray[Any]:
+            return array[frames] if isinstance(frames, slice) else take(array, frames)
+
+        shapes = None if self.shapes is None else chosen(self.shapes)
+        points, visible = chosen(self.points), chosen(self.visible)
         return Dataset(points, visible, self.layout, self.source, shapes)
 
 

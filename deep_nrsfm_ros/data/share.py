@@ -38,8 +38,8 @@ class Share:
 
     def rows(self, n: int) -> NDArray[np.int64]:
         """Return the indices of this share among n items."""
-        everything = np.arange(n)
-        return everything[everything // BLOCK % self.size == self.index]
+        own: NDArray[np.bool_] = np.arange(n) // BLOCK % self.size == self.index
+        return np.flatnonzero(own)
 
 
 WHOLE_SHARE = Share()

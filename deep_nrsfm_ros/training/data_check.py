@@ -41,8 +41,8 @@ def check_dataset(
             multiplied; None: unknown.
         reporter: takes the warnings.
     """
-    points = to_pixels(dataset.points, dataset.visible, image_size)
-    if points is not dataset.points:
+    if image_size is not None:  # else nothing is multiplied
+        points = to_pixels(dataset.points, dataset.visible.astype(np.float32), image_size)
         dataset = dataclasses.replace(dataset, points=np.asarray(points, np.float32))
     for finding in _findings(dataset, source, image_size):
         reporter.warn(str(finding))
