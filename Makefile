@@ -1,4 +1,4 @@
-# make demo        from a fresh clone to the picture
+# make demo        from a fresh clone to a person in 3D on a page
 # make demo-live   from videos to 3D, with MediaPipe Pose as the detector
 # make test        environment, lint, types and all tests; TEST_PROCESSES=2: two files at a time
 # make lint        lint and types only
@@ -48,7 +48,7 @@ EXAMPLES_READY := .venv/.ready-examples
 .PHONY: demo demo-live test lint sanitize fuzz benchmark benchmark-speed audit lock clean clean-demo reference
 
 demo: $(READY)
-	$(PYTHON) -m deep_nrsfm_ros.commands.demo
+	$(PYTHON) -m deep_nrsfm_ros.commands.demo --node
 
 demo-live: $(EXAMPLES_READY)
 	$(PYTHON) -m examples.demo_live

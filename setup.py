@@ -47,6 +47,7 @@ setup(
     package_data={
         NAME: [
             *("py.typed", "kernel/*.pyi", "layouts/presets/*.yaml", "layouts/trees/*.yaml"),
+            *("data/clip.npz", "data/clip_licence.txt"),
             *("reporting/*.j2", "reporting/*.css", "reporting/*.js"),
         ]
     },
@@ -100,6 +101,9 @@ setup(
         "train": [
             "torch>=2.2",  # training; lifting needs none
         ],
+        "demo": [
+            "pillow",  # the picture of `deep-nrsfm demo`; its page needs nothing
+        ],
         "hdf5": [
             "h5py",  # reads the .h5 of DeepLabCut without pandas and PyTables (200 MB)
         ],
@@ -123,8 +127,8 @@ setup(
             "setuptools<80",  # colcon calls setup.py in ways that setuptools 80 dropped
         ],
         "benchmarks": [
-            "matplotlib",  # the demo's picture and the benchmarks' plots
-            "scipy",  # the demo's ground truth: triangulation from four calibrated cameras
+            "matplotlib",  # the benchmarks' plots
+            "scipy",  # ground truth of real scenes: triangulation from calibrated cameras
         ],
         # Not in requirements.lock: only benchmarks.speed.forward_pass has a row for it.
         "speed": [

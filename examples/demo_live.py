@@ -17,14 +17,15 @@ from pathlib import Path
 import numpy as np
 from sensor_msgs.msg import PointCloud2
 
-from deep_nrsfm_ros.commands.demo.__main__ import LOG, evaluate, fetch_wheel, launch, say
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Info, Played, lifter, node
-from deep_nrsfm_ros.data.pose2sim import View, extract_videos, read_session
+from deep_nrsfm_ros.commands.demo.first_look import TORSO, read_model, say, show
+from deep_nrsfm_ros.commands.demo.over_dds import CAMERA_INFO, LOG, evaluate, launch
+from deep_nrsfm_ros.data.clip import read_clip
+from deep_nrsfm_ros.data.pose2sim import View, extract_videos, fetch_wheel, read_session
 from deep_nrsfm_ros.layouts.presets import MEDIAPIPE33
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read_observation
-from deep_nrsfm_ros.model_files.folders import model_folders
-from deep_nrsfm_ros.model_files.model_file import find_model, load_model
+from deep_nrsfm_ros.reporting.stage import make_stage
 
 DETECTOR = "examples.mediapipe_detector"
 TOPIC = "/keypoints"
@@ -44,7 +45,7 @@ class Listener(Client):
 
     def __init__(self, process: subprocess.Popen[bytes], bag: Path) -> None:
         """Connect to the lifter that runs as `process`; `bag` must not exist yet."""
-        super().__init__(process, None, bag)
+        super().__init__(process, None, bag, CAMERA_INFO)
         self._heard: dict[int, float] = {}
         self._seen: list[Observation] = []
         self._record(PointCloud2, TOPIC, self._take_keypoints)
@@ -86,7 +87,7 @@ class Listener(Client):
 def run(given: argparse.Namespace) -> None:
     """Run the demo; raise DemoError, ValueError or OSError for what goes wrong."""
     models = given.output / "models"
-    layout = load_model(find_model(given.model, model_folders(models))).layout
+    layout = read_model(given.model, given.output).layout
     wheel = fetch_wheel(given.cache)
     videos = extract_videos(wheel, "Balancing", given.output / "videos")
     say("triangulating the ground truth from the detections that come with the videos")
@@ -97,6 +98,8 @@ def run(given: argparse.Namespace) -> None:
         "model": given.model,
         "models_dir": models,
         "keypoint_layout": MEDIAPIPE33.name,
+        "camera_info": CAMERA_INFO,
+        "reference_length": TORSO,
     }
     answers: list[Played] = []
     views: list[View] = []
@@ -105,11 +108,13 @@ def run(given: argparse.Namespace) -> None:
         with listener:
             listener.meet()
             for view in session.views:
+                listener.announce(view.camera)
                 played, seen = look(listener, videos[view.camera.name], view, given.output)
                 answers.append(played)
                 views.append(dataclasses.replace(view, points=seen[0], confidence=seen[1]))
     live = dataclasses.replace(session, views=tuple(views))
-    evaluate(live, answers, layout, bag, given.output / "demo_live.png", MEDIAPIPE33)
+    lifted = evaluate(live, answers, layout, bag)
+    show(make_stage(live, read_clip().images, MEDIAPIPE33, layout, lifted), given.output)
 
 
 def look(listener: Listener, video: Path, view: View, output: Path) -> tuple[Played, Observation]:

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from deep_nrsfm_ros.commands.demo.__main__ import fetch_wheel
 from deep_nrsfm_ros.data.cameras import triangulate
-from deep_nrsfm_ros.data.pose2sim import JOINTS, View, extract_videos, read_session
+from deep_nrsfm_ros.data.pose2sim import JOINTS, View, extract_videos, fetch_wheel, read_session
 from deep_nrsfm_ros.layouts.presets import MEDIAPIPE33
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 

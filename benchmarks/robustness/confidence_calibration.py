@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import Session, run_program
 from benchmarks.table import Table
-from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
-from deep_nrsfm_ros.data.pose2sim import JOINTS, read_session
+from deep_nrsfm_ros.data.pose2sim import JOINTS, WHEEL, read_session
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, COCO17, HUMAN17
@@ -80,7 +79,7 @@ LEGEND = {
     f"{DISTANCE[1]:g} RMS radii away and up to {ASIDE:g} degrees beside the optical axis, with a "
     f"noise of {', '.join(f'{n:.0%}' for n in NOISE)} of the RMS radius, drawn for each frame; "
     "as coco17: without toes, and with neck and mid-hip only where the two points between which "
-    "they lie are visible; detections of pose2sim, where `make demo` has fetched them, and of "
+    "they lie are visible; detections of pose2sim, where `make demo-live` has fetched them, and of "
     "Shelf, and motion capture before HumanEva's cameras, where DATA/scenes has them: the 12 limb "
     "joints, Shelf and HumanEva with intrinsics. The fit saw none of them",
     "cut": f"{GAPS}: {', '.join(f'{h:.0%}' for h in HIDDEN)} of the points hidden, drawn for each "

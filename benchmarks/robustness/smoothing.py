@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
 from deep_nrsfm_ros.data.openpose import largest, read_people
-from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, read_session
+from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, WHEEL, read_session
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all

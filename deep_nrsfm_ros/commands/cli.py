@@ -14,6 +14,7 @@ from deep_nrsfm_ros.commands.program import called_as
 from deep_nrsfm_ros.model_files.folders import PACKAGE
 
 PROGRAMS = {
+    "demo": "lift a real person and show it on a page: a first look",
     "lift": "lift a file of 2D keypoints to 3D",
     "train": "train a model from bags of 2D keypoints",
     "evaluate": "compare models with motion capture or with real cameras",

@@ -7,6 +7,8 @@ ground truth for the real detections of each view.
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,14 +16,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from deep_nrsfm_ros.data.cameras import Array, Camera, triangulate
 from deep_nrsfm_ros.data.openpose import largest, read_people
 from deep_nrsfm_ros.layouts.presets import BODY25B, HUMAN17
 from deep_nrsfm_ros.lifting.observation import Observation
 
+WHEEL = "pose2sim-0.6.0-py3-none-any.whl"
 RATE = 60.0
 """Frames per second of the cameras."""
 JOINTS = HUMAN17.keypoints[:12]
@@ -73,6 +74,24 @@ class Session:
     world: Array
     pixels: tuple[float, float]
     pixels_given: tuple[float, float]
+
+
+def fetch_wheel(cache: Path) -> Path:
+    """Return the wheel that contains the session; download it from PyPI if it is not in `cache`.
+
+    Raises:
+        OSError: the download fails.
+    """
+    wheel, partial = cache / WHEEL, cache / "partial"
+    if not wheel.exists():
+        print("- fetching the detections (pose2sim 0.6.0, BSD-3, 23 MB)", flush=True)
+        command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest"]
+        try:
+            subprocess.run([*command, str(partial), "pose2sim==0.6.0"], check=True)
+        except subprocess.CalledProcessError:
+            raise OSError(f"pip cannot fetch pose2sim 0.6.0; put {WHEEL} into {cache}") from None
+        (partial / WHEEL).replace(wheel)
+    return wheel
 
 
 def read_session(wheel: Path) -> Session:
@@ -199,6 +218,8 @@ def refine(cameras: list[Camera], pixels: Array, weights: Array) -> tuple[list[C
     Returns:
         The refined cameras, and their delays (c,) in frames behind the first one.
     """
+    from scipy.optimize import least_squares  # 100 MB that a reader of the views does not need
+    from scipy.spatial.transform import Rotation
 
     def unpack(x: Array) -> tuple[list[Camera], Array]:
         moves = np.concatenate([np.zeros((1, 7)), x.reshape(-1, 7)]) * _PRIOR

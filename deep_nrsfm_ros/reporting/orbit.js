@@ -2,9 +2,10 @@
 "use strict";
 
 class Orbit {
-  // draw(orbit) is called whenever the view changes; zoom: pixels per unit of the scene.
+  // draw(orbit) is called whenever the view changes; zoom: pixels per unit of the scene; distance: of
+  // the viewer from the origin, Infinity: no perspective.
   constructor(canvas, yaw, pitch, draw) {
-    Object.assign(this, { canvas, yaw, pitch, draw, pen: canvas.getContext("2d"), zoom: 1 });
+    Object.assign(this, { canvas, yaw, pitch, draw, pen: canvas.getContext("2d"), zoom: 1, distance: Infinity });
     canvas.addEventListener("pointerdown", e => canvas.setPointerCapture(e.pointerId));
     canvas.addEventListener("pointermove", e => {
       if (!e.buttons) return;
@@ -27,9 +28,10 @@ class Orbit {
   project([x, y, z]) {
     const [c, s] = [Math.cos(this.yaw), Math.sin(this.yaw)];
     const [cp, sp] = [Math.cos(this.pitch), Math.sin(this.pitch)];
-    const depth = c * z - s * x;
-    return [this.width / 2 + this.zoom * (c * x + s * z),
-            this.height / 2 - this.zoom * (cp * y - sp * depth), cp * depth + sp * y];
+    const depth = c * z - s * x, nearness = cp * depth + sp * y;
+    const zoom = this.zoom / Math.max(0.1, 1 - nearness / this.distance);
+    return [this.width / 2 + zoom * (c * x + s * z),
+            this.height / 2 - zoom * (cp * y - sp * depth), nearness];
   }
 
   // Lines [from, to, colour, opacity, width] between projected points, drawn from far to near, far ones fainter.

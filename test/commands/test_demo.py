@@ -15,10 +15,9 @@ import numpy as np
 import pytest
 
 import deep_nrsfm_ros
-from deep_nrsfm_ros.commands.demo.__main__ import WHEEL, fetch_wheel
 from deep_nrsfm_ros.commands.demo.client import Played
 from deep_nrsfm_ros.commands.demo.evaluation import read_points
-from deep_nrsfm_ros.data.cameras import Camera
+from deep_nrsfm_ros.data.pose2sim import WHEEL, fetch_wheel
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
@@ -56,22 +55,20 @@ def test_a_latency_below_zero_is_no_latency() -> None:
 
 
 @pytest.fixture
-def start(tmp_path: Path, ring: list[Camera], write_session: Any) -> Start:
-    """Return a function that starts the demo on a made-up session with an untrained model."""
-    write_session(tmp_path / WHEEL, ring, ring, [0.0] * 4)
+def start(tmp_path: Path) -> Start:
+    """Return a function that starts the demo with an untrained model."""
     network = initialise(Architecture(widths=(16, 8)), len(HUMAN17), np.random.default_rng(0))
     model = Model("untrained", network, HUMAN17, Normaliser(), np.eye(3, dtype=np.float32))
     save_model(tmp_path / "untrained.safetensors", model)
 
     def run(**options: Any) -> subprocess.Popen[str]:
         options = {
-            "cache": tmp_path,
             "output": tmp_path / "output",
             "model": tmp_path / "untrained.safetensors",
         } | options
         words = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
         return subprocess.Popen(
-            [sys.executable, "-m", "deep_nrsfm_ros.commands.demo", *words],
+            [sys.executable, "-m", "deep_nrsfm_ros.commands.demo", "--node", *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -93,7 +90,7 @@ def descendants(folder: Path) -> list[str]:
     return lines
 
 
-def test_demo_from_wheel_to_trained_model(start: Start, tmp_path: Path) -> None:
+def test_demo_from_keypoints_to_trained_model(start: Start, tmp_path: Path) -> None:
     process = start(train_steps=20)
     said, _ = process.communicate(timeout=170)
     assert process.returncode == 0, said
@@ -101,8 +98,9 @@ def test_demo_from_wheel_to_trained_model(start: Start, tmp_path: Path) -> None:
     table = [line.split() for line in said.splitlines() if line.lstrip().startswith(("cam", "mea"))]
     assert [row[0] for row in table] == ["camera", "cam01", "cam02", "cam03", "cam04", "mean"]
     assert all(float(row[4]) > 0 for row in table[1:])
-    assert all(row[1] == "30" and 15 <= float(row[2]) <= 30 for row in table[1:])
-    assert len(read_points(output / "lifted")) >= 60
+    assert all(row[1] == "100" and 50 <= float(row[2]) <= 100 for row in table[1:])
+    assert len(read_points(output / "lifted")) >= 200
+    assert len(said.splitlines()) <= 40 and (output / "demo.html").as_uri() in said
     assert (output / "demo.png").read_bytes().startswith(b"\x89PNG")
     assert load_model(output / "models" / "demo.safetensors").layout == HUMAN17
     assert said.count("mm aligned") == 2  # of both models

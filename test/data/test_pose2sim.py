@@ -71,7 +71,7 @@ def test_foreign_files_are_refused(tmp_path: Path, ring: list[Camera], write_ses
 def test_the_real_session() -> None:
     wheel = Path(os.environ.get("POSE2SIM_WHEEL", f".cache/{WHEEL}"))
     if not wheel.exists():
-        pytest.skip(f"{wheel} is not there; `make demo` fetches it")
+        pytest.skip(f"{wheel} is not there; `make demo-live` fetches it")
     session = read_session(wheel)
     assert [view.points.shape for view in session.views] == [(100, 25, 2)] * 4
     assert session.pixels_given[0] == pytest.approx(15.9, abs=0.5)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import Reader
 
-from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.cameras import Camera
+from deep_nrsfm_ros.data.pose2sim import WHEEL
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise

@@ -237,7 +237,7 @@ def test_the_real_one_sees_the_person(tmp_path: Path) -> None:
     pytest.importorskip("mediapipe", reason="`make demo-live` installs it")
     wheel = Path(os.environ.get("POSE2SIM_WHEEL", ".cache/pose2sim-0.6.0-py3-none-any.whl"))
     if not wheel.exists() or not zipfile.is_zipfile(wheel):
-        pytest.skip(f"{wheel} is not there; `make demo` fetches it")
+        pytest.skip(f"{wheel} is not there; `make demo-live` fetches it")
     from examples.mediapipe_detector import Detector, images
 
     videos = extract_videos(wheel, "Balancing", tmp_path)

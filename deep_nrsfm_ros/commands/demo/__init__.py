@@ -1,1 +1,5 @@
-"""The demo: real detections of a person, over real DDS, into 3D, and a training on top."""
+"""The demo: a real person, seen by four cameras, lifted to 3D and shown on a page."""
+
+from deep_nrsfm_ros.commands.demo.first_look import main
+
+__all__ = ["main"]

@@ -25,9 +25,12 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import CameraInfo, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+
+from deep_nrsfm_ros.data.cameras import Camera
+from deep_nrsfm_ros.lifting.intrinsics import PLUMB_BOB
 
 Info = Mapping[str, Any]
 """Of a message: `source_timestamp` and `received_timestamp` in ns of the system's clock."""
@@ -116,13 +119,20 @@ class Client:
         training: values of the latest training status.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes], source: Path | None, bag: Path) -> None:
+    def __init__(
+        self,
+        process: subprocess.Popen[bytes],
+        source: Path | None,
+        bag: Path,
+        camera_info: str = "camera_info",
+    ) -> None:
         """Connect to a lifter.
 
         Args:
             process: runs the lifter.
             source: bag to play, with PointCloud2 messages on one topic; None: nothing to play.
             bag: to record; must not exist.
+            camera_info: topic of `announce`.
         """
         self._process = process
         self._messages = _by_camera(source) if source else {}
@@ -138,6 +148,7 @@ class Client:
         self._received: dict[int, float] = {}
         self._errors: list[float] = []
         self._publisher = self._node.create_publisher(PointCloud2, "keypoints", 10)
+        self._camera_info = self._node.create_publisher(CameraInfo, camera_info, _LATCHED)
         self._record(PointCloud2, "/lifter/points", self._take_points)
         self._record(QuaternionStamped, "/lifter/camera_rotation", lambda *_: None)
         self._record(DiagnosticArray, "/diagnostics", self._take_report)
@@ -163,6 +174,18 @@ class Client:
         """Wait until the lifter and this client have discovered each other."""
         self.wait(self._publisher.get_subscription_count, "the lifter's subscription")
         self.wait(lambda: self.health and self.training, "the lifter's diagnostics")
+
+    def announce(self, camera: Camera) -> None:
+        """Publish the intrinsics of a camera, and wait until the lifter's diagnostics show them."""
+        message = CameraInfo(width=camera.size[0], height=camera.size[1])
+        message.header.frame_id = camera.name
+        message.distortion_model = PLUMB_BOB
+        message.k, message.d = camera.matrix.ravel().tolist(), camera.distortion.tolist()
+        self._camera_info.publish(message)
+        self.wait(
+            lambda: f"length {camera.matrix[0, 0]:.1f} " in self.health.get("camera", ""),
+            f"the intrinsics of {camera.name}",
+        )
 
     def play(self, camera: str) -> Played:
         """Publish the messages of a camera at the rate of their stamps; wait for diagnostics.

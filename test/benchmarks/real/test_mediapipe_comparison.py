@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.data import pose2sim_scenes
 from benchmarks.data.pose2sim_scenes import LIMBS, PoseDetections
 from benchmarks.real import mediapipe_comparison
-from deep_nrsfm_ros.commands.demo.__main__ import WHEEL
 from deep_nrsfm_ros.data.cameras import Camera
-from deep_nrsfm_ros.data.pose2sim import JOINTS
+from deep_nrsfm_ros.data.pose2sim import JOINTS, WHEEL
 from deep_nrsfm_ros.layouts.presets import BODY25B
 
 FRAMES = 12

@@ -1,0 +1,163 @@
+"""Lift a real person, seen by four cameras one at a time, and write a page that shows it.
+
+The clip is part of the package: 2D keypoints of a detector, images, and ground truth to compare
+with. With --node the keypoints take the way of a robot: they are played over DDS to the lifter, its
+answers are recorded, and a model is trained on the recording by the lifter's service.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.data.clip import Clip, read_clip
+from deep_nrsfm_ros.data.detections import gather, stamps_at
+from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, View
+from deep_nrsfm_ros.data.recording import lift_recording
+from deep_nrsfm_ros.extras import is_installed, require_extra
+from deep_nrsfm_ros.layouts.presets import BODY25B
+from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.observation import Observation
+from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
+from deep_nrsfm_ros.nrsfm.metrics import camera_errors
+from deep_nrsfm_ros.reporting.stage import Stage, make_stage, stage_page
+
+TORSO = 0.5
+"""Metres from the neck to the middle of the hips that the demo assumes of the person."""
+PAGE, PICTURE = "demo.html", "demo.png"
+_NOTES = (
+    f"place and size from the camera's intrinsics and an assumed torso of {TORSO} m; "
+    "nothing is fitted to the ground truth",
+)
+
+
+def arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(prog=program_name("demo"), description=__doc__)
+    parser.add_argument(
+        "--output", type=Path, default=Path("demo_output"), help="folder of the results"
+    )
+    parser.add_argument("--model", default="human", help="model to lift with: a name or a path")
+    parser.add_argument(
+        "--node",
+        action="store_true",
+        help="play the keypoints over DDS to the lifter node, and train on the recording; needs "
+        "the extras ros and train",
+    )
+    parser.add_argument(
+        "--train-steps", type=int, default=300, help="training steps; 0 = no training"
+    )
+    return parser
+
+
+def say(text: str) -> None:
+    """Print a step of the demo without buffering."""
+    print(f"- {text}", flush=True)
+
+
+def read_model(name: str, output: Path) -> Model:
+    """Return the model of the demo.
+
+    Raises:
+        ValueError: it is not there, damaged, or lacks a joint of the ground truth.
+    """
+    model = load_model(find_model(name, model_folders(output / "models")))
+    if lacking := [joint for joint in JOINTS if joint not in model.layout.keypoints]:
+        raise ValueError(f"model {model.name!r} lifts no person: it has no {lacking[0]}")
+    return model
+
+
+def lift_view(view: View, model: Model) -> NDArray[np.floating]:
+    """Return the lifted points (f, p, 3) of one camera in its optical frame, in metres."""
+    frames = [
+        Observation(view.points[i : i + 1], view.confidence[i : i + 1])
+        for i in range(len(view.points))
+    ]
+    detections = gather(
+        frames,
+        stamps_at(RATE, len(frames)),
+        len(BODY25B),
+        view.camera.name,
+        ["person"] * len(frames),
+    )
+    lifter = Lifter(model, LiftingOptions(reference_length=TORSO))
+    recording = lift_recording(detections, BODY25B, lifter, intrinsics=view.camera.intrinsics)
+    shapes: NDArray[np.floating] = recording.lifted.shapes
+    return shapes
+
+
+def show(stage: Stage, output: Path) -> str:
+    """Write page and picture of a stage; return a sentence that names the page."""
+    output.mkdir(parents=True, exist_ok=True)
+    page = output / PAGE
+    page.write_text(
+        stage_page(stage, "A person in 3D, from one camera at a time", _NOTES), encoding="utf-8"
+    )
+    if is_installed("PIL"):
+        from deep_nrsfm_ros.reporting.stage_image import draw_picture
+
+        draw_picture(stage, output / PICTURE)
+        say(f"picture: {output / PICTURE}")
+    else:
+        say("no picture, as Pillow is not installed: pip install pillow")
+    said = f"page, for any browser: {page.absolute().as_uri()}"
+    say(said)
+    return said
+
+
+def run(args: argparse.Namespace) -> None:
+    """Lift the clip without ROS.
+
+    Raises:
+        ValueError: the model cannot be used.
+        OSError: a file cannot be written.
+    """
+    model, clip = read_model(args.model, args.output), read_clip()
+    truth, _ = clip.session.pixels
+    say(
+        f"{len(clip.session.views)} cameras saw a person for {len(clip.session.world) / RATE:.1f} "
+        f"s; the ground truth is triangulated from all of them ({truth:.1f} px off on average)"
+    )
+    lifted = []
+    for view in clip.session.views:
+        shapes = lift_view(view, model)
+        lifted.append(shapes)
+        known = np.isfinite(shapes).all((1, 2))
+        limbs = [model.layout.index(joint) for joint in JOINTS]
+        error = camera_errors(1000 * shapes[known][:, limbs], view.truth[known])
+        say(
+            f"{view.camera.name}: {known.sum()} of {len(known)} frames lifted; joints are "
+            f"{error.aligned:.0f} mm off after alignment, the rotation {error.rotation:.0f} degrees"
+        )
+    show(stage_of(clip, model, lifted), args.output)
+
+
+def stage_of(clip: Clip, model: Model, lifted: Sequence[NDArray[np.floating]]) -> Stage:
+    """Return the stage of the clip with its lifted points (f, p, 3) of each camera."""
+    return make_stage(clip.session, clip.images, BODY25B, model.layout, lifted)
+
+
+@program
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the demo; exit with 1 on an error, with 130 when interrupted."""
+    args = arguments().parse_args(argv)
+    try:
+        if not args.node:
+            run(args)
+            return
+        require_extra("ros", "demo --node")
+        if args.train_steps:
+            require_extra("train", "training")
+        from deep_nrsfm_ros.commands.demo import over_dds
+
+        over_dds.launch(over_dds.run, args)
+    except (OSError, ValueError) as error:
+        sys.exit(f"demo: {error}")
