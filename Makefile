@@ -2,6 +2,7 @@
 # make demo-live   from videos to 3D, with MediaPipe Pose as the detector
 # make test        environment, lint, types and all tests; TEST_PROCESSES=2: two files at a time
 # make lint        lint and types only
+# make docs        the documentation site in build/site, warnings are errors
 # make reference   docs/reference/ from the code
 # make sanitize    the kernel's tests with a kernel that checks every access (ASan, UBSan)
 # make fuzz        100000 spoilt inputs of every kind; takes hours
@@ -45,7 +46,7 @@ READY := .venv/.ready
 # Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
 EXAMPLES_READY := .venv/.ready-examples
 
-.PHONY: demo demo-live test lint sanitize fuzz benchmark benchmark-speed audit lock clean clean-demo reference
+.PHONY: docs demo demo-live test lint sanitize fuzz benchmark benchmark-speed audit lock clean clean-demo reference
 
 demo: $(READY)
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo --node
@@ -63,6 +64,11 @@ lint: $(READY)
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
+
+docs: $(READY)
+	$(PYTHON) -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[docs]'
+	$(PYTHON) -m sphinx -W --keep-going -q -b html docs build/site
+	@echo build/site/index.html
 
 reference: $(READY)
 	$(PYTHON) -m docs.generate

@@ -118,6 +118,8 @@ setup(
             "pytest-timeout",  # a process that never answers fails its test instead of hanging all
             "h5py",  # writes files as DeepLabCut does
             "kinpy",  # reads the URDF of a person; its forward kinematics must be ours
+            "jsonschema",  # object files against their schema
+            "pillow",  # the demo's picture
             "hypothesis",  # properties over generated input
             "ruff",  # lint and format
             "mypy",  # types
@@ -125,6 +127,12 @@ setup(
             "types-tqdm",  # types of tqdm
             "colcon-common-extensions",  # the test that builds as a ROS workspace does
             "setuptools<80",  # colcon calls setup.py in ways that setuptools 80 dropped
+        ],
+        "docs": [
+            "sphinx",  # the documentation site
+            "myst-parser",  # its pages are Markdown
+            "furo",  # its theme
+            "sphinx-copybutton",  # commands are copied with one click
         ],
         "benchmarks": [
             "matplotlib",  # the benchmarks' plots

@@ -1,15 +1,22 @@
-"""Write the reference pages that follow from the code: parameters and keypoint layouts.
+"""Write the pages that follow from the code: parameters, layouts, command line, faults, schema.
 
 Run `make reference` after a change of an option or a layout. A test fails when a page is stale.
 """
 
 from __future__ import annotations
 
+import argparse
+import ast
+import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from deep_nrsfm_ros.commands import demo, doctor, evaluate, lift, models, replay, train
+from deep_nrsfm_ros.commands.cli import PROGRAMS
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.layouts.layout_file import FIELDS, HANDEDNESS
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
@@ -23,6 +30,7 @@ from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.request import TrainingOptions
 
 FOLDER = Path(__file__).parent / "reference"
+_PACKAGE = Path(__file__).parents[1] / "deep_nrsfm_ros"
 _HOME = "$ROS_HOME/deep_nrsfm_ros"
 _SHOWN = {"models_dir": f"{_HOME}/models", "bags_dir": f"{_HOME}/bags"}
 _GROUPS: tuple[tuple[str, type, str], ...] = (
@@ -77,7 +85,219 @@ def layouts_page() -> str:
     )
 
 
-PAGES = {"parameters.md": parameters_page, "layouts.md": layouts_page}
+def command_line_page() -> str:
+    """Return the page of all programs and their options, in Markdown."""
+    parsers: dict[str, Callable[[], argparse.ArgumentParser]] = {
+        "demo": demo.arguments,
+        "lift": lift.arguments,
+        "train": train.parser,
+        "evaluate": evaluate.arguments,
+        "models": models.arguments,
+        "replay": replay.arguments,
+        "doctor": doctor.arguments,
+    }
+    parts = [
+        "# Command line",
+        "Each program is called as `deep-nrsfm NAME` or, in a ROS workspace, as `ros2 run "
+        "deep_nrsfm_ros NAME`. Made by `make reference`; do not edit.",
+    ]
+    for name, line in PROGRAMS.items():
+        parts.append(f"## {name}\n\n{line[0].upper()}{line[1:]}.")
+        if name not in parsers:
+            parts.append(
+                "Its options are ROS [parameters](parameters.md): `--ros-args -p NAME:=VALUE`."
+            )
+            continue
+        parser = parsers[name]()
+        parts.append((parser.description or "").strip())
+        for group in parser._action_groups:
+            rows = list(_option_rows(parser, group))
+            if rows:
+                title = (group.title or "options").capitalize()
+                parts.append(
+                    "\n".join([f"**{title}**", "", "| option | meaning |", "|---|---|", *rows])
+                )
+    return "\n\n".join(parts) + "\n"
+
+
+def _option_rows(parser: argparse.ArgumentParser, group: Any) -> Iterator[str]:
+    """Yield a row for each option of a group."""
+    for action in group._group_actions:
+        if action.help == argparse.SUPPRESS or isinstance(action, argparse._HelpAction):
+            continue
+        word = action.metavar or action.dest.upper()
+        choices = "{" + ",".join(map(str, action.choices)) + "}" if action.choices else ""
+        value = "" if action.nargs == 0 else f" {choices or word}"
+        names = [f"`{name}{value}`" for name in action.option_strings] or [f"`{word}`"]
+        text = parser._get_formatter()._expand_help(action) if action.help else ""
+        home = str(Path.home())
+        yield f"| {', '.join(names)} | {_cell(' '.join(text.split()).replace(home, '~'))} |"
+
+
+def _cell(text: str) -> str:
+    """Return text that Markdown shows as it is in a cell of a table."""
+    for character in "|<>*_":
+        text = text.replace(character, f"\\{character}")
+    return text
+
+
+def troubleshooting_page() -> str:
+    """Return the page of faults and remedies, from `doctor` and the checks of keypoints."""
+    rows = ["| found by doctor | remedy |", "|---|---|"]
+    rows += [f"| {_cell(seen)} | {_cell(remedy)} |" for seen, remedy in _doctor_findings()]
+    kinds = ["| kind | message and remedy |", "|---|---|"]
+    kinds += [f"| {kind} | {_cell(text)} |" for kind, text in _keypoint_findings()]
+    return (
+        "\n\n".join(
+            [
+                "# Troubleshooting",
+                "You get: every fault that the package finds by itself, and its remedy. `…` "
+                "stands for what depends on the case. Made by `make reference`; do not edit.",
+                "## The installation\n\n`ros2 run deep_nrsfm_ros doctor`, or `deep-nrsfm doctor`, "
+                "checks imports, environment, disk, model, bags and an answer over DDS.",
+                "\n".join(rows),
+                "## The keypoints\n\nThe lifter says these in its log and on `/diagnostics`; "
+                "`lift` says them at its end.",
+                "\n".join(kinds),
+                "## Nothing comes out\n\n`ros2 topic echo --once /diagnostics` names the topic, "
+                "the number of messages received and dropped, and the last reason. A message that "
+                "cannot be used is never answered by a guess.",
+            ]
+        )
+        + "\n"
+    )
+
+
+def _doctor_findings() -> Iterator[tuple[str, str]]:
+    """Yield what each check of doctor finds, with the remedy, as they stand in its source."""
+    tree = ast.parse((_PACKAGE / "commands" / "doctor.py").read_text(encoding="utf-8"))
+    for check in ast.walk(tree):
+        if not (isinstance(check, ast.FunctionDef) and check.name.startswith("check_")):
+            continue
+        texts: dict[str, str] = {}
+        nodes = [n for n in ast.walk(check) if isinstance(n, ast.Assign | ast.AugAssign | ast.Call)]
+        for node in sorted(nodes, key=lambda n: (n.lineno, n.col_offset)):
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                texts[node.targets[0].id] = _text(node.value, texts)
+            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Result":
+                seen, *rest = node.args
+                if rest:
+                    yield _text(seen, texts), _text(rest[0], texts)
+
+
+def _keypoint_findings() -> Iterator[tuple[str, str]]:
+    """Yield kind and text of each finding about keypoints, as they stand in the source."""
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        calls = (n for n in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(n, ast.Call))
+        found = [n for n in calls if getattr(n.func, "id", "") == "Finding" and len(n.args) > 1]
+        for node in sorted(found, key=lambda n: n.lineno):
+            kind, text = _text(node.args[0], {}), _text(node.args[1], {})
+            if set(text) - set("… "):
+                yield kind, text
+
+
+def _text(node: ast.expr, texts: dict[str, str]) -> str:
+    """Return the text of an expression; `…` for what only the program can say."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        parts = [_text(part, {}) for part in node.values]
+        return "".join(parts)
+    if isinstance(node, ast.BinOp):
+        return _text(node.left, texts) + _text(node.right, texts)
+    if isinstance(node, ast.Name):
+        return texts.get(node.id, "…")
+    return "…"
+
+
+_FIELDS = {
+    "name": ("name of the object", {"type": "string", "minLength": 1}),
+    "keypoints": ("names of the keypoints, in the order of the detector", "names"),
+    "edges": ("pairs to draw; those that keep their lengths are bones", "pairs"),
+    "rigid": ("further pairs that keep their distance", "pairs"),
+    "handedness": (
+        "four keypoints that tell the object from its mirror image, or a list of such fours",
+        "handedness",
+    ),
+    "reference": ("the pair that sets the size", "pair"),
+    "reference_length": ("its length in metres", {"type": "number", "exclusiveMinimum": 0}),
+    "derived": (
+        "keypoints that are means of others",
+        {"type": "object", "additionalProperties": {"$ref": "#/$defs/names"}},
+    ),
+    "top": ("the keypoints at the top of an upright object", "one_or_more"),
+    "bottom": ("the keypoints at its bottom", "one_or_more"),
+    "joints": (
+        "the kinematic tree: a mapping, or the name of one of the package",
+        {"type": ["object", "string"]},
+    ),
+}
+
+
+def schema_of_objects() -> str:
+    """Return the JSON Schema of an object file (a layout file)."""
+    name = {"type": "string", "minLength": 1}
+    pair = {"type": "array", "items": name, "minItems": 2, "maxItems": 2}
+    names = {"type": "array", "items": name, "minItems": 1}
+    four = {
+        "type": "object",
+        "properties": dict.fromkeys(HANDEDNESS, name),
+        "required": list(HANDEDNESS),
+        "additionalProperties": False,
+    }
+    kinds: dict[str, Any] = {
+        "names": names,
+        "pair": pair,
+        "pairs": {"type": "array", "items": pair},
+        "handedness": {"anyOf": [four, {"type": "array", "items": four}]},
+        "one_or_more": {"anyOf": [name, names]},
+    }
+    properties = {}
+    for field in FIELDS:
+        text, kind = _FIELDS[field]
+        shape = {"$ref": f"#/$defs/{kind}"} if isinstance(kind, str) else kind
+        # A template leaves fields without a value; they count as absent.
+        properties[field] = {"description": text, "anyOf": [shape, {"type": "null"}]}
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Object file of deep_nrsfm_ros",
+        "type": "object",
+        "properties": properties,
+        "required": ["name", "keypoints"],
+        "additionalProperties": False,
+        "$defs": kinds,
+    }
+    return json.dumps(schema, indent=2) + "\n"
+
+
+def object_file_page() -> str:
+    """Return the page of the fields of an object file, in Markdown."""
+    rows = [f"| `{name}` | {_FIELDS[name][0]} |" for name in FIELDS]
+    return (
+        "\n\n".join(
+            [
+                "# Object files",
+                "You get: the fields of a layout file, and a JSON Schema by which an editor checks "
+                "them: [object.schema.json](object.schema.json). With the YAML language server, "
+                "begin the file with",
+                "    # yaml-language-server: $schema=object.schema.json",
+                "`name` and `keypoints` are needed. What each is for: [objects of your own]"
+                "(../tutorials/object_files.md). Made by `make reference`; do not edit.",
+                "\n".join(["| field | meaning |", "|---|---|", *rows]),
+            ]
+        )
+        + "\n"
+    )
+
+
+PAGES = {
+    "parameters.md": parameters_page,
+    "layouts.md": layouts_page,
+    "command_line.md": command_line_page,
+    "object_file.md": object_file_page,
+    "object.schema.json": schema_of_objects,
+    "../operations/troubleshooting.md": troubleshooting_page,
+}
 
 
 def _default(value: Any) -> str:

@@ -215,16 +215,21 @@ def examine(args: argparse.Namespace) -> bool:
     return well
 
 
-@program
-def main(argv: Sequence[str] | None = None) -> None:
-    """Examine this installation."""
+def arguments() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     from deep_nrsfm_ros.model_files.folders import default_models_dir
 
     parser = argparse.ArgumentParser(prog=program_name("doctor"), description=__doc__)
     parser.add_argument("--model", default=SHIPPED, help="model to lift with (default: human)")
     parser.add_argument("--models-dir", type=Path, default=default_models_dir())
     parser.add_argument("--timeout", type=float, default=30.0, help="seconds for an answer")
-    args = parser.parse_args(argv)
+    return parser
+
+
+@program
+def main(argv: Sequence[str] | None = None) -> None:
+    """Examine this installation."""
+    args = arguments().parse_args(argv)
     args.models_dir = args.models_dir.expanduser().absolute()
     if not examine(args):
         print("lifting does not work yet; repair the faults from the top", file=sys.stderr)

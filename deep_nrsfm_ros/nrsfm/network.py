@@ -462,11 +462,11 @@ def _convolution_fan(name: str, shape: tuple[int, ...]) -> int:
 
 
 def coherence(net: Network) -> float:
-    """Return the mutual coherence of the final dictionary: the largest |cosine| of two atoms.
+    """Return the mutual coherence of the final dictionary.
 
     Returns:
-        A number in [0, 1]; a low one indicates a good model. Atoms of norm zero count as
-        orthogonal to all others.
+        The largest magnitude of the cosine of two atoms, a number in [0, 1]; a low one indicates a
+        good model. Atoms of norm zero count as orthogonal to all others.
 
     Source: section "Coherence as guide".
     """

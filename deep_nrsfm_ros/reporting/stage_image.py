@@ -73,8 +73,8 @@ class Room:
         pen.polygon([(_SMOOTH * x, _SMOOTH * y) for x, y in outline], fill=_FLOOR)
         for d in np.arange(-reach, reach + 1e-9, GRID):
             for ends in (((d, -reach), (d, reach)), ((-reach, d), (reach, d))):
-                a, b = (self._at(self._floor(centre + end)) for end in ends)
-                _line(pen, a, b, _LINE, 1)
+                start, stop = (self._at(self._floor(centre + end)) for end in ends)
+                _line(pen, start, stop, _LINE, 1)
         shape, truth = view.shapes[frame], view.truth[frame]
         flat = shape * [1, 1, 0]
         for a, b, _ in _bones(self.stage.target, flat):
@@ -186,7 +186,7 @@ def animation_frames(
             (0, "2D keypoints of a detector"),
             (photo.width, "3D from this camera alone (grey: truth)"),
         ):
-            at = (left + 2 * margin, 2 * margin)
+            at = (left + 2 * margin, height - round(height / 26) - 3 * margin)
             x1, y1, x2, y2 = pen.textbbox(at, text, font=words)
             pen.rectangle((x1 - margin, y1 - margin, x2 + margin, y2 + margin), "white")
             pen.text(at, text, _DARK, words)

@@ -1,0 +1,22 @@
+"""Print where the nose of each lifted person is: a subscriber to copy."""
+
+import numpy as np
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import PointCloud2
+
+NOSE = 14  # of human17, the layout of the model human
+
+
+def show(message: PointCloud2) -> None:
+    """Print x, y, z and confidence of a keypoint of each object."""
+    points = np.frombuffer(message.data, "<f4").reshape(message.height, message.width, -1)
+    for x, y, z, confidence in points[:, NOSE, :4]:
+        print(f"{x:.3f} {y:.3f} {z:.3f}, confidence {confidence:.2f}", flush=True)
+
+
+rclpy.init()
+node = Node("reader")
+node.create_subscription(PointCloud2, "lifter/points", show, qos_profile_sensor_data)
+rclpy.spin(node)
