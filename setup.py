@@ -39,9 +39,26 @@ class BuildKernel(build_ext):
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="3D shape and camera from 2D keypoints, learned from 2D alone, for ROS 2",
+    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    author="deep_nrsfm_ros maintainers",
+    author_email="maintainers@example.org",
+    url="https://arxiv.org/abs/1902.10840",  # of the method, until the repository has a public one
     license="Apache-2.0",
+    license_files=["LICENSE", f"{NAME}/data/clip_licence.txt"],
+    keywords="ROS 2, human pose estimation, 3D, keypoints, non-rigid structure from motion",
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Developers",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: C",
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in (11, 12, 13)),
+        "Topic :: Scientific/Engineering :: Image Recognition",
+        "Typing :: Typed",
+    ],
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={

@@ -24,7 +24,8 @@ extensions = [
 exclude_patterns = ["README.md", "_build", "__pycache__"]
 html_theme = "furo"
 html_title = f"deep_nrsfm_ros {__version__}"
-html_static_path: list[str] = []
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_extra_path = ["reference/object.schema.json"]
 
 myst_enable_extensions = ["colon_fence"]

@@ -27,7 +27,7 @@ from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read_observation
 from deep_nrsfm_ros.reporting.stage import make_stage
 
-DETECTOR = "examples.mediapipe_detector"
+DETECTOR = "deep_nrsfm_ros.node.mediapipe_detector"
 TOPIC = "/keypoints"
 
 

@@ -1,7 +1,7 @@
 """Start detector, lifter and RViz; the detector is a command, or is already running.
 
 ros2 launch deep_nrsfm_ros live.launch.py keypoints:=/keypoints config:=my_lifter.yaml \
-    detector:="python3 mediapipe_detector.py --ros-args -p source:=0"
+    detector:="ros2 run deep_nrsfm_ros mediapipe_detector --ros-args -p source:=0"
 """
 
 from launch import LaunchDescription

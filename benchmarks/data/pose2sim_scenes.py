@@ -104,7 +104,7 @@ def detect_trial(wheel: Path, trial: str, output: Path) -> dict[str, PoseDetecti
 def detect_video(video: Path) -> PoseDetections:
     """Run MediaPipe on a video."""
     try:
-        from examples.mediapipe_detector import LANDMARKS, Detector, images
+        from deep_nrsfm_ros.node.mediapipe_detector import LANDMARKS, Detector, images
     except ImportError as error:
         raise ValueError(f"{error}; `make demo-live` installs MediaPipe") from None
     detect = Detector()

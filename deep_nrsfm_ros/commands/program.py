@@ -56,7 +56,8 @@ def program_name(name: str) -> str:
     if _called_as:
         return _called_as
     started = Path(sys.argv[0])
-    if started == Path(__file__).with_name(f"{name}.py"):
+    folder = Path(__file__).parent
+    if started in (folder / f"{name}.py", folder / name / "__main__.py"):
         return f"python -m {__package__}.{name}"
     if started.name == name and started.parent.name == "deep_nrsfm_ros":
         return f"ros2 run deep_nrsfm_ros {name}"

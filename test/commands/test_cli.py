@@ -27,7 +27,7 @@ def test_help_lists_every_program_with_a_line() -> None:
 
 
 def test_every_script_is_a_program() -> None:
-    assert {path.name for path in SCRIPTS.iterdir()} == set(cli.PROGRAMS)
+    assert {path.name for path in SCRIPTS.iterdir()} == {*cli.PROGRAMS, "mediapipe_detector"}
 
 
 @pytest.mark.parametrize("name", cli.PROGRAMS)
@@ -50,7 +50,7 @@ def test_ros2_run_shows_in_the_usage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unknown_program_is_refused_with_the_nearest(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for word, hint in {"trian": "did you mean train?", "zzz": "choose one of lift, train,"}.items():
+    for word, hint in {"trian": "did you mean train?", "zzz": "choose one of demo, lift,"}.items():
         with pytest.raises(SystemExit) as end:
             cli.main([word, "--help"])
         assert end.value.code == 2

@@ -24,7 +24,7 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def module(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Return the module of the detector, imported with the stand-ins."""
-    names = ("cv2", "mediapipe", "examples.mediapipe_detector")
+    names = ("cv2", "mediapipe", "deep_nrsfm_ros.node.mediapipe_detector")
     for name in names:
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.syspath_prepend(STAND_INS)

@@ -159,7 +159,13 @@ def start(
         words = [word for k, v in parameters.items() for word in ("-p", f"{k}:={v}")]
         started.append(
             subprocess.Popen(
-                [sys.executable, "-m", "examples.mediapipe_detector", "--ros-args", *words],
+                [
+                    sys.executable,
+                    "-m",
+                    "deep_nrsfm_ros.node.mediapipe_detector",
+                    "--ros-args",
+                    *words,
+                ],
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
@@ -238,7 +244,7 @@ def test_the_real_one_sees_the_person(tmp_path: Path) -> None:
     wheel = Path(os.environ.get("POSE2SIM_WHEEL", ".cache/pose2sim-0.6.0-py3-none-any.whl"))
     if not wheel.exists() or not zipfile.is_zipfile(wheel):
         pytest.skip(f"{wheel} is not there; `make demo-live` fetches it")
-    from examples.mediapipe_detector import Detector, images
+    from deep_nrsfm_ros.node.mediapipe_detector import Detector, images
 
     videos = extract_videos(wheel, "Balancing", tmp_path)
     assert sorted(videos) == ["cam01", "cam02", "cam03", "cam04"]

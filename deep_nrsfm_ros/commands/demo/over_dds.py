@@ -7,6 +7,7 @@ recorded in another bag.
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import random
 import shutil
@@ -123,13 +124,17 @@ def train(client: Client, session: Session, present: Path) -> None:
     say(client.train())
     sent = 0
     latencies: list[float] = []
-    while client.training["state"] not in ENDED:
-        for camera in cameras:
-            played = client.play(camera)
-            sent, latencies = sent + len(played.stamps), latencies + played.latencies
+    shown = ""
+    for camera in itertools.cycle(cameras):
+        if client.training["state"] in ENDED:
+            break
+        played = client.play(camera)
+        sent, latencies = sent + len(played.stamps), latencies + played.latencies
         done, steps = (client.training.get(key) for key in ("step", "steps"))
         progress = f": {done} of {steps} steps" if done and steps else ""
-        print(f"  {client.training['state']}{progress}", flush=True)
+        if (text := f"  {client.training['state']}{progress}") != shown:
+            shown = text
+            print(text, flush=True)
     if client.training["state"] != "finished":
         raise DemoError(f"training {client.training['state']}: {client.training['message']}")
     p50, p99 = (Played([], latencies, 0.0, 0.0).latency(percent) for percent in (50, 99))

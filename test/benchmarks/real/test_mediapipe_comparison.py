@@ -94,7 +94,7 @@ def test_without_mediapipe_it_says_what_to_do(
     data: Path, output: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (output / "mediapipe-0.10.14" / "Static" / "cam02.npz").unlink()
-    monkeypatch.setitem(sys.modules, "examples.mediapipe_detector", None)
+    monkeypatch.setitem(sys.modules, "deep_nrsfm_ros.node.mediapipe_detector", None)
     with pytest.raises(SystemExit, match="2"):
         mediapipe_comparison.main(["--data", str(data), "--output", str(output)])
     assert "`make demo-live` installs MediaPipe" in capsys.readouterr().err

@@ -1,7 +1,7 @@
 """A detector for the lifter: MediaPipe Pose on a video, images, a camera or an image topic.
 
     pip install mediapipe==0.10.14
-    python mediapipe_detector.py --ros-args -p source:=0
+    ros2 run deep_nrsfm_ros mediapipe_detector --ros-args -p source:=0
     ros2 run deep_nrsfm_ros lifter --ros-args -p keypoint_layout:=mediapipe33
 
 The wheel has the weights and brings OpenCV. For every image `keypoints` (sensor_msgs/PointCloud2)
