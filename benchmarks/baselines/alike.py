@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.baselines.block_matrix import block_matrix
+from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import block_matrix
 
 Floats = NDArray[Any]
 

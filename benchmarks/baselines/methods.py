@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines.alike import block_matrix_of_neighbours
-from benchmarks.baselines.block_matrix import block_matrix
-from benchmarks.baselines.em_ppca import em_ppca, em_ppca_by_likelihood
-from benchmarks.baselines.rigid import rigid
 from benchmarks.baselines.sparse import sparse
 from benchmarks.baselines.structure_from_category import structure_from_category
+from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import block_matrix
+from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import em_ppca, em_ppca_by_likelihood
+from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid
 
 __all__ = ["BASELINES", "BATCH", "Baseline", "block_matrix", "em_ppca", "rigid", "shuffled_batches"]
 

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.baselines.block_matrix import gram_matrix
-from benchmarks.baselines.rigid import quadratic, symmetric
+from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import gram_matrix
+from deep_nrsfm_ros.nrsfm.factorisation.rigid import quadratic, symmetric
 from deep_nrsfm_ros.nrsfm.geometry import back_project, polar
 
 Floats = NDArray[Any]

@@ -68,6 +68,14 @@ class Recipe:
         "off = never; without effect where cycle is 0 or frames show one side only",
         choices=("repair", "always", "off"),
     )
+    few_frames: int = option(
+        2000,
+        "frames up to which the known shapes of the cycle loss come from classic factorisations of "
+        "all frames, on which a network cannot improve with so few; 0 = never; without effect in "
+        "trainings of fewer than 2000 steps, that start from a model, or of several processes",
+        low=0,
+        high=10_000,
+    )
     paper_initialisation: bool = option(
         False,
         "initialise the weights as the paper's code does: random biases, and the scale of weights "
@@ -156,6 +164,7 @@ PRESETS: dict[str, Preset] = {
             learning_rate=1e-3,
             schedule="exponential",
             cycle=0.0,
+            few_frames=0,
             paper_initialisation=True,
             seeds=1,
         ),

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deep_nrsfm_ros.configuration import check
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Network
@@ -26,6 +27,7 @@ from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
+from deep_nrsfm_ros.training.few_frames import factorise
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
@@ -139,7 +141,9 @@ def train(
     part = dataclasses.replace(frames, usable=usable).to(device)
     if group.rank:
         checkpointing = dataclasses.replace(checkpointing, file=None)
-    loop = _Loop(part, preset, setup, callbacks, checkpointing)
+    alone = setup.start is None and group.size == 1
+    known = factorise(part, preset) if alone else None
+    loop = _Loop(part, preset, setup, callbacks, checkpointing, known)
     file = checkpointing.file
     saved = group.broadcast(read_checkpoint(file) if file is not None and file.exists() else None)
     if saved is not None:
@@ -161,18 +165,22 @@ class _Loop:
         setup: Setup,
         callbacks: Callbacks,
         checkpointing: Checkpointing,
+        known: Consensus | None,
     ) -> None:
         recipe = preset.recipe
         self.frames, self.preset, self.setup = frames, preset, setup
         self.callbacks, self.checkpointing, self.group = callbacks, checkpointing, setup.group
-        self.screening = recipe.seeds > 1 and setup.start is None
+        self.known = known
+        # Seeds differ in which frames they mirror; known shapes leave them no choice.
+        self.screening = recipe.seeds > 1 and setup.start is None and known is None
         self.first_seed = recipe.seed * (recipe.seeds if self.screening else 1)
         self.trainer = self._trainer(self.first_seed)
         self.leader: Trainer | None = None
         self.leader_error = math.inf
         self.best = BestCheckpoint(setup.limits, recipe)
         self.mirror = MirrorCheck(frames, preset.normaliser, most_frames(recipe), self.group)
-        self.teacher = Teacher(self.mirror, recipe)
+        shapes = None if known is None else torch.from_numpy(known.shapes.astype(np.float32))
+        self.teacher = Teacher(self.mirror, recipe, shapes)
         self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
         self.saved = time.monotonic()
         self.stopped, self.time_fraction = False, 0.0
@@ -228,7 +236,11 @@ class _Loop:
     def _trainer(self, seed: int) -> Trainer:
         """Return a new trainer; only the first one, without screening, takes the start."""
         setup = self.setup
-        return Trainer(self.frames, self.preset, seed, setup.start, setup.group, setup.layout_loss)
+        trainer = Trainer(
+            *(self.frames, self.preset, seed, setup.start, setup.group, setup.layout_loss)
+        )
+        trainer.known = self.known
+        return trainer
 
     def _advance(self, steps: int, time_budget: float, *, chosen: bool = False) -> None:
         """Train up to step `steps`, or until `time_budget` of the time limit has elapsed.

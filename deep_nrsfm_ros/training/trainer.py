@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.losses import Batch, Objective
 from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
@@ -44,6 +45,7 @@ class Trainer:
         kept_step: step of the weights where they are not those of the last step, else None.
         end_reason: why the training has ended; "" if it was stopped or goes on.
         mirrored_share: share of frames with mirrored depth at the end, 0 to 0.5; NaN unknown.
+        known: shapes of the frames by factorisation that the network is taught; None: none.
         total_frames: frames of all processes.
         cpu_seconds: processor time of this process in steps.
     """
@@ -79,6 +81,7 @@ class Trainer:
         self.kept_step: int | None = None
         self.end_reason = ""
         self.mirrored_share = math.nan
+        self.known: Consensus | None = None
         device = frames.device
         initial = start or initialise(
             architecture,

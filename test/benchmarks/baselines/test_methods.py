@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from benchmarks.baselines import em_ppca as em_module
 from benchmarks.baselines.alike import block_matrix_of_neighbours, dissimilarity, nearest
-from benchmarks.baselines.em_ppca import em_ppca_by_likelihood
 from benchmarks.baselines.methods import BATCH, block_matrix, em_ppca, rigid, shuffled_batches
+from deep_nrsfm_ros.nrsfm.factorisation import em_ppca as em_module
+from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import em_ppca_by_likelihood
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, random_cameras
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.baselines.rigid import rigid_rotations, rigid_shape
+from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations, rigid_shape
 from deep_nrsfm_ros.nrsfm.geometry import align, rotation_from_camera
 
 Floats = NDArray[Any]
@@ -24,7 +24,7 @@ MIRROR_EVERY = 25
 
 
 @dataclass(frozen=True)
-class _Model:
+class LinearModel:
     """Cameras and shape distribution.
 
     Attributes:
@@ -88,7 +88,7 @@ def em_ppca_by_likelihood(W: Floats, K: int, *, iterations: int = 300) -> Floats
     return best[1]
 
 
-def _fit(Y: Floats, K: int, *, annealed: bool, mirror_test: bool, iterations: int) -> _Model:
+def _fit(Y: Floats, K: int, *, annealed: bool, mirror_test: bool, iterations: int) -> LinearModel:
     """Return the model after `iterations` of EM."""
     model = _start(Y, K)
     for i in range(iterations):
@@ -99,11 +99,11 @@ def _fit(Y: Floats, K: int, *, annealed: bool, mirror_test: bool, iterations: in
         basis, variance = _fit_basis(Y, Q[:, :2], z, zz)
         if annealed:
             variance *= 1 + ANNEALING * max(1 - 2 * i / iterations, 0)
-        model = _Model(Q, basis, variance)
+        model = LinearModel(Q, basis, variance)
     return model
 
 
-def _start(Y: Floats, K: int) -> _Model:
+def _start(Y: Floats, K: int) -> LinearModel:
     """Return rigid factorisation with the principal modes of its residual."""
     W = Y.swapaxes(1, 2)
     Q = rotation_from_camera(rigid_rotations(W).swapaxes(1, 2))
@@ -112,16 +112,45 @@ def _start(Y: Floats, K: int) -> _Model:
     lifted = (Q[:, :2].swapaxes(1, 2) @ residual).reshape(len(Y), -1)
     _, s, Vt = np.linalg.svd(lifted, full_matrices=False)
     modes = (s[:K, None] / len(Y) ** 0.5 * Vt[:K]).reshape(-1, 3, Y.shape[2])
-    return _Model(Q, np.concatenate((mean.T[None], modes)), float((residual**2).mean()))
+    return LinearModel(Q, np.concatenate((mean.T[None], modes)), float((residual**2).mean()))
 
 
-def _shapes(model: _Model, posterior: _Posterior) -> Floats:
+def from_shapes(W: Floats, Q: Floats, S: Floats, K: int, *, iterations: int) -> LinearModel:
+    """Return mean shape, K modes and cameras of highest likelihood, starting from other shapes.
+
+    Args:
+        W: (f, p, 2) images.
+        Q: (f, 3, 3) rotations from object to camera.
+        S: (f, p, 3) shapes in object axes.
+        K: number of modes.
+        iterations: of EM.
+    """
+    Y = W.astype(np.float64).swapaxes(1, 2)
+    mean = S.mean(0)
+    _, s, Vt = np.linalg.svd((S - mean).swapaxes(1, 2).reshape(len(S), -1), full_matrices=False)
+    modes = (s[:K, None] / len(S) ** 0.5 * Vt[:K]).reshape(-1, 3, W.shape[1])
+    size = float((Y**2).mean())
+    variance = float((s[K:] ** 2).sum()) / S.size + 1e-4 * size
+    model = LinearModel(Q, np.concatenate((mean.T[None], modes)), variance)
+    for _ in range(iterations):
+        z, zz, _ = _posterior(Y, model)
+        Q = _update_rotations(Y, model, z, zz)
+        model = LinearModel(Q, *_fit_basis(Y, Q[:, :2], z, zz))
+    return model
+
+
+def shapes_of(W: Floats, model: LinearModel) -> Floats:
+    """Return the posterior mean (f, p, 3) of the shapes of images W (f, p, 2), in object axes."""
+    return _shapes(model, _posterior(W.astype(np.float64).swapaxes(1, 2), model))
+
+
+def _shapes(model: LinearModel, posterior: _Posterior) -> Floats:
     """Return the posterior mean (f, p, 3) in object axes."""
     S: Floats = np.tensordot(posterior.z, model.basis, 1).swapaxes(1, 2)
     return S
 
 
-def _posterior(Y: Floats, model: _Model) -> _Posterior:
+def _posterior(Y: Floats, model: LinearModel) -> _Posterior:
     """Return the distribution of the coefficients, given the images Y (f, 2, p)."""
     f, K = len(Y), len(model.basis) - 1
     P = (model.Q[:, None, :2] @ model.basis).reshape(f, K + 1, -1)
@@ -138,7 +167,7 @@ def _posterior(Y: Floats, model: _Model) -> _Posterior:
     return _Posterior(z, zz, -0.5 * (distance + size))
 
 
-def _mirror_test(Y: Floats, model: _Model) -> _Model:
+def _mirror_test(Y: Floats, model: LinearModel) -> LinearModel:
     """Return the model with those frames turned whose mirrored depth has a higher likelihood.
 
     For each frame the shape's depth is negated in the camera's axes, the mean shape is aligned to
@@ -155,7 +184,7 @@ def _mirror_test(Y: Floats, model: _Model) -> _Model:
     return replace(model, Q=np.where(better[:, None, None], turned.Q, model.Q))
 
 
-def _update_rotations(Y: Floats, model: _Model, z: Floats, zz: Floats) -> Floats:
+def _update_rotations(Y: Floats, model: LinearModel, z: Floats, zz: Floats) -> Floats:
     """Return rotations Q (f, 3, 3) after one Gauss-Newton step of the expected error.
 
     Q <- exp([w]) Q, with E|y - (x + w cross x)|^2 over the first two rows of x = Q s.

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
-from benchmarks.baselines.rigid import quadratic, root_of_rank_three, stack, symmetric
+from deep_nrsfm_ros.nrsfm.factorisation.rigid import quadratic, root_of_rank_three, stack, symmetric
 from deep_nrsfm_ros.nrsfm.geometry import back_project, polar
 
 Floats = NDArray[Any]
@@ -29,11 +28,11 @@ def block_matrix(W: Floats, K: int, *, weighted: bool = False, iterations: int =
     factorization method revisited", WACV 2020: large singular values are shrunk less. Its cameras
     from several column triplets are left out.
     """
-    R = _block_rotations(W, K)
-    return _least_nuclear_norm(W, R, iterations, weighted=weighted)
+    R = block_rotations(W, K)
+    return least_nuclear_norm(W, R, iterations, weighted=weighted)
 
 
-def _block_rotations(W: Floats, K: int) -> Floats:
+def block_rotations(W: Floats, K: int) -> Floats:
     """Return R (f, 2, 3) from the rank 3K factorisation.
 
     Each row pair of Pi G is a multiple of a rotation: A q = 0 for the Gram matrix Q = G G^T.
@@ -75,20 +74,46 @@ def gram_matrix(Pi: Floats, *, trace: float = 1e-1, iterations: int = 500) -> Fl
     return symmetric(z, n)
 
 
-def _refine(Pi: Floats, G: Floats) -> Floats:
-    """Return G (n, 3) with row pairs of Pi G of equal length and at right angles."""
+def _refine(Pi: Floats, G: Floats, *, iterations: int = 30) -> Floats:
+    """Return G (n, 3) with row pairs of Pi G of equal length and at right angles.
 
-    def residual(g: Floats) -> Floats:
-        x, y = np.moveaxis(Pi @ g.reshape(G.shape), 1, 0)
-        xx, yy, xy = (x * x).sum(1), (y * y).sum(1), (x * y).sum(1)
-        skew: Floats = np.concatenate((xx - yy, 2 * xy)) / np.tile(xx + yy + 1e-12, 2)
-        return skew
+    Levenberg-Marquardt on the differences, relative to the squared lengths of the pair.
+    """
+    damping, (r, J) = 1e-3, _skew(Pi, G)
+    for _ in range(iterations):
+        normal, gradient = J.T @ J, J.T @ r
+        step = np.linalg.solve(
+            normal + damping * (np.diag(normal.diagonal()) + 1e-9 * np.eye(len(normal))), gradient
+        )
+        moved = G - step.reshape(G.shape)
+        r_moved, J_moved = _skew(Pi, moved)
+        if r_moved @ r_moved < r @ r:
+            G, r, J, damping = moved, r_moved, J_moved, damping / 10
+        else:
+            damping = min(damping * 10, 1e9)
+    return G
 
-    refined: Floats = least_squares(residual, G.ravel(), max_nfev=30).x.reshape(G.shape)
-    return refined
+
+def _skew(Pi: Floats, G: Floats) -> tuple[Floats, Floats]:
+    """Return (xx - yy, 2 xy) / (xx + yy) (2f,) of the row pairs x, y of Pi G, and its Jacobian."""
+    x, y = np.moveaxis(Pi @ G, 1, 0)
+    xx, yy, xy = (x * x).sum(1), (y * y).sum(1), (x * y).sum(1)
+    size = xx + yy + 1e-12
+    r = np.concatenate(((xx - yy) / size, 2 * xy / size))
+    u, v = Pi[:, 0, :, None], Pi[:, 1, :, None]
+    x, y, size = x[:, None], y[:, None], size[:, None, None]
+    along, across = u * x, v * y
+    first = 2 * (along - across) / size
+    second = 2 * (u * y + v * x) / size
+    both = 2 * (along + across) / size
+    a, b = np.split(r[:, None, None], 2)
+    J = np.concatenate((first - a * both, second - b * both))
+    return r, J.reshape(len(r), -1)
 
 
-def _least_nuclear_norm(W: Floats, R: Floats, iterations: int, *, weighted: bool) -> Floats:
+def least_nuclear_norm(
+    W: Floats, R: Floats, iterations: int = 150, *, weighted: bool = False
+) -> Floats:
     """Return S (f, p, 3): min |S#|_* subject to R S = W, S# being S as a matrix (f, 3p).
 
     ADMM: singular values are shrunk, then the shapes moved to where they project onto W.

@@ -1,0 +1,74 @@
+"""Few frames: a network that learns the shapes on which classic factorisations agree.
+
+Below about a thousand frames a network overfits: it explains the images by shapes that are wrong in
+depth. Factorisations have fewer parameters and no local minima of this kind. Their shapes, seen by
+random cameras, are what the network must return. The model lifts new frames like any other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus
+from deep_nrsfm_ros.nrsfm.network import Architecture, complete, initialise, whitening
+from deep_nrsfm_ros.nrsfm.recipe import Preset
+from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.trainer import second_moment
+
+MIN_STEPS = 2000
+"""Steps from which the factorisations are worth their seconds."""
+MIN_FRAMES = 10
+"""Frames below which cameras and shapes are not determined."""
+MIN_VISIBLE = 0.8
+"""Share of the keypoints that must be visible; the others are filled in."""
+MAX_SPREAD = 0.25
+"""Spread of the solutions above which none is believed."""
+
+_FLOOR = 1e-3  # of the whitening that fills in missing keypoints
+
+
+def factorise(frames: FrameStore, preset: Preset) -> Consensus | None:
+    """Return the shapes of the frames by factorisation; None where a network learns them better.
+
+    They are None for many or very few frames, short trainings, many missing keypoints, and where
+    the factorisations disagree.
+
+    Args:
+        frames: all frames of the training.
+        preset: its recipe says for how many frames to factorise.
+    """
+    recipe, p = preset.recipe, frames.points.shape[1]
+    if not MIN_FRAMES <= len(frames) <= recipe.few_frames or recipe.steps < MIN_STEPS:
+        return None
+    if p < 4 or not recipe.cycle:
+        return None
+    batch = frames.batch(torch.arange(len(frames), device=frames.device))
+    points, mask = batch.points.cpu().numpy(), batch.mask.cpu().numpy()
+    if mask.mean() < MIN_VISIBLE:
+        return None
+    if not mask.all():
+        L, L_inverse = whitening(second_moment(frames, preset.normaliser), 1.0, _FLOOR)
+        net = initialise(Architecture(widths=(1,)), p, np.random.default_rng(0))
+        weights = dict(net.named_weights()) | {"L": L, "L_inverse": L_inverse}
+        centred = points - (points * mask).sum(1, keepdims=True) / mask.sum(1, keepdims=True)
+        points, _ = complete(
+            net.from_named_weights(net.architecture, weights), centred * mask, mask
+        )
+    found = consensus(points)
+    return found if found.spread <= MAX_SPREAD else None
+
+
+def taught_shapes(known: Tensor, size: int, generator: torch.Generator) -> Tensor:
+    """Return `size` random shapes (size, p, 3): half of them known, half between two known ones.
+
+    Args:
+        known: (f, p, 3) in one object frame.
+        size: number of shapes.
+        generator: source of the random numbers.
+    """
+    first, second = torch.randint(len(known), (2, size), generator=generator)
+    share = torch.rand((size, 1, 1), generator=generator)
+    share[: size // 2] = 0
+    return torch.lerp(known[first], known[second], share)

@@ -1,0 +1,53 @@
+"""Factorisations of few frames: their consensus is better than each, and chosen without truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import block_matrix
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.nrsfm.metrics import shape_errors
+
+
+def images(modes: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return shapes (60, 14, 3) of Gaussian modes that grow smaller, and an image of each."""
+    rng = np.random.default_rng(modes)
+    mean, basis = rng.standard_normal((14, 3)), rng.standard_normal((modes, 14, 3))
+    codes = rng.standard_normal((60, modes)) * 0.2 / (1 + np.arange(modes))
+    shapes = centre(mean + np.einsum("fk,kpd->fpd", codes, basis))
+    W = shapes @ random_cameras(60, rng).astype(float)
+    return shapes, W + noise * rng.standard_normal(W.shape)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> tuple[np.ndarray, np.ndarray, Consensus]:
+    shapes, W = images(3, noise=0.02)
+    return shapes, W, consensus(W)
+
+
+def test_the_consensus_is_better_than_the_block_matrix_method(
+    noisy: tuple[np.ndarray, np.ndarray, Consensus],
+) -> None:
+    shapes, W, found = noisy
+    single = min(shape_errors(block_matrix(W, K), shapes).proper for K in (2, 3))
+    assert shape_errors(found.shapes, shapes).proper < single
+    assert found.solutions > 1
+    assert 0 < found.spread < 0.1
+
+
+def test_shapes_and_rotations_give_the_images(
+    noisy: tuple[np.ndarray, np.ndarray, Consensus],
+) -> None:
+    _, W, found = noisy
+    seen = found.shapes @ found.rotations.swapaxes(1, 2)
+    np.testing.assert_allclose(seen[..., :2], centre(W), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(found.rotations), 1)
+
+
+def test_few_modes_without_noise_are_found_exactly() -> None:
+    shapes, W = images(2)
+    found = consensus(W)
+    assert found.solutions == 1
+    assert shape_errors(found.shapes, shapes).proper < 0.01

@@ -1,0 +1,107 @@
+"""Few frames: the network learns what factorisations agree on, and lifts new frames like any."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
+from deep_nrsfm_ros.nrsfm.metrics import shape_errors
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
+from deep_nrsfm_ros.training import few_frames, loop
+from deep_nrsfm_ros.training.few_frames import MAX_SPREAD, MIN_FRAMES, factorise, taught_shapes
+from deep_nrsfm_ros.training.finish import finish
+from deep_nrsfm_ros.training.frames import FrameStore
+
+FRAMES = 40
+
+
+def preset(**recipe: Any) -> Preset:
+    return PRESETS["default"]._replace(recipe=Recipe(**{"steps": 2000, **recipe}))
+
+
+def store(figure: Any, frames: int = FRAMES, hidden: float = 0.0) -> FrameStore:
+    visible = np.random.default_rng(0).random(figure.points[:frames].shape[:2]) >= hidden
+    return FrameStore.of(figure.points[:frames], visible)
+
+
+def agreed(points: np.ndarray, spread: float = 0.01) -> Consensus:
+    """Return a result of made-up depth."""
+    shapes = np.concatenate((points, points[..., :1]), 2)
+    return Consensus(shapes, np.tile(np.eye(3), (len(points), 1, 1)), spread, 5)
+
+
+def test_the_factorisation_of_few_frames_is_right(figure: Any) -> None:
+    known = factorise(store(figure), preset())
+    assert known is not None
+    assert shape_errors(known.shapes, figure.shapes[:FRAMES]).proper < 0.1
+
+
+@pytest.mark.parametrize(
+    ("recipe", "frames", "hidden"),
+    [
+        ({"few_frames": 0}, FRAMES, 0.0),
+        ({"few_frames": FRAMES - 1}, FRAMES, 0.0),
+        ({"steps": 100}, FRAMES, 0.0),
+        ({"cycle": 0.0}, FRAMES, 0.0),
+        ({}, MIN_FRAMES - 1, 0.0),
+        ({}, FRAMES, 0.4),
+    ],
+)
+def test_where_it_has_no_place_nothing_is_factorised(
+    figure: Any,
+    recipe: dict[str, Any],
+    frames: int,
+    hidden: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(few_frames, "consensus", agreed)
+    assert factorise(store(figure), preset()) is not None
+    assert factorise(store(figure, frames, hidden), preset(**recipe)) is None
+
+
+def test_solutions_that_disagree_are_not_believed(
+    figure: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(few_frames, "consensus", lambda W: agreed(W, 1.01 * MAX_SPREAD))
+    assert factorise(store(figure), preset()) is None
+
+
+def test_missing_keypoints_are_filled_in(figure: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(few_frames, "consensus", lambda W: seen.append(W) or agreed(W))
+    factorise(store(figure, hidden=0.1), preset())
+    points = figure.points[:FRAMES] - figure.points[:FRAMES].mean(1, keepdims=True)
+    filled = seen[0] - seen[0].mean(1, keepdims=True)
+    assert np.linalg.norm(filled - points) < 0.2 * np.linalg.norm(points)
+
+
+def test_taught_shapes_are_known_or_lie_between_known_ones() -> None:
+    known = torch.stack((torch.zeros(5, 3), torch.ones(5, 3)))
+    taught = taught_shapes(known, 64, torch.Generator().manual_seed(0))
+    assert taught.shape == (64, 5, 3)
+    assert set(taught[:32].unique().tolist()) == {0.0, 1.0}
+    between = taught[32:]
+    assert ((between >= 0) & (between <= 1)).all()
+    assert len(between.unique()) > 5
+
+
+def test_the_network_is_taught_the_factorisation(
+    figure: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(few_frames, "MIN_STEPS", 1)
+    points, truth = figure.points[:FRAMES], figure.shapes[:FRAMES]
+    turned = Consensus(truth * [1, 1, -1], np.zeros((FRAMES, 3, 3)), 0.01, 5)
+    monkeypatch.setattr(few_frames, "consensus", lambda W: turned)
+    small = preset(steps=300)
+    small = small._replace(architecture=dataclasses.replace(small.architecture, widths=(64, 32)))
+    trainer = loop.train(points, np.ones(points.shape[:2], bool), small)
+    assert trainer.known is turned
+    assert shape_errors(trainer.known.shapes, truth).proper < 1e-6
+    model = finish(trainer, "few", figure.layout, "test")
+    assert model.provenance["factorisation"] == {"solutions": 5, "spread": 0.01}
+    assert trainer.measure()[1] < 0.2
