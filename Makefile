@@ -23,8 +23,8 @@ LOCK_TORCH ?= torch==2.13.0
 # The order matters: later programs reuse the trainings of earlier ones. Index: benchmarks/README.md.
 BENCHMARKS := paper.table1_cmu paper.mirrored_frames paper.ablation paper.table3_unseen \
     robustness.noise robustness.missing_keypoints paper.table2_categories paper.classic_sequences \
-    paper.coherence robustness.perspective robustness.confidence_calibration robustness.smoothing \
-    robustness.corrupted_data
+    paper.coherence paper.protocols robustness.perspective robustness.confidence_calibration \
+    robustness.smoothing robustness.corrupted_data
 # The quick ones come first. Run them on an idle machine.
 SPEED := speed.latency_breakdown speed.forward_pass speed.bag_reading speed.latency \
     speed.latency_while_training speed.training_speed speed.training_scale

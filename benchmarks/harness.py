@@ -58,6 +58,7 @@ class Session:
     stride: int  # every n-th frame
     batches: int = 2  # of 500 frames, on which the baselines are solved; 0: all
     one_camera: bool = False  # for all frames of a trial, not one for each frame
+    baselines: tuple[str, ...] | None = None  # words, of which a baseline's name has one; None: all
 
     def mocap(self, subjects: Sequence[str], split: str) -> Dataset:
         """Return the dataset of the trials "train", "held-out" or "all" of CMU subjects."""
@@ -211,16 +212,18 @@ def run_program(
         "(default: 2; 0: all)",
     )
     parser.add_argument(
-        "--one-camera",
-        action="store_true",
-        help="one random camera for each trial, not for each frame",
+        "--baselines",
+        nargs="*",
+        metavar="WORD",
+        help="only those whose name has one of these words, e.g. rigid Simple; none: none",
     )
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
     session = Session(
         *(args.data, args.output, tuple(args.subjects), tuple(args.seeds)),
-        *(args.steps, args.stride, args.batches, args.one_camera),
+        *(args.steps, args.stride, args.batches),
+        baselines=None if args.baselines is None else tuple(args.baselines),
     )
     try:
         table = benchmark(session)

@@ -69,6 +69,12 @@ class Solved(NamedTuple):
         return shown | {"frames": self.frames, "ms": 1000 * self.cpu_seconds / self.frames}
 
 
+def chosen(session: Session) -> list[str]:
+    """Return the names of the baselines that the session asks for."""
+    words = session.baselines
+    return [name for name in BASELINES if words is None or any(word in name for word in words)]
+
+
 def solve(session: Session, name: str, dataset: Dataset) -> Solved:
     """Return a baseline's errors on a dataset with ground truth, kept in the output folder."""
     baseline = BASELINES[name]

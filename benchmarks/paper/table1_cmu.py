@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.baselines.batches import SPENT, solve
-from benchmarks.baselines.methods import BASELINES
+from benchmarks.baselines.batches import SPENT, chosen, solve
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, LIFTING, evaluate, figures
@@ -70,7 +69,7 @@ def benchmark(session: Session) -> Table:
                     shown = figures(evaluate(model, dataset, options)) | spent
                     shown["frames"] = len(dataset)
                     table.add((subject, f"{method}, {lifting}"), shown, seed)
-        for name in BASELINES:
+        for name in chosen(session):
             solved = solve(session, name, dataset)
             table.add((subject, solved.label), solved.figures)
     return table

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.baselines.batches import SPENT, solve
-from benchmarks.baselines.methods import BASELINES
+from benchmarks.baselines.batches import SPENT, chosen, solve
 from benchmarks.data.mat_files import observed, read_category
 from benchmarks.data.synthetic_furniture import CATEGORIES
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
@@ -106,7 +105,7 @@ def benchmark(session: Session) -> Table:
             for lifting, options in LIFTING.items():
                 labels = (category, f"default recipe, {lifting}")
                 table.add(labels, _shown(evaluate(model, dataset, options)), seed)
-        for name in BASELINES:
+        for name in chosen(session):
             solved = solve(session, name, dataset)
             shown = {figure: x for figure, x in solved.figures.items() if figure in table.figures}
             table.add((category, solved.label), shown)

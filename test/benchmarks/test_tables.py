@@ -15,7 +15,14 @@ from benchmarks import harness
 from benchmarks.baselines import batches, pursuit
 from benchmarks.baselines.methods import BASELINES, Baseline, block_matrix
 from benchmarks.harness import Session
-from benchmarks.paper import ablation, coherence, mirrored_frames, table1_cmu, table3_unseen
+from benchmarks.paper import (
+    ablation,
+    coherence,
+    mirrored_frames,
+    protocols,
+    table1_cmu,
+    table3_unseen,
+)
 from benchmarks.robustness import missing_keypoints, noise
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import ALONE, LIFTING
@@ -27,6 +34,7 @@ LONE = ("--subjects", "01", "--seeds", "0", "1", "--steps", "3")
 SIMPLE = "Simple (Dai et al.)"
 ALL_TABLES = [
     table1_cmu,
+    protocols,
     mirrored_frames,
     ablation,
     table3_unseen,
