@@ -41,7 +41,7 @@ from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
-from deep_nrsfm_ros.training.judge import Figures, Judge, worse_figures
+from deep_nrsfm_ros.training.judge import Figures, Judge, rank, worse_figures
 from deep_nrsfm_ros.training.loop import Setup, train
 
 Floats = NDArray[Any]
@@ -102,7 +102,6 @@ RUNS = {
     "excavator_front": SCRATCH,
     "hand": [*PLAIN, Run("", 3000)],
     "mouse": [*PLAIN, Run("", 3000)],
-    "mouse_one_view": PLAIN,
 }
 
 
@@ -192,7 +191,6 @@ SCENES: dict[str, Callable[[Path], Scene]] = {
     "excavator_front": partial(_excavator, 40.0),
     "hand": partial(_views, "hand_nyu/hand_nyu_dev.npz", _FINGERS, 1, 2),
     "mouse": partial(_views, "mouse_dannce/mouse_dannce_predicted.npz", _MOUSE, 6, 4),
-    "mouse_one_view": partial(_views, "mouse_dannce/mouse_dannce_predicted.npz", _MOUSE, 1, 1),
 }
 
 
@@ -268,7 +266,8 @@ def rows(name: str, result: Result) -> list[str]:
 def orders(result: Result) -> dict[str, float]:
     """Return how each figure orders the models of a scene: Spearman, and regret of its choice."""
     scores = {c: [getattr(row[0], c) for row in result.figures] for c in COLUMNS}
-    scores[ORDER] = [row[0].score for row in result.figures]
+    ranks = [rank(row[0], result.figures[0][0]) for row in result.figures]
+    scores[ORDER] = [100.0 * each.doubtful + each.score for each in ranks]
     accuracy: dict[str, float] = {}
     for name, score in scores.items():
         known = not np.isnan(score).any() and np.ptp(score) > 0

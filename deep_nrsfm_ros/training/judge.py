@@ -76,11 +76,6 @@ class Figures(NamedTuple):
         """Return the share of frames that are known to be mirrored or turned; 0 if none is."""
         return max(_or_zero(self.mirrored_share), _or_zero(self.front_disagreement))
 
-    @property
-    def score(self) -> float:
-        """Return the figure that orders models on the same frames; less is better."""
-        return self.misfit + self.wrong_sides + _or_zero(self.opposed)
-
 
 IN_WORDS = {
     "mirrored_share": "{:.1%} of its frames are mirrored against their neighbours",
@@ -106,6 +101,18 @@ they do.
 
 MOST_MIRRORED = 0.05
 """Share of mirrored frames above which a model is doubtful where there is none to compare with."""
+
+
+class Rank(NamedTuple):
+    """What orders models on the same frames; the least is the best.
+
+    Attributes:
+        doubtful: whether the rule doubts the model.
+        score: sum of its misfit, and the shares of frames that are turned or opposed.
+    """
+
+    doubtful: bool
+    score: float
 
 
 class Judgement(NamedTuple):
@@ -197,6 +204,14 @@ def worse_figures(new: Figures, old: Figures | None) -> list[str]:
     return worse + (["misfit"] if new.misfit > old.misfit else [])
 
 
+def rank(new: Figures, old: Figures | None) -> Rank:
+    """Return the rank of a model beside the one at hand, if there is one."""
+    # The mirror image of a model that turns its frames itself says nothing against another one.
+    is_rival_worse = old is not None and old.wrong_sides > new.wrong_sides + MORE_WRONG_SIDES
+    opposed = 0.0 if is_rival_worse else _or_zero(new.opposed)
+    return Rank(bool(worse_figures(new, old)), new.misfit + new.wrong_sides + opposed)
+
+
 def _or_zero(value: float) -> float:
     """Return a figure, 0 where it is unknown."""
     return 0.0 if math.isnan(value) else value
@@ -239,11 +254,13 @@ class Standing(NamedTuple):
         model: the model.
         figures: beside the model at hand.
         verdict: "at hand", "better" or "doubtful".
+        rank: orders the models.
     """
 
     model: Model
     figures: Figures
     verdict: str
+    rank: Rank
 
 
 def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> list[Standing]:
@@ -265,9 +282,10 @@ def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> li
     result = []
     for model in lifting:
         new = court.figures(model, at_hand)
-        verdict = "doubtful" if worse_figures(new, old) else "better" if old else ""
-        result.append(Standing(model, new, "at hand" if model is at_hand else verdict))
-    return sorted(result, key=lambda each: (each.verdict == "doubtful", each.figures.score))
+        place = rank(new, old)
+        verdict = "doubtful" if place.doubtful else "better" if old else ""
+        result.append(Standing(model, new, "at hand" if model is at_hand else verdict, place))
+    return sorted(result, key=lambda each: each.rank)
 
 
 class Judge:

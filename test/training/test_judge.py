@@ -164,4 +164,4 @@ def test_standings_have_the_best_first_and_doubtful_ones_last(
     ]
     alone = standings(frames, [bad, good], None)
     assert [each.model.name for each in alone] == ["good", "bad"]
-    assert found[0].figures.score < found[1].figures.score
+    assert found[0].rank < found[1].rank
