@@ -9,7 +9,7 @@
 # make benchmark DATA=DIR  the paper's tables; DIR holds cmu/ and nrsfm/; interrupted, it goes on
 # make benchmark-speed     speed against floors and other ways, side by side; DATA=DIR adds time_to_error
 # make audit       known vulnerabilities of the pins in requirements.lock
-# make lock        resolve requirements.lock anew
+# make lock        resolve requirements.lock anew, and requirements.hashes.lock: what a robot needs, with hashes
 # make clean       remove what building and testing left; .venv, downloads, models and recordings stay
 # make clean-demo  remove what the demos left in demo_output, with the model that they trained
 #
@@ -66,7 +66,6 @@ lint: $(READY)
 	$(PYTHON) -m mypy
 
 docs: $(READY)
-	$(PYTHON) -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[docs]'
 	$(PYTHON) -m sphinx -W --keep-going -q -b html docs build/site
 	@echo build/site/index.html
 
@@ -126,7 +125,7 @@ audit:
 lock:
 	rm -rf build/lock && $(LOCK_PYTHON) -m venv build/lock
 	build/lock/bin/pip install --quiet --dry-run --ignore-installed \
-	    --report build/lock/report.json '.[train,ros,test,benchmarks]' '$(LOCK_TORCH)'
+	    --report build/lock/report.json '.[train,ros,test,benchmarks,docs,demo]' '$(LOCK_TORCH)'
 	build/lock/bin/python -c 'import json; \
 	    found = [i["metadata"] for i in json.load(open("build/lock/report.json"))["install"]]; \
 	    pins = {m["name"]: m["version"].split("+")[0] for m in found}; \
@@ -135,6 +134,9 @@ lock:
 	    [print(f"{n}=={pins[n]}") for n in sorted(pins, key=str.lower) if not n.startswith(skip)]' \
 	    > build/lock/requirements.lock
 	mv build/lock/requirements.lock requirements.lock
+	build/lock/bin/pip install --quiet uv
+	build/lock/bin/uv pip compile setup.py --extra ros --extra hdf5 --extra demo --universal --generate-hashes \
+	    --python-version 3.11 --quiet --custom-compile-command "make lock" -o requirements.hashes.lock
 
 clean:
 	rm -rf build dist .hypothesis .pytest_cache .ruff_cache .mypy_cache

@@ -50,6 +50,25 @@ _GROUPS: tuple[tuple[str, type, str], ...] = (
 )
 
 
+PARSERS: dict[str, Callable[[], argparse.ArgumentParser]] = {
+    "demo": demo.arguments,
+    "lift": lift.arguments,
+    "train": train.parser,
+    "evaluate": evaluate.arguments,
+    "models": models.arguments,
+    "replay": replay.arguments,
+    "doctor": doctor.arguments,
+}
+"""The parser of each program that has one."""
+
+
+def parameter_names() -> set[str]:
+    """Return the names of all parameters of the lifter."""
+    return {
+        parameter_name(field, prefix) for _, cls, prefix in _GROUPS for field, _, _ in options(cls)
+    }
+
+
 def parameters_page() -> str:
     """Return the page of all parameters of the lifter, in Markdown."""
     parts = [
@@ -87,15 +106,6 @@ def layouts_page() -> str:
 
 def command_line_page() -> str:
     """Return the page of all programs and their options, in Markdown."""
-    parsers: dict[str, Callable[[], argparse.ArgumentParser]] = {
-        "demo": demo.arguments,
-        "lift": lift.arguments,
-        "train": train.parser,
-        "evaluate": evaluate.arguments,
-        "models": models.arguments,
-        "replay": replay.arguments,
-        "doctor": doctor.arguments,
-    }
     parts = [
         "# Command line",
         "Each program is called as `deep-nrsfm NAME` or, in a ROS workspace, as `ros2 run "
@@ -103,12 +113,12 @@ def command_line_page() -> str:
     ]
     for name, line in PROGRAMS.items():
         parts.append(f"## {name}\n\n{line[0].upper()}{line[1:]}.")
-        if name not in parsers:
+        if name not in PARSERS:
             parts.append(
                 "Its options are ROS [parameters](parameters.md): `--ros-args -p NAME:=VALUE`."
             )
             continue
-        parser = parsers[name]()
+        parser = PARSERS[name]()
         parts.append((parser.description or "").strip())
         for group in parser._action_groups:
             rows = list(_option_rows(parser, group))

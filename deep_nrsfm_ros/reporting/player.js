@@ -7,6 +7,7 @@ const MOST = 3000; // frames that a live page keeps
 const $ = id => document.getElementById(id);
 const RAMP = [[230, 97, 1], [253, 184, 99], [120, 198, 121], [0, 104, 55]];
 const AXES = ["#d62728", "#2ca02c", "#1f77b4"], AXIS_NAMES = ["x", "y", "z"];
+const WAITING = live ? "waiting for the lifter's first answer" : "the recording has no frames";
 const frames = [];
 const box = [Infinity, Infinity, -Infinity, -Infinity];
 const extents = { reach: [], size: [] };
@@ -70,7 +71,8 @@ function drawSeen() {
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.lineCap = "round";
   const frame = frames[index];
-  if (!frame) return;
+  if (!frame) { write(pen, 12, 20, WAITING, "#888888"); return; }
+  if (!frame.objects.length) write(pen, 12, 20, "no object in this frame", "#888888");
   if (box[0] > box[2]) { write(pen, 12, 20, "no keypoints yet", "#888888"); return; }
   const zoom = Math.min((width - 30) / (box[2] - box[0] || 1), (height - 30) / (box[3] - box[1] || 1));
   const place = ([x, y]) => [width / 2 + zoom * (x - (box[0] + box[2]) / 2),
@@ -117,14 +119,16 @@ const orbit = new Orbit($("lifted"), 0, 0, () => {
   orbit.clear();
   orbit.joints = [];
   const frame = frames[index], view = frame && viewOf(frame);
+  if (!frame || !frame.objects.some(o => o.shape)) write(orbit.pen, 12, 20, frame ? "nothing was lifted in this frame" : WAITING, "#888888");
   if (!view) return;
-  orbit.zoom = 0.44 * wheel * Math.min(orbit.width, orbit.height) / view.reach;
+  orbit.zoom = 0.54 * wheel * Math.min(orbit.width, orbit.height) / view.reach;
   const project = v => orbit.project(view.up(v)), lines = [], words = [];
   const put = (from, to, stroke, opacity, width) =>
     lines.push([project(from), project(to), stroke, opacity, width]);
   if (atRest && recording.upright) floor(view, frame).forEach(line => lines.push(line));
+  if (!atRest && recording.upright) level(view).forEach(line => lines.push(line));
   if (!atRest || view.chosen.rotation) {
-    const far = frame.camera ? Math.hypot(...frame.camera) : 1.8 * view.reach;
+    const far = frame.camera ? Math.hypot(...frame.camera) : 1.35 * view.reach;
     const tip = frame.camera ? add(frame.camera, atRest ? scaled(view.chosen.position, -1) : [0, 0, 0]) : [0, 0, -far];
     frustum(tip, 0.22 * view.reach).forEach(([a, b]) => put(a, b, "#444444", 1, 2));
     put(tip, add(tip, [0, 0, 0.65 * far]), "#444444", 0.3, 1);
@@ -161,6 +165,18 @@ function floor(view, frame) {
     const side = far * k / 3;
     [[[side, low, -far], [side, low, far]], [[-far, low, side], [far, low, side]]].forEach(
       ([a, b]) => lines.push([orbit.project(a), orbit.project(b), "#bbbbbb", 0.8, 1]));
+  }
+  return lines;
+}
+
+// A grid below the objects, level with the camera: the direction of gravity is not known.
+function level(view) {
+  const low = 0.95 * extent("reach"), far = 1.2 * extent("reach"), lines = [];
+  const project = v => orbit.project(view.up(v));
+  for (let k = -3; k <= 3; k++) {
+    const side = far * k / 3;
+    [[[side, low, -far], [side, low, far]], [[-far, low, side], [far, low, side]]].forEach(
+      ([a, b]) => lines.push([project(a), project(b), "#c8ced3", 0.8, 1]));
   }
   return lines;
 }

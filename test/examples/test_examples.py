@@ -1,0 +1,68 @@
+"""The examples run as they are: files, the notebook, and a publisher and a subscriber live."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+
+
+def test_arrays_are_lifted(tmp_path: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / "lift_array.py")]
+    said = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True)
+    assert said.returncode == 0 and "100 frames of 17 keypoints" in said.stdout, said.stderr
+    assert np.isfinite(np.load(tmp_path / "lifted.npz")["shapes"]).all()
+
+
+def test_examples_are_short() -> None:
+    for name in ("lift_array", "publish_keypoints", "print_points"):
+        lines = (EXAMPLES / f"{name}.py").read_text("utf-8").splitlines()
+        assert len([line for line in lines if line.strip()]) <= 32
+
+
+def test_the_notebook_lifts_draws_and_trains() -> None:
+    notebook = json.loads((EXAMPLES / "lift_draw_train.ipynb").read_text("utf-8"))
+    variables: dict[str, Any] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), variables)
+    assert variables["lifted"].shapes.shape == (100, 17, 3)
+    assert variables["mine"].name == "mine"
+
+
+def test_a_published_person_is_printed(tmp_path: Path) -> None:
+    live = environment() | {
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+    }
+    commands = (
+        ["-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-p", "keypoint_layout:=coco17"],
+        [str(EXAMPLES / "publish_keypoints.py")],
+        [str(EXAMPLES / "print_points.py")],
+    )
+    running = []
+    for number, words in enumerate(commands):
+        with (tmp_path / f"{number}.log").open("w") as log:
+            running.append(subprocess.Popen([sys.executable, *words], env=live, stdout=log))
+    try:
+        deadline = time.monotonic() + 150
+        while "confidence" not in (tmp_path / "2.log").read_text():
+            assert time.monotonic() < deadline and all(p.poll() is None for p in running)
+            time.sleep(0.2)
+    finally:
+        for process in running:
+            process.kill()
+            process.wait()
