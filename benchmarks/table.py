@@ -36,6 +36,7 @@ class Table:
         legend: meaning of labels and figures.
         draw: draws the plot.
         rows: the runs.
+        digits: decimals of a figure, where they are not two.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Table:
         self.name, self.title, self.legend, self.draw = name, title, legend, draw
         self.labels, self.figures = tuple(labels), tuple(figures)
         self.rows: list[Row] = []
+        self.digits: dict[str, int] = {}
 
     def add(
         self, labels: Sequence[str], figures: Mapping[str, float], seed: int | None = None
@@ -79,7 +81,9 @@ class Table:
         columns = (*self.labels, *self.figures)
         lines = [f"## {self.title}", "", f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
         for labels, figures in self.values().items():
-            cells = (_cell(figures.get(name, [])) for name in self.figures)
+            cells = (
+                _cell(figures.get(name, []), self.digits.get(name, 2)) for name in self.figures
+            )
             lines.append(f"| {' | '.join((*labels, *cells))} |")
         seeds = max(len(v) for figures in self.values().values() for v in figures.values())
         legend = dict(self.legend)
@@ -106,12 +110,12 @@ class Table:
         pyplot.close(figure)
 
 
-def _cell(values: Sequence[float]) -> str:
+def _cell(values: Sequence[float], digits: int) -> str:
     """Return the mean of the seeds, with half the range if there are several."""
     if not values:
         return ""
-    mean = f"{np.mean(values):.2f}"
-    return mean if len(values) == 1 else f"{mean} ± {np.ptp(values) / 2:.2f}"
+    mean = f"{np.mean(values):.{digits}f}"
+    return mean if len(values) == 1 else f"{mean} ± {np.ptp(values) / 2:.{digits}f}"
 
 
 def bars(*names: str) -> Callable[[Table, Figure], None]:

@@ -45,6 +45,7 @@ def benchmark(session: Session) -> Table:
         CONVENTIONS | SPENT | LIFTING_LEGEND | BASELINE_LEGEND,
         bars("shape %", "proper %"),
     )
+    table.digits["frames"] = 0
     for subject in session.subjects:
         for protocol, changes in PROTOCOLS.items():
             changed = dataclasses.replace(session, **changes)

@@ -55,6 +55,7 @@ def benchmark(session: Session) -> Table:
         CONVENTIONS | TIME | SPENT | {"paper": printed} | LIFTING_LEGEND | BASELINE_LEGEND,
         bars("shape %", "proper %"),
     )
+    table.digits["frames"] = 0
     for subject in session.subjects:
         for method, by_subject in PAPER.items():
             if subject in by_subject:

@@ -93,6 +93,7 @@ def benchmark(session: Session) -> Table:
         SPENT | _LEGEND | LIFTING_LEGEND | BASELINE_LEGEND,
         bars("shape %", "proper %"),
     )
+    table.digits["frames"] = 0
     for category in session.subjects:
         dataset = images(session, category)
         for method, printed in PAPER.items():

@@ -105,6 +105,7 @@ def benchmark(session: Session) -> Table:
         | {"union": " ".join(TRAINED_ON["union"])},
         bars("relative %", "proper %"),
     )
+    table.digits["distance"] = 3
     for part in session.subjects:
         if part == SINGLE_VIEW:
             _single_view(session, table)

@@ -29,6 +29,11 @@ def test_markdown_shows_mean_and_half_the_range_of_the_seeds(table: Table) -> No
     ]
 
 
+def test_figures_have_the_decimals_that_the_table_says(table: Table) -> None:
+    table.digits["b"] = 3
+    assert "| ours | alone | 8.50 ± 0.50 | 1.000 ± 0.500 |" in table.markdown()
+
+
 def test_csv_has_every_seed(table: Table, tmp_path: Path) -> None:
     table.write(tmp_path)
     assert list(csv.reader((tmp_path / "t.csv").open())) == [
