@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.layouts.joints import MAX_ANGLES, WORDS, Joint, direction_vector
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 
@@ -34,7 +35,8 @@ _TINIEST = 1e-300
 _GIMBAL = 1e-6  # sine or cosine of the second angle below which the first and third are locked
 _FAR = np.radians(120.0)
 """First angle beyond which the other solution for three angles is taken."""
-_ORDER = (FREE, HINGE, AIMED)
+_ORDER = (FREE, HINGE, AIMED)  # as in kernel/joints.h, which also has the next one
+_MAX_OTHERS = 3
 _UNTURNED = np.eye(3).reshape(1, 1, 3, 3)
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 _NO_TWIST = np.array([1.0, 0.0])
@@ -148,6 +150,7 @@ class KinematicTree:
             self._group(*kinds[members[0]], members, row_of) for members in self._schedule(kinds)
         ]
         self._weights = np.concatenate([weights, np.reshape(pairs, (-1, len(layout)))])
+        self._compiled = _compiled_groups(self._groups) if kernel.AVAILABLE else None
         self._along, self._first = self._bones()
 
     def __len__(self) -> int:
@@ -251,6 +254,15 @@ class KinematicTree:
         origins, directions = vectors[:, :j], vectors[:, j:]
         rotations = np.empty((n, j, 3, 3))
         angles = np.zeros((n, len(self.angle_names)))
+        if self._compiled and n:
+            measured = np.ascontiguousarray(directions)
+            kernel._kernel.joint_frames(*self._compiled, measured, rotations, angles, (n, j))
+        else:
+            self._fill(directions, rotations, angles)
+        return Pose(origins, rotations[:, self._frames], angles)
+
+    def _fill(self, directions: Floats, rotations: Floats, angles: Floats) -> None:
+        """Fill frames (n, j, 3, 3) and angles (n, a), as the kernel does: for reading and tests."""
         for group in self._groups:
             parents = _UNTURNED if group.parents[0] < 0 else rotations[:, group.parents]
             v = directions[:, group.pairs]
@@ -262,7 +274,6 @@ class KinematicTree:
             rotations[:, group.joints] = R
             if theta.size:
                 angles[:, group.angles] = theta
-        return Pose(origins, rotations[:, self._frames], angles)
 
     def offsets(self, pose: Pose) -> Floats:
         """Return the origin (n, j, 3) of each joint in its parent's frame; 0 for the root.
@@ -304,6 +315,28 @@ class KinematicTree:
             step = (rotations[:, parent] @ offsets[:, i, :, None])[..., 0]
             origins[:, i] = origins[:, parent] + step
         return Pose(origins, rotations, angles)
+
+
+def _compiled_groups(groups: Sequence[_Group]) -> tuple[NDArray[np.int32], Floats] | None:
+    """Return indices (k, 12) and constants (k, 39) as the kernel takes them; None: too many."""
+    indices, constants = [], []
+    for group in groups:
+        k, s = group.weights.shape
+        if s > _MAX_OTHERS:
+            return None
+        others, weights = np.zeros((k, _MAX_OTHERS, 3)), np.zeros((k, _MAX_OTHERS))
+        others[:, :s], weights[:, :s] = group.others, group.weights
+        for i in range(k):
+            pairs, angles = np.zeros(_MAX_OTHERS, int), np.full(MAX_ANGLES, -1)
+            pairs[:s] = group.other_pairs[i]
+            angles[: group.angles.shape[1]] = group.angles[i]
+            count = int((weights[i] > 0).sum())
+            head = (_ORDER.index(group.kind), group.proper, group.joints[i], group.parents[i])
+            indices.append([*head, group.pairs[i], count, *pairs, *angles])
+            parts = (group.first[i], others[i], weights[i], group.basis[i], group.to_axes[i])
+            last = (group.max_twist[i], group.parent_weight, group.elevation[i])
+            constants.append(np.concatenate([*map(np.ravel, parts), group.signs[i], last]))
+    return np.array(indices, np.int32), np.array(constants)
 
 
 def _across(first: Floats, direction: Sequence[float] | None = None) -> Floats:
@@ -381,6 +414,15 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 def quaternions(R: Floats) -> Floats:
     """Return the unit quaternions (..., 4), x y z w, w >= 0, of rotations (..., 3, 3)."""
+    if kernel.AVAILABLE:
+        q = np.empty((*R.shape[:-2], 4))
+        kernel._kernel.quaternions(np.ascontiguousarray(R, np.float64), q)
+        return q
+    return _quaternions(R)
+
+
+def _quaternions(R: Floats) -> Floats:
+    """Return unit quaternions, as the kernel does: for reading and tests."""
     a, b, c, d, e, f, g, h, i = np.moveaxis(R.reshape(*R.shape[:-2], 9), -1, 0)
     trace = a + e + i
     columns = (

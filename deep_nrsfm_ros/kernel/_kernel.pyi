@@ -195,3 +195,35 @@ def choose_vectors(bytes: int, /) -> int:
 
     For tests, which try all of them. It holds for the whole process.
     """
+
+def joint_frames(
+    indices: Any,
+    constants: Any,
+    directions: Any,
+    rotations: Any,
+    angles: Any,
+    sizes: tuple[int, int],
+    /,
+) -> None:
+    """Fill the frames and angles of joints: `KinematicTree` lays out the arguments.
+
+    Args:
+        indices: (k, 12) int32: kinds and indices of the joints with frames of their own.
+        constants: (k, 39) float64.
+        directions: (n, m, 3) float64, measured.
+        rotations: output (n, j, 3, 3) float64; only the joints that `indices` name are filled.
+        angles: output (n, a) float64; only those that `indices` name are filled.
+        sizes: n and j, at least 1.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: The arrays do not fit each other, or an index is out of range.
+    """
+
+def quaternions(rotations: Any, quaternions: Any, /) -> None:
+    """Fill unit quaternions (n, 4), x y z w, w >= 0, of rotations (n, 3, 3), both float64.
+
+    Raises:
+        TypeError: An argument is no C-contiguous array of its item type.
+        ValueError: The arrays do not fit each other.
+    """

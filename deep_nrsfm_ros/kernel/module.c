@@ -8,6 +8,7 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "joints.h"
 #include "point_cloud.h"
 #include "plan.h"
 #include "tracking.h"
@@ -262,6 +263,48 @@ static PyObject *update_tracks_entry(PyObject *Py_UNUSED(module), PyObject *args
     Py_RETURN_NONE;
 }
 
+/* joint_frames(indices, constants, directions, rotations, angles, (n, j)): fill rotations (n, j, 3, 3) of the joints that
+   the indices name, and angles (n, a), from the directions (n, m, 3). */
+static PyObject *joint_frames_entry(PyObject *Py_UNUSED(module), PyObject *args) {
+    static const ArrayArgument expected[5] = {
+        {"indices", INT32, 0}, {"constants", FLOAT64, 0}, {"directions", FLOAT64, 0}, {"rotations", FLOAT64, 1}, {"angles", FLOAT64, 1}};
+    PyObject *o[5];
+    Py_buffer arrays[5];
+    Py_ssize_t n, j;
+    if (!parse_arguments(args, "OOOOO(nn):joint_frames", &o[0], &o[1], &o[2], &o[3], &o[4], &n, &j)) return NULL;
+    if (!get_arrays(5, expected, o, arrays)) return NULL;
+    int sound = n > 0 && j > 0 && count_items(arrays) % JOINT_INDICES == 0 && count_items(arrays + 2) % 3 == 0;
+    JointTree tree = {0};
+    if (sound) {
+        Py_ssize_t k = count_items(arrays) / JOINT_INDICES, vectors = count_items(arrays + 2) / 3;
+        tree = (JointTree){k, j, vectors / n, count_items(arrays + 4) / n, arrays[0].buf, arrays[1].buf};
+        const Py_ssize_t of_tree[1] = {JOINT_CONSTANTS};
+        Py_ssize_t of_object[3] = {3 * tree.m, 0, tree.a};
+        sound = !__builtin_mul_overflow(9, j, &of_object[1]) && lengths_match(1, arrays + 1, of_tree, k) &&
+                lengths_match(3, arrays + 2, of_object, n) && joints_are_sound(&tree);
+    }
+    if (sound) joint_frames(&tree, n, arrays[2].buf, arrays[3].buf, arrays[4].buf);
+    release_arrays(5, arrays);
+    if (!sound) return PyErr_Format(PyExc_ValueError, "the arrays do not fit each other");
+    Py_RETURN_NONE;
+}
+
+/* quaternions(rotations, quaternions): fill the second, (n, 4), from the first, (n, 3, 3). */
+static PyObject *quaternions_entry(PyObject *Py_UNUSED(module), PyObject *args) {
+    static const ArrayArgument expected[2] = {{"rotations", FLOAT64, 0}, {"quaternions", FLOAT64, 1}};
+    static const Py_ssize_t sizes[2] = {9, 4};
+    PyObject *o[2];
+    Py_buffer arrays[2];
+    if (!parse_arguments(args, "OO:quaternions", &o[0], &o[1])) return NULL;
+    if (!get_arrays(2, expected, o, arrays)) return NULL;
+    Py_ssize_t n = count_items(arrays + 1) / 4;
+    int sound = lengths_match(2, arrays, sizes, n);
+    if (sound) rotations_to_quaternions(n, arrays[0].buf, arrays[1].buf);
+    release_arrays(2, arrays);
+    if (!sound) return PyErr_Format(PyExc_ValueError, "the arrays do not fit each other");
+    Py_RETURN_NONE;
+}
+
 /* choose_vectors(bytes) -> bytes: for tests, which try them all. */
 static PyObject *choose(PyObject *Py_UNUSED(module), PyObject *bytes) {
     long requested = PyLong_AsLong(bytes);
@@ -285,6 +328,8 @@ static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
                                 {"decode_keypoints", decode_keypoints_entry, METH_VARARGS, NULL},
                                 {"match_tracks", match_tracks_entry, METH_VARARGS, NULL},
                                 {"update_tracks", update_tracks_entry, METH_VARARGS, NULL},
+                                {"joint_frames", joint_frames_entry, METH_VARARGS, NULL},
+                                {"quaternions", quaternions_entry, METH_VARARGS, NULL},
                                 {"choose_vectors", choose, METH_O, NULL},
                                 {NULL, NULL, 0, NULL}};
 static PyModuleDef_Slot slots[] = {{Py_mod_exec, (void *)module_exec}, {0, NULL}};

@@ -230,7 +230,7 @@ def _constants(
         error_std=np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1)),
         noise=options.noise,
         refill=options.refill,
-        reference_length=options.reference_length or model.layout.reference_length or 1.0,
+        reference_length=options.length_for(model.layout),
         reference=pair and (model.layout.index(pair[0]), model.layout.index(pair[1])),
         min_visible=options.min_visible,
         derivations=to_model.derivations,

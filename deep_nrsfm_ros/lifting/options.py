@@ -9,6 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+
+TRUNK = ("neck", "mid_hip")
+"""Reference pair of people."""
+TRUNK_SHARE = 0.5 / 1.75
+"""Length of the trunk, from neck to mid-hip, relative to a person's height."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +68,27 @@ class LiftingOptions:
     reference_length: float = option(
         0.0,
         "length in the output of the layout's reference pair (of people: neck to mid-hip), or of "
-        "the RMS radius if the layout has no pair; 0.5 gives metres for an adult; 0 = the length "
-        "in metres from the model's layout file, or 1 if it has none",
+        "the RMS radius if the layout has no pair; 0 = that of person_height, or the length in "
+        "metres from the model's layout, 0.5 of people (human17), or 1 if it has none",
         low=0.0,
         high=1e6,
     )
+    person_height: float = option(
+        0.0,
+        "height in metres of the people who are lifted: sizes and places are in metres for them; "
+        "it stands for a reference_length of 2/7 of it, from neck to mid-hip, and is used where "
+        "reference_length is 0; 0 = unknown, 1.75 typical",
+        low=0.0,
+        high=100.0,
+    )
+
+    def length_for(self, layout: KeypointLayout) -> float:
+        """Return the length of a layout's reference pair in the output; 1 if nothing says it."""
+        if self.reference_length:
+            return self.reference_length
+        if self.person_height and layout.reference == TRUNK:
+            return TRUNK_SHARE * self.person_height
+        return layout.reference_length or 1.0
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,11 @@ def unused_options(
             if value != field.default and field.name != "enabled":
                 name = f"history.{field.name}"
                 warnings[name] = f"{name} is {value:g} and has no effect, since {reason}"
+    if lifting.person_height and lifting.reference_length:
+        warnings["person_height"] = (
+            f"person_height is {lifting.person_height:g} and has no effect, since reference_length "
+            f"is {lifting.reference_length:g}"
+        )
     return warnings
 
 

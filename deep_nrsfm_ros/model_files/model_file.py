@@ -320,21 +320,25 @@ def _layout(header: dict[str, Any]) -> KeypointLayout:
     if handedness and isinstance(handedness[0], str):  # the one of an older file
         handedness = [handedness]
     header = {"rigid": [], **_of_preset(header)} | header | {"handedness": handedness}
+    if header["reference_length"] is None:
+        header["reference_length"] = _of_preset(header)["reference_length"]
     _check_names(header)
     joints = joints_from_json(_tuples(header["joints"]))
     return KeypointLayout(**_tuples(header) | {"joints": joints})
 
 
 def _of_preset(header: dict[str, Any]) -> dict[str, Any]:
-    """Return top, bottom and joints of the preset that a header has the keypoints of.
+    """Return top, bottom, joints and length of the preset that a header has the keypoints of.
 
     Older files lack these fields.
     """
     same = LAYOUTS.get(str(header["name"]))
     if same is None or list(same.keypoints) != header["keypoints"]:
-        return {"top": [], "bottom": [], "joints": []}
+        return {"top": [], "bottom": [], "joints": [], "reference_length": None}
     joints = [dataclasses.asdict(joint) for joint in same.joints]
-    return {"top": list(same.top), "bottom": list(same.bottom), "joints": joints}
+    length = same.reference_length if [*(same.reference or ())] == header["reference"] else None
+    ends = {"top": list(same.top), "bottom": list(same.bottom)}
+    return ends | {"joints": joints, "reference_length": length}
 
 
 def _check_names(layout: dict[str, Any]) -> None:

@@ -156,6 +156,7 @@ class LifterNode(Node):
                 f"{self._pipeline.source.name!r}"
             )
         )
+        self._log_unit()
         if self._pipeline.remembers:
             self.get_logger().info(
                 "an answer depends on the last seconds of its object too; -p "
@@ -171,6 +172,18 @@ class LifterNode(Node):
         self._name_check = NameCheck(self)
         for warning in (*parameter_bridge.undeclared(self), *self._unused_options()):
             self.get_logger().warning(warning)
+
+    def _log_unit(self) -> None:
+        """Log the unit of the output, if it is the layout's own."""
+        layout = self._pipeline.model.layout
+        lifting = parameter_bridge.read(self, LiftingOptions)
+        own = layout.reference_length and lifting.length_for(layout) == layout.reference_length
+        if own and not lifting.reference_length and layout.reference:
+            a, b = layout.reference
+            self.get_logger().info(
+                f"metres: {a} to {b} is taken to be {layout.reference_length:g} m; -p "
+                "reference_length, or -p person_height of people, says otherwise"
+            )
 
     def _quiet_publisher(self, kind: type, topic: str) -> Publisher:
         """Return a publisher without event callbacks."""

@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.body.kinematic_tree import KinematicTree, rotation_about
+from deep_nrsfm_ros import kernel
+from deep_nrsfm_ros.body.kinematic_tree import (
+    KinematicTree,
+    _quaternions,
+    quaternions,
+    rotation_about,
+)
 from deep_nrsfm_ros.layouts.joints import Joint
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
+from deep_nrsfm_ros.layouts.presets import CMU31, COCO17, HUMAN17
 from test.fixtures.standing_person import (
     HEIGHT,
     keypoints_of,
@@ -20,6 +26,13 @@ from test.fixtures.standing_person import (
 TREE = KinematicTree(HUMAN17)
 STANDING = standing_person()
 OFFSETS = TREE.offsets(TREE(STANDING[None]))[0]
+_JOINTS = (
+    Joint("cab", ("track",), directions=(("up", ("track", "cab")), ("front", ("track", "boom")))),
+    Joint("boom", ("boom",), "cab", (("front", ("boom", "stick")),), (("boom", "right"),)),
+    Joint("stick", ("stick",), "boom", (("down", ("stick", "bucket")),), (("stick", "left"),)),
+    Joint("bucket", ("bucket",), "stick"),
+)
+EXCAVATOR = KeypointLayout("excavator", ("track", "cab", "boom", "stick", "bucket"), joints=_JOINTS)
 REP155 = {"waist", "r_head", "y_head", "p_head"} | {
     f"{side}_{part}"
     for side in "lr"
@@ -174,18 +187,39 @@ def test_a_layout_without_joints_has_no_tree() -> None:
 
 
 def test_any_object_may_have_a_tree() -> None:
-    joints = (
-        Joint(
-            "cab", ("track",), directions=(("up", ("track", "cab")), ("front", ("track", "boom")))
-        ),
-        Joint("boom", ("boom",), "cab", (("front", ("boom", "stick")),), (("boom", "right"),)),
-        Joint("stick", ("stick",), "boom", (("down", ("stick", "bucket")),), (("stick", "left"),)),
-        Joint("bucket", ("bucket",), "stick"),
-    )
-    layout = KeypointLayout("excavator", ("track", "cab", "boom", "stick", "bucket"), joints=joints)
-    tree = KinematicTree(layout)
+    tree = KinematicTree(EXCAVATOR)
     points = np.array([[0, 0, 0], [0, 0, 2], [1, 0, 1], [3, 0, 3], [3, 0, 1]], float)
     R = rotation_about(np.array([0.6, 0, 0.8]), np.array(1.0))
     pose = tree(points[None] @ R.T)
     assert np.degrees(pose.angles[0]).tolist() == pytest.approx([45, 45])
     np.testing.assert_allclose(pose.rotations[0, 0], R, atol=1e-9)
+
+
+@pytest.mark.skipif(not kernel.AVAILABLE, reason="there is no kernel")
+@pytest.mark.parametrize("layout", [HUMAN17, COCO17, EXCAVATOR], ids=lambda layout: layout.name)
+def test_the_kernel_computes_the_same(layout: KeypointLayout) -> None:
+    tree = KinematicTree(layout)
+    points = np.random.default_rng(6).normal(size=(3000, len(layout), 3))
+    pose = tree(points)
+    directions = (tree._weights @ points)[:, len(tree) :]
+    rotations, angles = np.empty((3000, len(tree), 3, 3)), np.zeros_like(pose.angles)
+    tree._fill(directions, rotations, angles)
+    np.testing.assert_allclose(pose.rotations, rotations[:, tree._frames], atol=1e-9)
+    turn = np.abs(pose.angles - angles)
+    assert np.minimum(turn, 2 * np.pi - turn).max() < 1e-6
+    R = random_rotations(500, np.random.default_rng(7))
+    R[0], R[1] = np.diag([1, -1, -1]), np.diag([-1, -1, 1])
+    np.testing.assert_allclose(quaternions(R), _quaternions(R), atol=1e-12)
+
+
+@pytest.mark.skipif(not kernel.AVAILABLE, reason="there is no kernel")
+@pytest.mark.parametrize(("column", "value"), [(2, 99), (3, 20), (4, 99), (5, 4), (6, 99), (9, 99)])
+def test_the_kernel_refuses_indices_out_of_range(column: int, value: int) -> None:
+    compiled = TREE._compiled
+    assert compiled
+    indices, constants = compiled[0].copy(), compiled[1]
+    indices[1, column] = value
+    directions = np.zeros((1, len(TREE._weights) - len(TREE), 3))
+    outputs = np.zeros((1, len(TREE), 3, 3)), np.zeros((1, len(TREE.angle_names)))
+    with pytest.raises(ValueError, match="do not fit"):
+        kernel._kernel.joint_frames(indices, constants, directions, *outputs, (1, len(TREE)))

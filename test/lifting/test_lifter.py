@@ -250,11 +250,12 @@ def test_reference_length(length: float) -> None:
 def test_the_reference_length_is_that_of_the_object_unless_another_is_asked_for() -> None:
     described = dataclasses.replace(HUMAN17, reference_length=0.52)
     pair = [HUMAN17.index(name) for name in HUMAN17.reference or ()]
-    for layout, length, expected in (
-        *((described, 0.0, 0.52), (described, 2.0, 2.0)),
-        (HUMAN17, 0.0, 1.0),
+    unknown = dataclasses.replace(HUMAN17, reference_length=None)
+    for layout, length, height, expected in (
+        *((described, 0.0, 0.0, 0.52), (described, 2.0, 0.0, 2.0), (unknown, 0.0, 0.0, 1.0)),
+        *((HUMAN17, 0.0, 0.0, 0.5), (HUMAN17, 0.0, 1.4, 0.4), (HUMAN17, 0.6, 1.4, 0.6)),
     ):
-        options = LiftingOptions(reference_length=length)
+        options = LiftingOptions(reference_length=length, person_height=height)
         neck, hip = (
             Lifter(random_model(layout=layout), options)(*pixels()).shapes[:, pair].swapaxes(0, 1)
         )

@@ -119,5 +119,5 @@ def test_learned_bones_are_shown_in_units_of_the_reference_length() -> None:
         pipeline.lift(seen, CAMERA, ("a",), "topic", Moment(i / 30))
     assert pipeline.learned_bones(0) == {}
     (text,) = pipeline.learned_bones().values()
-    assert "s of sight: " in text and "neck-mid_hip 1.000" in text and "right_knee" not in text
+    assert "s of sight: " in text and "neck-mid_hip 0.500" in text and "right_knee" not in text
     assert "left_knee-left_ankle" in text and "big_toe" not in text  # coco17 has no toes

@@ -1,0 +1,191 @@
+"""CPU time of a message of five people, with and without what the lifter says of their joints."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped, TwistStamped
+from sensor_msgs.msg import CameraInfo, JointState, MultiDOFJointState, PointCloud2
+from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
+
+from benchmarks.speed.round_trip import serialised_keypoints
+from benchmarks.speed.timing import (
+    print_and_write,
+    random_domain,
+    require_one_thread,
+    speed_parser,
+)
+from benchmarks.table import Table, bars
+from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.node import lifter
+from deep_nrsfm_ros.node.bodies import BodyPublishers
+
+PEOPLE, RATE = 5, 30.0
+SWITCHED_OFF, SILENT, OWN, ALL = (
+    *("without the code for joints", "nobody listens"),
+    *("~/joints, ~/joint_states, ~/tracks", "all of it"),
+)
+LEGEND = {
+    "us": f"CPU time of all threads of the node for a message of {PEOPLE} people, model human",
+    "% of a core": f"at {RATE:.0f} messages a second, lifting and ~/points included",
+    "for joints %": f"the same, without the row '{SWITCHED_OFF}'",
+    OWN: "with a subscriber to each, in another process",
+    ALL: "these, ~/markers, ~/objects, and joint_states, urdf, position and velocity of each "
+    "person (body.humans); without /tf, whose package is not on PyPI",
+}
+_KINDS = {
+    "joint_states": JointState,
+    "urdf": String,
+    "position": PointStamped,
+    "velocity": TwistStamped,
+}
+_ALL = "body.humans:=true"
+
+
+def topics(*, everything: bool) -> dict[str, Any]:
+    """Return the topics that are listened to, with the types of their messages."""
+    found: dict[str, Any] = {
+        "/lifter/points": PointCloud2,
+        "/lifter/joints": MultiDOFJointState,
+        "/lifter/joint_states": JointState,
+        "/lifter/tracks": DiagnosticArray,
+    }
+    if everything:
+        found |= {"/lifter/markers": MarkerArray, "/lifter/objects": MultiDOFJointState}
+        for person in range(1, PEOPLE + 1):
+            for name, kind in _KINDS.items():
+                found[f"/humans/bodies/object{person}/{name}"] = kind
+    return found
+
+
+def listen(*, everything: bool) -> None:
+    """Subscribe until the process is killed."""
+    rclpy.init()
+    node = rclpy.create_node("listener")
+    for topic, kind in topics(everything=everything).items():
+        node.create_subscription(kind, topic, lambda raw: None, 10, raw=True)
+    rclpy.spin(node)
+
+
+@contextmanager
+def listener(*, everything: bool) -> Iterator[None]:
+    """Run `listen` in a process of its own."""
+    word = "--listen-to-all" if everything else "--listen"
+    process = subprocess.Popen([sys.executable, "-m", "benchmarks.speed.joints", word])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+class Lifter:
+    """A lifter in this process that lifts people who stand before its camera."""
+
+    def __init__(self, *settings: str) -> None:
+        """Start the node."""
+        words = ("input_type:=sensor_msgs/PointCloud2", "camera_info:=camera_info", *settings)
+        rclpy.init(args=["--ros-args", *(w for text in words for w in ("-p", text))])
+        self.node: Any = lifter.LifterNode()
+        k = [600.0, 0.0, 320.0, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0]
+        self.node._camera._receive(CameraInfo(k=k, d=[0.0] * 5, distortion_model="plumb_bob"))
+        ((self._source, _),) = self.node._keypoint_topics._subscribed.values()
+        self._raw = serialised_keypoints(PEOPLE, len(HUMAN17))
+        self._number = 30
+
+    def lift(self, calls: int) -> float:
+        """Lift messages at the rate of their stamps; return the CPU time of each in us."""
+        began = time.process_time()
+        for _ in range(calls):
+            self._number += 1
+            second, rest = divmod(self._number / RATE, 1)
+            stamp = struct.pack("<iI", int(second), int(1e9 * rest))
+            self.node._lift(self._source, self._raw[:4] + stamp + self._raw[12:])
+        return 1e6 * (time.process_time() - began) / calls
+
+    def wait_for(self, publishers: Sequence[Any], seconds: float = 60.0) -> None:
+        """Wait until all publishers have a subscriber."""
+        end = time.monotonic() + seconds
+        while not all(publisher.get_subscription_count() for publisher in publishers):
+            if time.monotonic() > end:
+                raise TimeoutError("no subscriber")
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """End the node."""
+        self.node.close()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def measure(rounds: int, calls: int) -> dict[str, float]:
+    """Return the median CPU time in us of a message for each row."""
+    seconds: dict[str, list[float]] = {name: [] for name in (SWITCHED_OFF, SILENT, OWN, ALL)}
+    off = mock.patch.object(BodyPublishers, "has_subscriber", return_value=False)
+    silent = Lifter()
+    silent.lift(calls)
+    for _ in range(rounds):
+        with off:
+            seconds[SWITCHED_OFF].append(silent.lift(calls))
+        seconds[SILENT].append(silent.lift(calls))
+    bodies = silent.node._bodies
+    with listener(everything=False):
+        silent.wait_for((silent.node._points, bodies._joints, bodies._angles, bodies._tracks))
+        silent.lift(calls)
+        for _ in range(rounds):
+            seconds[OWN].append(silent.lift(calls))
+    silent.close()
+    everything = Lifter(_ALL)
+    everything.lift(2)
+    with listener(everything=True):
+        own = [b.angles for bodies in everything.node._bodies._bodies.values() for b in bodies]
+        everything.wait_for((everything.node._markers, *own))
+        everything.lift(calls)
+        for _ in range(rounds):
+            seconds[ALL].append(everything.lift(calls))
+    everything.close()
+    return {name: float(np.median(times)) for name, times in seconds.items()}
+
+
+def benchmark(args: Namespace) -> Iterator[Table]:
+    """Measure and yield the table."""
+    os.environ["ROS_DOMAIN_ID"] = str(random_domain())
+    table = Table(
+        *("joints", f"What the joints of {PEOPLE} people cost", ("row",)),
+        *(("us", "% of a core", "for joints %"), LEGEND, bars("us")),
+    )
+    results = measure(*((1, 3) if args.quick else (15, 60)))
+    for name, us in results.items():
+        share = [100 * RATE * 1e-6 * x for x in (us, us - results[SWITCHED_OFF])]
+        table.add((name,), {"us": us, "% of a core": share[0], "for joints %": share[1]})
+    yield table
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command."""
+    parser = speed_parser(__doc__)
+    parser.add_argument("--listen", action="store_true", help="be the listener")
+    parser.add_argument("--listen-to-all", action="store_true", help="be the listener to all")
+    args = parser.parse_args(argv)
+    if args.listen or args.listen_to_all:
+        listen(everything=args.listen_to_all)
+    else:
+        print_and_write(benchmark(args), args.output)
+
+
+if __name__ == "__main__":
+    require_one_thread()
+    main()
