@@ -28,6 +28,11 @@ _BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
 _RELEASED = 128  # blocks after which results that are in files are taken out of memory
 
 
+_IMAGE = np.array([-1, 1], np.float32)
+_CAMERA = np.array([-1, 1, 1], np.float32)  # x axis of the camera: to the right
+_OBJECT = np.array([1, -1, 1], np.float32)  # y axis of the object: to its left
+
+
 class Lifted(NamedTuple):
     """n lifted objects with p keypoints each.
 
@@ -198,9 +203,31 @@ class Lifter:
                 f"points are {points.shape} and confidence {confidence.shape}; "
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
+        if self.options.mirrored:
+            points, context = points * _IMAGE, context and _mirrored_context(context)
         arrays, not_lifted = self.backend(points, confidence, perspective, context)
         lifted = Lifted(*arrays)
+        if self.options.mirrored:
+            lifted = _mirrored(lifted)
         return mark_not_lifted(lifted, not_lifted) if not_lifted.any() else lifted
+
+
+def _mirrored_context(context: Context) -> Context:
+    """Return the context in the axes of the mirrored camera, whose x axis points to the left."""
+    up, to_view = context.up, context.to_view
+    return context._replace(
+        up=None if up is None else np.asarray(up) * _CAMERA,
+        to_view=None if to_view is None else _CAMERA[:, None] * to_view * _CAMERA,
+    )
+
+
+def _mirrored(lifted: Lifted) -> Lifted:
+    """Return the mirror images of lifted objects: left and right exchanged in image and object."""
+    return lifted._replace(
+        shapes=lifted.shapes * _CAMERA,
+        rotations=_CAMERA[:, None] * lifted.rotations * _OBJECT,
+        translation=lifted.translation * _IMAGE,
+    )
 
 
 def _constants(

@@ -57,6 +57,11 @@ class LiftingOptions:
         "average, at twice the time and with an occasional mirrored frame; needs a layout with "
         "handedness and with pairs of left_ and right_ keypoints",
     )
+    mirrored: bool = option(
+        False,
+        "whether the objects are mirror images of the model's object: a left hand and a model of "
+        "right hands; the keypoints are mirrored, lifted, and mirrored back",
+    )
     min_visible: int = option(
         4,
         "fewest detected keypoints with which an object is lifted; a keypoint that follows from "

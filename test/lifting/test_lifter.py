@@ -324,3 +324,43 @@ def test_a_quarter_turn_of_the_image_turns_the_shape_and_the_camera() -> None:
     single = Lifter(random_model(), LiftingOptions(test_time_rotations=1))
     apart = single(points @ quarter[:2, :2].T, confidence).shapes
     assert np.abs(apart - single(points, confidence).shapes @ quarter.T).max() > 1e-2
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+def test_mirrored_objects_are_lifted_as_the_model_s_own(perspective: bool) -> None:
+    points, confidence = pixels(missing=0.2)
+    if perspective:
+        points = ((points - points.mean(1, keepdims=True)) / 1000).astype(np.float32)
+    model, image = random_model(), np.array([-1, 1], np.float32)
+    own, mirrored = (
+        Lifter(model, LiftingOptions(mirrored=mirrored)).lift(
+            points * image**mirrored, confidence, perspective=perspective
+        )
+        for mirrored in (False, True)
+    )
+    np.testing.assert_allclose(mirrored.shapes, own.shapes * [-1, 1, 1], atol=1e-5)
+    np.testing.assert_allclose(mirrored.translation, own.translation * image, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(mirrored.rotations), 1, atol=1e-4)
+    # In object axes, whose y points to the left, the mirror image has the other left.
+    in_object = [S.shapes @ S.rotations for S in (own, mirrored)]
+    np.testing.assert_allclose(in_object[1], in_object[0] * [1, -1, 1], atol=1e-5)
+    np.testing.assert_array_equal(mirrored.confidence, own.confidence)
+
+
+def test_mirrored_objects_over_time_and_under_gravity() -> None:
+    points, confidence = pixels(6)
+    model, up = random_model(), np.array([0.3, -0.9, 0.1])
+    results = []
+    for mirrored in (False, True):
+        signs = np.array([-1, 1, 1]) ** mirrored
+        lifter = Lifter(model, LiftingOptions(mirrored=mirrored))
+        memory = lifter.memory()
+        for i in range(6):
+            context = memory(("hand",), i / 30)._replace(up=up / np.linalg.norm(up) * signs)
+            lifted = lifter.lift(
+                points[i : i + 1] * signs[:2].astype(np.float32),
+                confidence[i : i + 1],
+                context=context,
+            )
+        results.append(lifted.shapes * signs)
+    np.testing.assert_allclose(results[0], results[1], atol=1e-5)

@@ -1,0 +1,218 @@
+"""A model of hands from 2D detections alone, and its errors on another person's labelled hand.
+
+    python -m benchmarks.real.hands --data DIR                     train on Apache and MIT data, print
+    python -m benchmarks.real.hands --data DIR --model hand21      only print
+    python -m benchmarks.real.hands --data DIR --collections signs sila kinivi signers
+
+Left and right hands are mixed in the collections. `deep_nrsfm_ros.data.hands` sorts them by place,
+by the detector's handedness, or as palms, and mirrors the left ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.table import Table, bars
+from deep_nrsfm_ros.data.hands import mirrored, palms_as_right_hands, right_hands
+from deep_nrsfm_ros.layouts.presets import preset
+from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
+from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
+from deep_nrsfm_ros.nrsfm.geometry import centre
+from deep_nrsfm_ros.nrsfm.metrics import camera_errors
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS
+
+Float32 = NDArray[np.float32]
+
+FREE = ("kinivi", "signers")
+"""Collections whose licences allow to share a model: Apache-2.0, MIT."""
+COLLECTIONS = ("kinivi", "signers", "signs", "sila")
+COLUMNS = {
+    "PA mm": "mean distance of 12 points after the best similarity transform",
+    "camera mm": "the same without a rotation",
+    "rotation deg": "median error of the orientation in the camera's axes",
+    "mirrored %": "frames that a reflection would fit better",
+}
+_LEGEND = COLUMNS | {
+    "labels": "a depth camera's hand labels of a person who is in no training; wrist, thumb and "
+    "the tips and middle joints of four fingers, defined a little otherwise than MediaPipe's",
+    "rigid": "the mean of the labelled shapes, turned to fit each frame: of the labels themselves",
+}
+_MIN_CONFIDENCE = 0.3  # of each keypoint of a hand that is learned from
+_SILA_ASPECT = 4 / 3  # width over height of a webcam's image, by which x is normalised
+
+
+class Labelled(NamedTuple):
+    """Detections of one hand in the layout hand21, with labels.
+
+    Attributes:
+        points: (f, 21, 2) pixels.
+        confidence: (f, 21) 1 where the detector has the joint, else 0.
+        truth: (f, 21, 3) mm in the camera's axes, NaN without a label.
+        camera: (3, 3) intrinsics.
+    """
+
+    points: Float32
+    confidence: Float32
+    truth: NDArray[np.float64]
+    camera: NDArray[np.float64]
+
+
+def collection(folder: Path, name: str) -> Float32:
+    """Return a collection as right hands (f, 21, 2), each centred and of one size.
+
+    Raises:
+        ValueError: there is no such collection.
+    """
+    if name == "signers":
+        hands = _signers(folder / "signers")
+    elif name in COLLECTIONS:
+        points = np.load(folder / f"hands_{name}" / f"hands_{name}.npz")["points"]
+        if name == "signs":
+            hands = right_hands(points, mirrored_image=True)
+        else:
+            aspect = _SILA_ASPECT if name == "sila" else 1.0
+            hands = palms_as_right_hands(points * np.array([aspect, 1], np.float32))
+    else:
+        raise ValueError(f"no collection {name!r}; there are {', '.join(COLLECTIONS)}")
+    hands = centre(hands)
+    size = np.linalg.norm(hands, axis=(1, 2))
+    known = np.isfinite(size) & (size > 0)
+    scaled: Float32 = (100 * hands[known] / size[known, None, None]).astype(np.float32)
+    return scaled
+
+
+def _signers(folder: Path) -> Float32:
+    """Return the complete hands of the signers, whose sides the detector has told."""
+    found = []
+    for path in sorted(folder.glob("*.npz")):
+        recording = np.load(path)
+        for side in ("left", "right"):
+            points = recording[f"hand_{side}"]
+            sure = recording[f"hand_{side}_confidence"] > _MIN_CONFIDENCE
+            points = points[sure.all(1) & np.isfinite(points).all((1, 2))]
+            found.append(mirrored(points) if side == "left" else points)
+    return np.concatenate(found)
+
+
+def labelled(folder: Path) -> Labelled:
+    """Return the labelled recording, its 14 joints named as in hand21; the palm has no name."""
+    recording = np.load(folder / "hand_nyu" / "hand_nyu_dev.npz")
+    names = recording["joint_names"].tolist()
+    fingers = ("index", "middle", "ring", "pinky")
+    sources = {"wrist": ("palm_1", "palm_2"), "thumb_tip": ("thumb_tip",)}
+    sources |= {"thumb_ip": ("thumb_mid",), "thumb_mcp": ("thumb_root",)}
+    sources |= {f"{finger}_tip": (f"{finger}_tip",) for finger in fingers}
+    sources |= {f"{finger}_pip": (f"{finger}_mid",) for finger in fingers}
+    layout, n = preset("hand21"), len(recording["points"])
+    points, confidence = np.zeros((n, 21, 2), np.float32), np.zeros((n, 21), np.float32)
+    truth = np.full((n, 21, 3), np.nan)
+    for name, parts in sources.items():
+        i, joints = layout.index(name), [names.index(part) for part in parts]
+        points[:, i] = recording["points"][:, 0, 0, joints].mean(1)
+        truth[:, i] = recording["truth"][:, 0, joints].mean(1)
+        confidence[:, i] = 1
+    return Labelled(points, confidence, truth, recording["K"][0])
+
+
+def errors(model: Model, hand: Labelled, *, intrinsics: bool) -> dict[str, float]:
+    """Return the `COLUMNS` of a model on a labelled hand."""
+    lifter = Lifter(model, LiftingOptions())
+    points = hand.points
+    if intrinsics:
+        focal, principal = hand.camera[[0, 1], [0, 1]], hand.camera[:2, 2]
+        points = ((points - principal) / focal * (hand.confidence[..., None] > 0)).astype(
+            np.float32
+        )
+    lifted = lift_all(
+        lambda p, c: lifter.lift(p, c, perspective=intrinsics), points, hand.confidence
+    )
+    return _shown(lifted.shapes, hand)
+
+
+def _shown(shapes: NDArray[Any], hand: Labelled) -> dict[str, float]:
+    joints = np.isfinite(hand.truth).all((0, 2))
+    found = camera_errors(shapes[:, joints], hand.truth[:, joints])
+    values = (found.aligned, found.in_camera, found.rotation, 100 * found.mirrored)
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def rigid_errors(hand: Labelled) -> dict[str, float]:
+    """Return the errors of the mean labelled shape in the orientation that fits each frame best."""
+    from deep_nrsfm_ros.nrsfm.geometry import align
+
+    known = np.isfinite(hand.truth).all(2)
+    truth = centre(np.where(known[..., None], hand.truth, 0.0)[:, known.all(0)])
+    mean = align(truth, np.broadcast_to(truth[0], truth.shape)).aligned.mean(0)
+    turned = align(np.broadcast_to(mean, truth.shape), truth).aligned
+    shapes = np.full(hand.truth.shape, np.nan)
+    shapes[:, known.all(0)] = turned
+    return _shown(shapes, hand)
+
+
+def train(folder: Path, collections: Sequence[str], steps: int, seed: int) -> tuple[Model, float]:
+    """Return a model of right hands of some collections, and the seconds that it took."""
+    from deep_nrsfm_ros.training.finish import finish
+    from deep_nrsfm_ros.training.loop import train as run
+
+    began = time.process_time()
+    points = np.concatenate([collection(folder, name) for name in collections])
+    default = PRESETS["default"]
+    recipe = dataclasses.replace(default.recipe, steps=steps, seed=seed)
+    trainer = run(points, np.ones(points.shape[:2], bool), default._replace(recipe=recipe))
+    source = f"hands detected by MediaPipe and OpenPose: {', '.join(collections)}"
+    model = finish(trainer, "hand21", preset("hand21"), source)
+    return model, time.process_time() - began
+
+
+def benchmark(models: Sequence[tuple[str, float, Model]], hand: Labelled) -> Table:
+    """Return the table of (label, minutes, model)."""
+    table = Table(
+        "hands",
+        "Hands: another person's labelled hand",
+        ("model", "lifted"),
+        ("CPU minutes", *COLUMNS),
+        _LEGEND,
+        bars("PA mm", "rotation deg"),
+    )
+    for label, minutes, model in models:
+        for intrinsics in (False, True):
+            how = "with intrinsics" if intrinsics else "without intrinsics"
+            figures = errors(model, hand, intrinsics=intrinsics)
+            table.add((label, how), {"CPU minutes": minutes, **figures} if minutes else figures)
+    table.add(("rigid", "-"), rigid_errors(hand))
+    return table
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Train or load a model and print its errors."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder of the scenes")
+    parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
+    parser.add_argument("--collections", nargs="+", default=list(FREE), choices=COLLECTIONS)
+    parser.add_argument("--model", help="name or file of a model, instead of a training")
+    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args(argv)
+    if args.model:
+        path = Path(args.model)
+        row = (args.model, 0.0, load_model(path if path.suffix == MODEL_SUFFIX else args.model))
+    else:
+        model, seconds = train(args.data, args.collections, args.steps, args.seed)
+        save_model(args.output / f"hand21{MODEL_SUFFIX}", model)
+        row = (", ".join(args.collections), seconds / 60, model)
+    table = benchmark([row], labelled(args.data))
+    print(table.markdown())
+    table.write(args.output)
+
+
+if __name__ == "__main__":
+    main()
