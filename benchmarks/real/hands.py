@@ -1,6 +1,6 @@
 """A model of hands from 2D detections alone, and its errors on another person's labelled hand.
 
-    python -m benchmarks.real.hands --data DIR                     train on Apache and MIT data, print
+    python -m benchmarks.real.hands --data DIR           train on Apache and MIT data
     python -m benchmarks.real.hands --data DIR --model hand21      only print
     python -m benchmarks.real.hands --data DIR --collections signs sila kinivi signers
 

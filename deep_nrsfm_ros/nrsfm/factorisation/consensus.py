@@ -151,7 +151,8 @@ def _signs(depth: Floats) -> Floats:
     """Return 1 or -1 (n,) for each of n depths (n, f, p), so that they agree best."""
     flat = depth.reshape(len(depth), -1)
     sign: Floats = np.sign(np.linalg.eigh(flat @ flat.T)[1][:, -1])
-    return np.where(sign == 0, 1.0, sign * (sign[0] or 1.0))
+    agreed: Floats = np.where(sign == 0, 1.0, sign * (sign[0] or 1.0))
+    return agreed
 
 
 def _mirrored(Q: Floats) -> Floats:
