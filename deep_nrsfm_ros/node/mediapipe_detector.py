@@ -6,8 +6,12 @@
 
 The wheel has the weights and brings OpenCV. For every image `keypoints` (sensor_msgs/PointCloud2)
 holds the 33 landmarks of one person, x and y in pixels and confidence = MediaPipe's visibility, or
-nothing (height 0). The stamp is the image's: a topic's own; when it came, of a camera; of a file,
-the start plus its place in the video. Copy this, and put your own detector in place of `Detector`.
+nothing (height 0). With `detect:=hands` `right_hand_keypoints` and `left_hand_keypoints` hold the
+21 landmarks of hands instead (layout hand21; lift left hands with `mirrored:=true`). With
+`detect:=holistic` `keypoints` holds the body and both hands of one person (layout mediapipe75), and
+the topics of the hands are there too. The stamp is the image's: a topic's own; when it came, of a
+camera; of a file, the start plus its place in the video. Copy this, and put your own detector in
+place of `Detector`.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import signal
 import sys
 import time
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,21 +46,30 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "source": ("", "video file, folder of images or number of a camera; empty: the topic `image`"),
     "rate": (30.0, "images a second, of a folder"),
     "frame_id": ("camera", "frame of the keypoints, where images do not come with one"),
-    "listeners": (1, "begin when so many listen to `keypoints`"),
+    "listeners": (1, "begin when so many listen to the keypoints, over all topics"),
+    "detect": ("pose", "pose = a body, hands = hands, holistic = a body with both hands"),
+    "selfie": (False, "whether the images are mirrored, as by front cameras: left and right hands"),
     "smooth": (True, "let MediaPipe smooth the landmarks over time, which makes them late"),
 }
-LANDMARKS = 33
+LANDMARKS, HAND = 33, 21
+KEYPOINTS, RIGHT, LEFT = "keypoints", "right_hand_keypoints", "left_hand_keypoints"
+TOPICS = {
+    "pose": {KEYPOINTS: LANDMARKS},
+    "hands": {RIGHT: HAND, LEFT: HAND},
+    "holistic": {KEYPOINTS: LANDMARKS + 2 * HAND, RIGHT: HAND, LEFT: HAND},
+}
+"""Topics of each kind of detection, and the landmarks of one object of each."""
 ENDING = (signal.SIGINT, signal.SIGTERM)
 # Bytes of a pixel, and the places of red, green and blue in it.
 ENCODINGS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "mono8": (1, [0, 0, 0])}
 
 
 class Detection(NamedTuple):
-    """The landmarks of one person; x right, y down, z forward."""
+    """The p landmarks of one person or hand; x right, y down, z forward."""
 
-    points: NDArray[np.float32]  # (33, 2) pixels
-    confidence: NDArray[np.float32]  # (33,) visibility, 0 to 1
-    world: NDArray[np.float32]  # (33, 3) MediaPipe's own 3D, metres about the hips
+    points: NDArray[np.float32]  # (p, 2) pixels
+    confidence: NDArray[np.float32]  # (p,) visibility, 0 to 1
+    world: NDArray[np.float32]  # (p, 3) MediaPipe's own 3D, metres about the hips; (0, 3): none
 
 
 class Detector:
@@ -76,6 +89,64 @@ class Detector:
         values = np.array(flat, np.float32)
         size = np.array(image.shape[1::-1], np.float32)
         return Detection(values[:, :2] * size, values[:, 2], np.array(world, np.float32))
+
+
+class HandDetector:
+    """MediaPipe Hands: up to four hands, each left or right."""
+
+    def __init__(self, selfie: bool = False) -> None:
+        """Load the model; `selfie`: the images are mirrored."""
+        self._hands = mediapipe.solutions.hands.Hands(max_num_hands=4)
+        self._selfie = selfie
+
+    def __call__(self, image: RGB) -> dict[str, list[Detection]]:
+        """Return the hands in the image by topic."""
+        found = self._hands.process(image)
+        hands: dict[str, list[Detection]] = {RIGHT: [], LEFT: []}
+        sides = found.multi_handedness or ()
+        for side, landmarks in zip(sides, found.multi_hand_landmarks or (), strict=True):
+            told = side.classification[0]
+            # MediaPipe names the sides for mirrored images.
+            right = (told.label == "Right") == self._selfie
+            hand = _marks(landmarks, image, HAND, told.score)
+            hands[RIGHT if right else LEFT].append(hand)
+        return hands
+
+
+class HolisticDetector:
+    """MediaPipe Holistic: one person's body and hands, the left one and the right one."""
+
+    def __init__(self, smooth: bool = True) -> None:
+        """Load the model."""
+        self._holistic = mediapipe.solutions.holistic.Holistic(smooth_landmarks=smooth)
+
+    def __call__(self, image: RGB) -> dict[str, list[Detection]]:
+        """Return the person and the hands in the image by topic."""
+        found = self._holistic.process(image)
+        left = _marks(found.left_hand_landmarks, image, HAND, 1.0)
+        right = _marks(found.right_hand_landmarks, image, HAND, 1.0)
+        parts = (_marks(found.pose_landmarks, image, LANDMARKS), left, right)
+        whole = Detection(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        seen = ((KEYPOINTS, whole), (RIGHT, right), (LEFT, left))
+        return {topic: [one] if one.confidence.any() else [] for topic, one in seen}
+
+
+def _marks(landmarks: Any, image: RGB, count: int, score: float | None = None) -> Detection:
+    """Return MediaPipe's landmarks; all missing if there are none.
+
+    Args:
+        landmarks: of MediaPipe, or None.
+        image: that they are of.
+        count: number of landmarks.
+        score: confidence of all; None: the visibility of each.
+    """
+    values = np.zeros((count, 3), np.float32)
+    if landmarks is not None:
+        values[:] = [(m.x, m.y, m.visibility) for m in landmarks.landmark]
+        if score is not None:
+            values[:, 2] = score
+    size = np.array(image.shape[1::-1], np.float32)
+    return Detection(values[:, :2] * size, values[:, 2], np.zeros((0, 3), np.float32))
 
 
 def images(source: str, rate: float = 30.0) -> Iterator[tuple[float, RGB]]:
@@ -104,13 +175,13 @@ def rgb(message: Image) -> RGB:
     return np.ascontiguousarray(rows.reshape(height, width, depth)[..., places])
 
 
-def cloud(found: Detection | None, header: Header) -> PointCloud2:
-    """Return the message: a row of points for a person, no row for nobody."""
-    rows = [] if found is None else [np.column_stack([found.points, found.confidence])]
+def cloud(found: list[Detection], landmarks: int, header: Header) -> PointCloud2:
+    """Return the message: a row of points for each object."""
+    rows = [np.column_stack([one.points, one.confidence]) for one in found]
     names = enumerate(("x", "y", "confidence"))
     fields = [PointField(name=n, offset=4 * i, datatype=7, count=1) for i, n in names]
-    message = PointCloud2(header=header, height=len(rows), width=LANDMARKS, fields=fields)
-    message.point_step, message.row_step, message.is_dense = 12, 12 * LANDMARKS, True
+    message = PointCloud2(header=header, height=len(rows), width=landmarks, fields=fields)
+    message.point_step, message.row_step, message.is_dense = 12, 12 * landmarks, True
     message.data = array("B", np.array(rows, "<f4").tobytes())
     return message
 
@@ -127,10 +198,16 @@ class DetectorNode(Node):
             kind = ParameterDescriptor(description=text, read_only=True, dynamic_typing=True)
             self._given[name] = type(default)(self.declare_parameter(name, default, kind).value)
         self.finished = Future()
-        self._detect = Detector(self._given["smooth"])
+        if self._given["detect"] not in TOPICS:
+            kinds = ", ".join(TOPICS)
+            raise ValueError(f"detect is {self._given['detect']!r}; expected one of {kinds}")
+        self._topics = TOPICS[self._given["detect"]]
+        self._detect = self._detector()
         self._begun, self._start, self._persons = False, 0, 0
         self._spent: list[float] = []
-        self._publisher = self.create_publisher(PointCloud2, "keypoints", 10)
+        self._by_topic = {
+            topic: self.create_publisher(PointCloud2, topic, 10) for topic in self._topics
+        }
         self._live = self._given["source"].isdecimal()
         if self._given["source"]:
             self._images = images(self._given["source"], self._given["rate"])
@@ -139,9 +216,24 @@ class DetectorNode(Node):
             latest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
             self.create_subscription(Image, "image", self._take, latest)
 
+    def _detector(self) -> Callable[[RGB], dict[str, list[Detection]]]:
+        """Return the function that finds the objects of each topic in an image."""
+        if self._given["detect"] == "hands":
+            return HandDetector(self._given["selfie"])
+        if self._given["detect"] == "holistic":
+            return HolisticDetector(self._given["smooth"])
+        detect = Detector(self._given["smooth"])
+
+        def person(image: RGB) -> dict[str, list[Detection]]:
+            found = detect(image)
+            return {KEYPOINTS: [] if found is None else [found]}
+
+        return person
+
     def _waits(self) -> bool:
         """Tell whether too few have listened yet."""
-        self._begun |= self._publisher.get_subscription_count() >= self._given["listeners"]
+        listeners = sum(p.get_subscription_count() for p in self._by_topic.values())
+        self._begun |= listeners >= self._given["listeners"]
         return not self._begun
 
     def _next(self) -> None:
@@ -173,12 +265,14 @@ class DetectorNode(Node):
         begin = time.perf_counter()
         found = self._detect(image)
         self._spent.append(time.perf_counter() - begin)
-        self._persons += found is not None
-        self._publisher.publish(cloud(found, header))
+        self._persons += any(found.values())
+        for topic, publisher in self._by_topic.items():
+            publisher.publish(cloud(found[topic], self._topics[topic], header))
 
     def close(self) -> None:
         """Wait until all is heard, and say what was seen."""
-        self._publisher.wait_for_all_acked(Duration(seconds=5))
+        for publisher in self._by_topic.values():
+            publisher.wait_for_all_acked(Duration(seconds=5))
         spent = f", p50 {1e3 * np.median(self._spent):.0f} ms an image" if self._spent else ""
         self.get_logger().info(f"{len(self._spent)} images, {self._persons} with a person{spent}")
 

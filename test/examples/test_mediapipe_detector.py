@@ -22,7 +22,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 
 from deep_nrsfm_ros.data.pose2sim import JOINTS, extract_videos, read_session
-from deep_nrsfm_ros.layouts.presets import BODY25B, MEDIAPIPE33
+from deep_nrsfm_ros.layouts.presets import BODY25B, HAND21, MEDIAPIPE33, MEDIAPIPE75
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, read_observation
 
@@ -90,15 +90,59 @@ def test_images_that_cannot_be_read(module: Any, change: dict[str, Any]) -> None
 
 def test_the_message_is_what_the_lifter_reads(module: Any) -> None:
     found = module.Detector()(coloured(0, 51)[..., ::-1].copy())
-    message = module.cloud(found, Header(frame_id="eye"))
+    message = module.cloud([found], module.LANDMARKS, Header(frame_id="eye"))
     seen = read_observation(message, POINT_CLOUD, len(MEDIAPIPE33))
     np.testing.assert_allclose(seen.points[0], found.points)
     np.testing.assert_allclose(seen.points[0, 0], [0, 0.2 * SIZE[0]], atol=1e-4)
     np.testing.assert_allclose(seen.confidence, 0.9)
     assert len(MEDIAPIPE33) == module.LANDMARKS
-    assert not len(read_observation(module.cloud(None, Header()), POINT_CLOUD, 33).points)
+    assert not len(
+        read_observation(module.cloud([], module.LANDMARKS, Header()), POINT_CLOUD, 33).points
+    )
     with pytest.raises(MessageError):
         read_observation(message, POINT_CLOUD, len(BODY25B))
+
+
+def test_hands_are_told_apart_and_selfies_too(module: Any) -> None:
+    image = np.ascontiguousarray(coloured(1, 2)[..., ::-1])
+    for selfie in (False, True):
+        found = module.HandDetector(selfie)(image)
+        assert {topic: len(hands) for topic, hands in found.items()} == module_topics(1)
+        # The first hand, on the left of the image, is called Left for a mirrored image.
+        first = found[module.LEFT if selfie else module.RIGHT][0]
+        np.testing.assert_allclose(first.points[0], [0.1 * SIZE[1], 0.5 * SIZE[0]], rtol=1e-5)
+        np.testing.assert_allclose(first.confidence, 0.9)
+        message = module.cloud([first, first], module.HAND, Header())
+        seen = read_observation(message, POINT_CLOUD, len(HAND21))
+        assert seen.points.shape == (2, 21, 2)
+    nothing = module.HandDetector()(np.zeros((*SIZE, 3), np.uint8))
+    assert {topic: len(hands) for topic, hands in nothing.items()} == module_topics(0)
+
+
+def module_topics(count: int) -> dict[str, int]:
+    return {"right_hand_keypoints": count, "left_hand_keypoints": count}
+
+
+def test_a_body_with_hands_is_one_object(module: Any) -> None:
+    found = module.HolisticDetector()(np.ascontiguousarray(coloured(0, 51)[..., ::-1]))
+    (whole,), (left,) = found[module.KEYPOINTS], found[module.LEFT]
+    assert not found[module.RIGHT]
+    assert whole.points.shape == (len(MEDIAPIPE75), 2)
+    assert module.TOPICS["holistic"][module.KEYPOINTS] == len(MEDIAPIPE75)
+    start = MEDIAPIPE75.index("left_hand_wrist")
+    np.testing.assert_array_equal(whole.points[start : start + 21], left.points)
+    np.testing.assert_allclose(whole.confidence[: len(MEDIAPIPE33)], 0.9)
+    assert (whole.confidence[start : start + 21] == 1).all()
+    assert (whole.confidence[MEDIAPIPE75.index("right_hand_wrist") :] == 0).all()
+    nobody = module.HolisticDetector()(np.zeros((*SIZE, 3), np.uint8))
+    assert not any(nobody.values())
+
+
+def test_an_unknown_kind_of_detection_is_a_message(start: Any) -> None:
+    process = start(detect="feet")
+    said = process.communicate(timeout=DEADLINE)[0]
+    assert process.returncode == 1 and "Traceback" not in said
+    assert "detect is 'feet'; expected one of pose, hands, holistic" in said
 
 
 def test_nobody_is_none(module: Any) -> None:

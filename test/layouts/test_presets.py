@@ -38,6 +38,8 @@ PLACES = {
     "11 left_shoulder 12 right_shoulder 13 left_elbow 16 right_wrist 17 left_pinky 19 left_index "
     "22 right_thumb 23 left_hip 24 right_hip 25 left_knee 28 right_ankle 29 left_heel "
     "30 right_heel 31 left_big_toe 32 right_big_toe",
+    "mediapipe75": "0 nose 11 left_shoulder 32 right_big_toe 33 left_hand_wrist 37 left_thumb_tip "
+    "54 right_hand_wrist 74 right_pinky_tip",
     "cmu31": "0 root 1 lhipjoint 5 ltoes 6 rhipjoint 10 rtoes 11 lowerback 16 head 17 lclavicle "
     "20 lwrist 23 lthumb 24 rclavicle 27 rwrist 30 rthumb",
     "halpe26": "0 nose 1 left_eye 5 left_shoulder 10 right_wrist 16 right_ankle 17 head_top "
@@ -82,7 +84,7 @@ PLACES = {
     "24 right_small_toe",
 }
 COUNTS = {"human17": 17, "human25": 25, "cmu31": 31, "coco17": 17, "body25": 25, "body25b": 25}
-COUNTS |= {"openpose18": 18, "rep155": 18, "mediapipe33": 33}
+COUNTS |= {"openpose18": 18, "rep155": 18, "mediapipe33": 33, "mediapipe75": 75}
 COUNTS |= {"halpe26": 26, "halpe136": 136, "coco_wholebody133": 133, "mpii16": 16, "h36m17": 17}
 COUNTS |= {"crowdpose14": 14, "openpose135": 135, "hand21": 21, "ap10k17": 17, "posetrack15": 15}
 COUNTS |= {"posetrack18_17": 17, "zed18": 18, "zed34": 34, "zed38": 38}

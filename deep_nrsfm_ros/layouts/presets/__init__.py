@@ -15,7 +15,7 @@ from deep_nrsfm_ros.layouts.layout_file import read_layout
 
 NAMES = [
     *("human17", "human25", "cmu31", "coco17", "body25", "body25b", "openpose18", "rep155"),
-    "mediapipe33",
+    *("mediapipe33", "mediapipe75"),
     *("halpe26", "halpe136", "coco_wholebody133", "mpii16", "h36m17", "crowdpose14"),
     *("openpose135", "hand21", "ap10k17", "posetrack15", "posetrack18_17"),
     *("zed18", "zed34", "zed38"),
@@ -32,6 +32,7 @@ BODY25B: KeypointLayout
 OPENPOSE18: KeypointLayout
 REP155: KeypointLayout
 MEDIAPIPE33: KeypointLayout
+MEDIAPIPE75: KeypointLayout
 HALPE26: KeypointLayout
 HALPE136: KeypointLayout
 COCO_WHOLEBODY133: KeypointLayout

@@ -28,4 +28,43 @@ class Pose:
         return SimpleNamespace(pose_landmarks=found, pose_world_landmarks=found)
 
 
-solutions = SimpleNamespace(pose=SimpleNamespace(Pose=Pose))
+def hand(place: float) -> Any:
+    """Return 21 landmarks about a place; hands have no visibility."""
+    across = (place + 0.01 * i for i in range(21))
+    return SimpleNamespace(
+        landmark=[SimpleNamespace(x=x, y=0.5, z=0.0, visibility=0.0) for x in across]
+    )
+
+
+class Hands:
+    """A hand on the left of the image that is called Left, and one on the right called Right."""
+
+    def __init__(self, max_num_hands: int) -> None:
+        assert max_num_hands >= 2
+
+    def process(self, image: np.ndarray) -> Any:
+        if not image.any():
+            return SimpleNamespace(multi_handedness=None, multi_hand_landmarks=None)
+        labels = (("Left", 0.9), ("Right", 0.8))
+        sides = [
+            SimpleNamespace(classification=[SimpleNamespace(label=label, score=score)])
+            for label, score in labels
+        ]
+        return SimpleNamespace(multi_handedness=sides, multi_hand_landmarks=[hand(0.1), hand(0.6)])
+
+
+class Holistic(Pose):
+    """The person of `Pose` with a left hand; the right one is not seen."""
+
+    def process(self, image: np.ndarray) -> Any:
+        found = super().process(image)
+        found.left_hand_landmarks = hand(0.6) if image.any() else None
+        found.right_hand_landmarks = None
+        return found
+
+
+solutions = SimpleNamespace(
+    pose=SimpleNamespace(Pose=Pose),
+    hands=SimpleNamespace(Hands=Hands),
+    holistic=SimpleNamespace(Holistic=Holistic),
+)
