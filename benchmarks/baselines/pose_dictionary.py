@@ -49,7 +49,7 @@ def normalised_poses(S: Floats, torso: Sequence[int] = TORSO15) -> Floats:
     return turned
 
 
-def sparse_dictionary(poses: Floats, K: int, sparsity: float, *, iterations: int = 60) -> Floats:
+def sparse_dictionary(poses: Floats, K: int, sparsity: float, *, iterations: int = 300) -> Floats:
     """Return K atoms (K, 3, p) whose non-negative sparse combinations are the poses (f, p, 3).
 
     min |Y - D X|^2 / 2 + sparsity sum X subject to X >= 0 and |D_k| <= the mean norm of a pose.
