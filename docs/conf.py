@@ -63,6 +63,12 @@ def _read_page(_: Any, name: str, source: list[str]) -> None:
     page = Path(f"{name}.md")
     if page not in map(Path, COPIED.values()):
         source[0] = rewrite(source[0], Path("docs") / page, page)
+    if name == "index":
+        pages = (path.stem for path in sorted(_DOCS.glob("*.md")))
+        more = [page for page in pages if page not in ("README", "index", *source[0].split())]
+        if more:  # pages that index.md does not place
+            listed = "\n".join(more)
+            source[0] += f"\n```{{toctree}}\n:caption: More\n:maxdepth: 1\n{listed}\n```\n"
 
 
 def setup(app: Any) -> None:
