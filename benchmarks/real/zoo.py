@@ -75,7 +75,7 @@ class Object:
 
 def mouse(folder: Path) -> Object:
     """Return the mouse of six cameras."""
-    return _scene(folder / "mouse_dannce" / "mouse_dannce_predicted.npz", "mouse22")
+    return _scene(folder / "mouse_dannce" / "mouse_dannce_predicted.npz", "mouse22", stride=3)
 
 
 def fly(folder: Path) -> Object:
@@ -139,13 +139,13 @@ def _dataset(
     return Dataset(points, visible[kept], layout, source, truth)
 
 
-def _scene(path: Path, layout: str) -> Object:
-    """Return the views of a scene as frames, the first 80 % of its time to learn from."""
+def _scene(path: Path, layout: str, stride: int = 1) -> Object:
+    """Return the views of every `stride`-th frame, the first 80 % of the time to learn from."""
     scene = np.load(path)
     truth = np.einsum("vij,fpj->fvpi", scene["R"], scene["truth"][:, 0].astype(float))
     points, first = scene["points"][:, :, 0], round(TRAINING_SHARE * len(scene["points"]))
     parts = []
-    for rows in (slice(None, first), slice(first, None)):
+    for rows in (slice(None, first, stride), slice(first, None)):
         flat = [x[rows].reshape(-1, *x.shape[2:]) for x in (points, centre_scene(truth))]
         parts.append(_dataset(flat[0], _layout(layout), path.stem, flat[1]))
     return Object(*parts)

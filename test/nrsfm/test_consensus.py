@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import block_matrix
-from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus, image_scales
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 
@@ -51,3 +51,11 @@ def test_few_modes_without_noise_are_found_exactly() -> None:
     found = consensus(W)
     assert found.solutions == 1
     assert shape_errors(found.shapes, shapes).proper < 0.01
+
+
+def test_scales_of_images_are_found_where_they_differ() -> None:
+    _, W = images(2, noise=0.005)
+    np.testing.assert_array_equal(image_scales(centre(W)), 1)
+    scales = np.exp(np.random.default_rng(0).normal(0, 0.3, len(W)))
+    found = image_scales(centre(scales[:, None, None] * W))
+    np.testing.assert_allclose(found / found.mean(), scales / scales.mean(), rtol=0.05)

@@ -32,7 +32,8 @@ def store(figure: Any, frames: int = FRAMES, hidden: float = 0.0) -> FrameStore:
 def agreed(points: np.ndarray, spread: float = 0.01) -> Consensus:
     """Return a result of made-up depth."""
     shapes = np.concatenate((points, points[..., :1]), 2)
-    return Consensus(shapes, np.tile(np.eye(3), (len(points), 1, 1)), spread, 5)
+    rotations = np.tile(np.eye(3), (len(points), 1, 1))
+    return Consensus(shapes, rotations, np.ones(len(points)), spread, 5)
 
 
 def test_the_factorisation_of_few_frames_is_right(figure: Any) -> None:
@@ -95,7 +96,7 @@ def test_the_network_is_taught_the_factorisation(
 ) -> None:
     monkeypatch.setattr(few_frames, "MIN_STEPS", 1)
     points, truth = figure.points[:FRAMES], figure.shapes[:FRAMES]
-    turned = Consensus(truth * [1, 1, -1], np.zeros((FRAMES, 3, 3)), 0.01, 5)
+    turned = Consensus(truth * [1, 1, -1], np.zeros((FRAMES, 3, 3)), np.ones(FRAMES), 0.01, 5)
     monkeypatch.setattr(few_frames, "consensus", lambda W: turned)
     small = preset(steps=300)
     small = small._replace(architecture=dataclasses.replace(small.architecture, widths=(64, 32)))

@@ -33,7 +33,13 @@ def block_matrix(W: Floats, K: int, *, weighted: bool = False, iterations: int =
 
 
 def block_rotations(W: Floats, K: int) -> Floats:
-    """Return R (f, 2, 3) from the rank 3K factorisation.
+    """Return R (f, 2, 3) from the rank 3K factorisation."""
+    R: Floats = polar(block_cameras(W, K))
+    return R
+
+
+def block_cameras(W: Floats, K: int) -> Floats:
+    """Return cameras (f, 2, 3), rotations times the scale of each image, of rank 3K factorisation.
 
     Each row pair of Pi G is a multiple of a rotation: A q = 0 for the Gram matrix Q = G G^T.
     First min |A q|^2 + trace Q over positive Q, then G itself by least squares.
@@ -42,9 +48,8 @@ def block_rotations(W: Floats, K: int) -> Floats:
     U, s, _ = np.linalg.svd(stack(W), full_matrices=False)
     Pi = (U[:, :n] * np.sqrt(s[:n])).reshape(-1, 2, n)
     Pi /= np.sqrt((Pi**2).sum((1, 2)).mean() / 2)
-    G = _refine(Pi, root_of_rank_three(gram_matrix(Pi)))
-    R: Floats = polar(Pi @ G)
-    return R
+    cameras: Floats = Pi @ _refine(Pi, root_of_rank_three(gram_matrix(Pi)))
+    return cameras
 
 
 def gram_matrix(Pi: Floats, *, trace: float = 1e-1, iterations: int = 500) -> Floats:

@@ -1,5 +1,7 @@
 """Shapes on which several factorisations of few frames agree, chosen without ground truth.
 
+0. An object that comes closer grows in the image. Rank-9 factorisation determines the scale of each
+   image. Where scales differ by more than the noise of that, the images are divided by them.
 1. Cameras come from rigid factorisation and from the block-matrix method with several ranks. The
    shapes of lowest nuclear norm are found for each. Cameras whose norm is within 0.5 % of the
    lowest are kept.
@@ -22,7 +24,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import block_rotations, least_nuclear_norm
+from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import (
+    block_cameras,
+    block_rotations,
+    least_nuclear_norm,
+)
 from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import from_shapes, shapes_of
 from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations, rigid_shape
 from deep_nrsfm_ros.nrsfm.geometry import back_project, centre, rotation_from_camera
@@ -37,6 +43,9 @@ DISAGREEMENT = 0.1
 """Root mean square difference of depth, relative to the size of the images, above which a solution
 is left out."""
 
+_SCALE_RANK = 3
+_SAME_SCALE = 0.15  # range of the middle half of the logarithms: 0.09 without differences on pickup
+_LEAST_SCALE = 0.1
 _SAME_NORM = 1.005  # times the lowest nuclear norm: cameras that are kept
 _EM_ITERATIONS = 100
 _MORE_ITERATIONS = 200  # where there is no noise: EM converges slowly
@@ -50,6 +59,7 @@ class Consensus(NamedTuple):
     Attributes:
         shapes: (f, p, 3) in the axes of one object frame, up to one reflection; centred.
         rotations: (f, 3, 3) from object to camera.
+        scales: (f,) of the images, 1 where they hardly differ: scale * projected shape = image.
         spread: root mean square difference of depth between the solutions and the result, relative
             to the size of the images: 0.03 typical, 0.3 no agreement.
         solutions: number of solutions that were averaged.
@@ -57,6 +67,7 @@ class Consensus(NamedTuple):
 
     shapes: Floats
     rotations: Floats
+    scales: Floats
     spread: float
     solutions: int
 
@@ -72,9 +83,11 @@ def consensus(W: Floats) -> Consensus:
     """Return the shapes on which factorisations of all frames agree.
 
     Args:
-        W: (f, p, 2) complete images of one scale, x right and y down; at least 4 frames and points.
+        W: (f, p, 2) complete images, x right and y down; at least 4 frames and points.
     """
     W = centre(W.astype(np.float64))
+    scales = image_scales(W)
+    W = W / scales[:, None, None]
     starts = _best_starts(W)
     exact = _exact(W)
     refined = [] if exact else [item for start in starts for item in _refined(W, start)]
@@ -100,7 +113,17 @@ def consensus(W: Floats) -> Consensus:
     seen = np.concatenate((W, middle[..., None]), 2)
     mirrored = _signs(np.stack((middle, (nearest.S @ nearest.Q.swapaxes(1, 2))[..., 2])))
     Q = nearest.Q if mirrored.prod() > 0 else _mirrored(nearest.Q)
-    return Consensus(centre(seen @ Q), Q, spread, len(solutions))
+    return Consensus(centre(seen @ Q), Q, scales, spread, len(solutions))
+
+
+def image_scales(W: Floats) -> Floats:
+    """Return the scale (f,) of each image W (f, p, 2), median 1; all 1 if they hardly differ."""
+    K = min(_SCALE_RANK, min(2 * len(W), W.shape[1]) // 3)
+    scales = np.linalg.norm(block_cameras(W, K), axis=(1, 2))
+    scales = np.maximum(scales / np.median(scales), _LEAST_SCALE)
+    low, high = np.quantile(np.log(scales), (0.25, 0.75))
+    same = high - low < _SAME_SCALE
+    return np.ones(len(W)) if same else scales
 
 
 def _best_starts(W: Floats) -> list[_Solution]:
