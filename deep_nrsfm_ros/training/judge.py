@@ -272,19 +272,17 @@ def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> li
         rival: the model at hand, with which each is compared; None: with itself.
     """
     court = Judge(frames)
-    lifting = []
-    for model in ([rival] if rival else []) + list(models):
+    at_hand, old = None, None
+    if rival is not None:
         with suppress(ValueError):
-            court.figures(model)
-            lifting.append(model)
-    at_hand = rival if rival is not None and any(model is rival for model in lifting) else None
-    old = court.figures(at_hand) if at_hand else None
+            old, at_hand = court.figures(rival), rival
     result = []
-    for model in lifting:
-        new = court.figures(model, at_hand)
-        place = rank(new, old)
-        verdict = "doubtful" if place.doubtful else "better" if old else ""
-        result.append(Standing(model, new, "at hand" if model is at_hand else verdict, place))
+    for model in ([at_hand] if at_hand else []) + list(models):
+        with suppress(ValueError):
+            new = old if model is at_hand and old else court.figures(model, at_hand)
+            place = rank(new, old)
+            verdict = "doubtful" if place.doubtful else "better" if old else ""
+            result.append(Standing(model, new, "at hand" if model is at_hand else verdict, place))
     return sorted(result, key=lambda each: each.rank)
 
 
