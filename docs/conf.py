@@ -64,7 +64,8 @@ def _read_page(_: Any, name: str, source: list[str]) -> None:
     if page not in map(Path, COPIED.values()):
         source[0] = rewrite(source[0], Path("docs") / page, page)
     if name == "index":
-        pages = (path.stem for path in sorted(_DOCS.glob("*.md")))
+        pages = [path.stem for path in sorted(_DOCS.glob("*.md"))]
+        pages += [Path(page).with_suffix("").as_posix() for page in COPIED.values()]
         more = [page for page in pages if page not in ("README", "index", *source[0].split())]
         if more:  # pages that index.md does not place
             listed = "\n".join(more)

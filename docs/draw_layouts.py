@@ -149,16 +149,20 @@ def positions(layout: KeypointLayout) -> list[tuple[str, dict[int, Point]]]:
     body = _BODY | {f"right_{n[5:]}": (-x, y) for n, (x, y) in _BODY.items() if x}
     start = next((i for i, n in enumerate(layout.keypoints) if n == "right_jaw_1"), None)
     if start is None:
-        return [("", _place(layout, range(len(layout)), body))]
-    face = dict(enumerate(_face(), start))
-    if "left_pupil" in layout.keypoints:
-        face |= {layout.index("right_pupil"): (-2.05, 1.4), layout.index("left_pupil"): (2.05, 1.4)}
-    parts = [("", _place(layout, range(26 if start == 26 else min(start, 25)), body))]
-    parts.append(("face", face))
+        own = [i for i, name in enumerate(layout.keypoints) if name in body]
+        parts = [("", _place(layout, own, body))]
+    else:
+        face = dict(enumerate(_face(), start))
+        if "left_pupil" in layout.keypoints:
+            face[layout.index("right_pupil")] = (-2.05, 1.4)
+            face[layout.index("left_pupil")] = (2.05, 1.4)
+        count = 26 if start == 26 else min(start, 25)
+        parts = [("", _place(layout, range(count), body)), ("face", face)]
     for side, sign in (("right", 1), ("left", -1)):
         hand = {f"{side}_{n}": (sign * x, y) for n, (x, y) in _hand().items()}
-        own = [layout.index(n) for n in hand if n in layout.keypoints]
-        parts.append((f"back of the {side} hand", _place(layout, own, hand)))
+        if f"{side}_hand_wrist" in layout.keypoints or start is not None:
+            own = [layout.index(n) for n in hand if n in layout.keypoints]
+            parts.append((f"back of the {side} hand", _place(layout, own, hand)))
     return parts
 
 
@@ -204,7 +208,9 @@ def draw(layout: KeypointLayout, folder: Path) -> None:
         _draw(axes, layout, *parts[0])
     else:
         figure, grid = plt.subplots(2, 2, figsize=(9, 9.5))
-        for axes, part in zip(grid.flat, parts, strict=True):
+        for axes in grid.flat:
+            axes.axis("off")
+        for axes, part in zip(grid.flat, parts, strict=False):
             _draw(axes, layout, *part)
     drawn = BytesIO()
     figure.savefig(drawn, dpi=100, bbox_inches="tight", facecolor="white")

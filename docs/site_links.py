@@ -6,17 +6,16 @@ import os
 import re
 from pathlib import Path
 
+_ROOT = Path(__file__).parents[1]
 COPIED = {
     "CONTRIBUTING.md": "copied/contributing.md",
     "CHANGELOG.rst": "copied/changelog.rst",
     "SECURITY.md": "copied/security_policy.md",
     "benchmarks/README.md": "copied/benchmarks.md",
-    "models/human.md": "copied/human.md",
-    "models/cmu31.md": "copied/cmu31.md",
+    **{f"models/{p.name}": f"copied/{p.name}" for p in sorted((_ROOT / "models").glob("*.md"))},
 }
 """Pages of the repository that the site has too, and where."""
 
-_ROOT = Path(__file__).parents[1]
 _PAGES = {**COPIED, "README.md": "index.md", "docs/README.md": "index.md"}
 _LINK = re.compile(r"(?P<text>!?\[[^\]]*\])\((?P<target>[^)\s]+)\)")
 

@@ -18,7 +18,7 @@ PAGES = [
     *sorted((ROOT / "models").glob("*.md")),
 ]
 CALL = re.compile(r"(?:deep-nrsfm|ros2 run deep_nrsfm_ros) (\w+)(.*)")
-OF_DETECTOR = {"source", "rate", "frame_id", "listeners", "smooth"}
+OF_DETECTOR = {"source", "rate", "frame_id", "listeners", "smooth", "detect", "selfie"}
 
 
 def commands() -> Iterator[tuple[str, str, list[str]]]:
