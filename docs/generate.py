@@ -25,6 +25,7 @@ from deep_nrsfm_ros.node.bodies import BodyOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
 from deep_nrsfm_ros.node.gravity import GravitySources
 from deep_nrsfm_ros.node.parameter_bridge import parameter_name
+from deep_nrsfm_ros.node.target_frame import TargetOptions
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.request import TrainingOptions
@@ -37,6 +38,7 @@ _GROUPS: tuple[tuple[str, type, str], ...] = (
     ("Model and input", InputOptions, ""),
     ("Lifting", LiftingOptions, ""),
     ("Camera", CameraOptions, ""),
+    ("Fixed frame", TargetOptions, ""),
     ("Lifting over time", HistoryOptions, "history."),
     ("Gravity", GravityOptions, "gravity."),
     ("Gravity: sources", GravitySources, "gravity."),

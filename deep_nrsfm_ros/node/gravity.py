@@ -28,6 +28,25 @@ _AVERAGED = 0.5  # s, time constant of the mean of the measurements
 _MAX_AGE = 5.0  # s after which the last measurement is no longer used
 
 
+def subscribe_to_frames(node: Node, kind: type, tree: FrameTree) -> None:
+    """Keep the transforms of /tf and /tf_static in a tree.
+
+    Args:
+        node: subscribes.
+        kind: class tf2_msgs/TFMessage.
+        tree: is filled.
+    """
+
+    def receive(message: Any) -> None:
+        for each in message.transforms:
+            q, t = each.transform.rotation, each.transform.translation
+            turn, shift = (q.x, q.y, q.z, q.w), (t.x, t.y, t.z)
+            tree.add(each.header.frame_id, each.child_frame_id, turn, shift)
+
+    for topic, qos in (("/tf", QoSProfile(depth=100)), ("/tf_static", _STATIC)):
+        node.create_subscription(kind, topic, receive, qos)
+
+
 @dataclass(frozen=True)
 class GravitySources:
     """Sources of the direction of gravity."""
@@ -103,14 +122,7 @@ class GravityDirection:
                 f"gravity.frame is {self._sources.frame!r} and the package tf2_msgs is missing; "
                 "install it (apt install ros-jazzy-tf2-msgs), or set gravity.up or gravity.imu"
             ) from None
-        for topic, qos in (("/tf", QoSProfile(depth=100)), ("/tf_static", _STATIC)):
-            self._node.create_subscription(TFMessage, topic, self._receive_frames, qos)
-
-    def _receive_frames(self, message: Any) -> None:
-        """Keep the rotations of a TFMessage."""
-        for each in message.transforms:
-            q = each.transform.rotation
-            self._tree.add(each.header.frame_id, each.child_frame_id, (q.x, q.y, q.z, q.w))
+        subscribe_to_frames(self._node, TFMessage, self._tree)
 
     def _receive_imu(self, message: Imu) -> None:
         """Average the acceleration of an Imu, or take its orientation if it has none."""

@@ -5,8 +5,9 @@ For every message on `keypoints` the node publishes, with the header of that mes
 - ~/points: n objects (rows) of p keypoints (columns): x right, y down, z forward, and confidence.
   Positions in the camera's optical frame if its CameraInfo is known, else centred on the keypoints
   of each object; in units of the parameter reference_length; NaN where an object is not lifted.
-- ~/camera_rotation: from the axes of the first object to those of the camera; not published if the
-  first object is not lifted. The axes are x front, y left, z up if the layout has a handedness.
+- ~/camera_rotation: from the axes of the first object to those of the camera, or of target_frame;
+  not published if the first object is not lifted. The axes are x front, y left, z up if the layout
+  has a handedness.
 - ~/objects: identity of the object in each row, and its transform; only with a subscriber.
 - ~/markers: shapes for RViz; only with a subscriber.
 - ~/skeleton: names of keypoints and joints, latched; ~/joints, ~/joint_states, ~/tracks: frames,
@@ -61,6 +62,7 @@ from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, 
 from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
+from deep_nrsfm_ros.node.target_frame import TargetFrame, TargetOptions
 from deep_nrsfm_ros.node.training_service import TrainingService
 from deep_nrsfm_ros.node.transforms import TransformBroadcaster
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
@@ -102,6 +104,7 @@ class LifterNode(Node):
         self._inputs = parameter_bridge.declare(self, InputOptions)
         parameter_bridge.declare(self, LiftingOptions)
         camera = parameter_bridge.declare(self, CameraOptions)
+        target = parameter_bridge.declare(self, TargetOptions)
         parameter_bridge.declare(self, HistoryOptions, _HISTORY)
         parameter_bridge.declare(self, SmoothingOptions, _SMOOTHING)
         self._up = parameter_bridge.declare(self, GravityOptions, _GRAVITY).direction
@@ -129,6 +132,7 @@ class LifterNode(Node):
         self._frame_id, self._last_frame = camera.frame_id, ""
         self._camera = CameraInfoSubscription(self, camera)
         self._gravity = GravityDirection(self, sources)
+        self._target = TargetFrame(self, target, positioned=self._camera.enabled)
         self._tf = TransformBroadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._lifter_diagnostics = LifterDiagnostics()
         self._points = self._quiet_publisher(PointCloud2, "~/points")
@@ -216,10 +220,14 @@ class LifterNode(Node):
                 header = header._replace(frame_id=self._frame(source, header.frame_id))
             self._last_frame = header.frame_id
             up = self._gravity(self._up, header.frame_id)
+            if up is None and self._target.name:
+                up = self._target.up(header.frame_id)
             detected = len(identities)
             lifted, identities = self._pipeline.lift(
                 observation, intrinsics, identities, source.topic, moment, up
             )
+            if self._target.name and identities:
+                header, lifted = self._target(header, lifted)
         except Exception as problem:  # one bad message must not end the node
             if self.context.ok():  # else a signal came meanwhile, and the message is not at fault
                 self._reject(source, problem)

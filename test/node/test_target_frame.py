@@ -1,0 +1,74 @@
+"""Objects in a fixed frame."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.lifting.observation import MessageError
+from deep_nrsfm_ros.messages.serialised import Header
+from deep_nrsfm_ros.node.target_frame import TargetFrame, TargetOptions
+from test.node.test_publishing import lifted
+
+LEVEL = (2.0, 0.0, 1.4, -0.5, 0.5, -0.5, 0.5)  # looks along x, 1.4 m high
+NODE: Any = None
+
+
+def target(pose: tuple[float, ...] = LEVEL, frame: str = "map") -> TargetFrame:
+    return TargetFrame(NODE, TargetOptions(frame, pose), positioned=True)
+
+
+def test_objects_before_a_level_camera_are_where_they_are_on_the_map() -> None:
+    objects = lifted(1, 3)
+    objects.shapes[0] = [[0, 0, 3], [1, 0, 3], [0, 1.4, 3]]  # ahead, to the right, on the floor
+    header, moved = target()(Header(1, 2, "camera"), objects)
+    assert header == Header(1, 2, "map")
+    wanted = [[5, 0, 1.4], [5, -1, 1.4], [5, 0, 0]]
+    np.testing.assert_allclose(moved.shapes[0], wanted, atol=1e-6)
+    np.testing.assert_allclose(moved.rotations[0] @ [0, 0, 1], [1, 0, 0], atol=1e-6)
+    np.testing.assert_array_equal(moved.residual, objects.residual)
+
+
+def test_gravity_is_known_with_the_target() -> None:
+    up = target().up("camera")
+    assert up is not None
+    np.testing.assert_allclose(up, [0, -1, 0], atol=1e-9)
+    assert target((0.0,) * 7, "").up("camera") is None
+
+
+def test_frames_of_tf_are_followed() -> None:
+    frames = target()
+    frames._pose = None
+    with pytest.raises(MessageError, match="no transform from 'camera' to target_frame 'map'"):
+        frames(Header(frame_id="camera"), lifted(1))
+    frames._tree.add("map", "base", (0, 0, 2**-0.5, 2**-0.5), (1, 2, 0))  # a quarter to the left
+    frames._tree.add("base", "camera", (-0.5, 0.5, -0.5, 0.5), (0.1, 0, 1))
+    objects = lifted(1, 1)
+    objects.shapes[0] = [[0, 0, 2]]
+    _, moved = frames(Header(frame_id="camera"), objects)
+    np.testing.assert_allclose(moved.shapes[0, 0], [1, 4.1, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "positioned", "reason"),
+    [
+        (TargetOptions("map", LEVEL), False, "without camera_info"),
+        (TargetOptions("", LEVEL), True, "camera_pose is set without target_frame"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    options: TargetOptions, reason: str, *, positioned: bool
+) -> None:
+    with pytest.raises(ValueError, match=reason):
+        TargetFrame(NODE, options, positioned=positioned)
+    with pytest.raises(ValueError, match="seven numbers"):
+        TargetOptions("map", (1.0, 2.0))
+
+
+@pytest.mark.skipif(find_spec("tf2_msgs") is not None, reason="tf2_msgs is there")
+def test_without_tf2_a_pose_is_needed() -> None:
+    with pytest.raises(ValueError, match=r"target_frame is 'map': .*tf2_msgs.*or set camera_pose"):
+        target((0.0,) * 7)
