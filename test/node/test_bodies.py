@@ -272,6 +272,19 @@ def test_the_example_shows_an_elbow(client: Client, tmp_path: Path) -> None:
     assert shown.read_text().startswith("object1/l_elbow: ")
 
 
+def leaves(split: Any) -> set[str]:
+    """Return the panels of a layout of Foxglove."""
+    return {split} if isinstance(split, str) else leaves(split["first"]) | leaves(split["second"])
+
+
+def test_the_layout_of_foxglove_shows_what_the_lifter_says() -> None:
+    layout = json.loads((EXAMPLES.parent / "config" / "foxglove.json").read_text())
+    assert leaves(layout["layout"]) == set(layout["configById"])
+    for path in layout["configById"]["Plot!angles"]["paths"]:
+        column = TREE.angle_names.index(path["label"])
+        assert path["value"] == f"/lifter/joint_states.position[{column}]"
+
+
 Make = Callable[..., Any]
 
 
