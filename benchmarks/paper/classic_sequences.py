@@ -20,6 +20,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import consensus
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, polar, rotation_from_camera
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 
@@ -39,6 +40,7 @@ PAPER = {
     "drink": {"Simple (Dai et al.)": 0.0266, "Simple, weighted (Kumar)": 0.0119},
     "pickup": {"Simple (Dai et al.)": 0.1731, "Simple, weighted (Kumar)": 0.0198},
 }
+AGREED = "factorisations that agree (no truth used)"
 _SHOWN = ("shape %", "proper %", "mirrored %")
 ERRORS = {
     "e3D": "mean distance of points over the mean standard deviation of the true coordinates "
@@ -51,6 +53,7 @@ _LEGEND = {
     "paper": "e3D of Dai et al. (IJCV 2014) and Kumar (WACV 2020), quoted from memory of their "
     "tables, not checked against the text",
     "frames": "few: the network overfits them; all figures are of the training frames",
+    AGREED: "what a training of up to 1000 frames teaches its network, by nrsfm/factorisation",
     "K": "chosen by the lowest shape error against the ground truth, which favours the baselines; "
     "they solve the whole sequence at once",
 }
@@ -93,6 +96,7 @@ def reconstructions(
         model = session.trained(f"{name} seed {seed}", dataset, session.preset("default", seed))
         for lifting, options in LIFTING.items():
             yield f"default recipe, {lifting}", seed, lift_in_object_axes(model, dataset, options)
+    yield AGREED, None, consensus(dataset.points).shapes
     yield "rigid factorisation (Tomasi-Kanade)", None, rigid(dataset.points)
     for baseline in BASELINES:
         rank, S = best_rank(baseline, dataset)

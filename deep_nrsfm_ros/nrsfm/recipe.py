@@ -69,7 +69,7 @@ class Recipe:
         choices=("repair", "always", "off"),
     )
     few_frames: int = option(
-        2000,
+        1000,
         "frames up to which the known shapes of the cycle loss come from classic factorisations of "
         "all frames, on which a network cannot improve with so few; 0 = never; without effect in "
         "trainings of fewer than 2000 steps, that start from a model, or of several processes",

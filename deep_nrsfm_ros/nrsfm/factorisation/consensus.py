@@ -184,4 +184,5 @@ def _mirrored(Q: Floats) -> Floats:
     diag(1, 1, -1) Q diag(1, 1, -1) takes S diag(1, 1, -1) to the mirrored depth.
     """
     mirror = np.array([1.0, 1.0, -1.0])
-    return mirror[:, None] * Q * mirror
+    turned: Floats = mirror[:, None] * Q * mirror
+    return turned
