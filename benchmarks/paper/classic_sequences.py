@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.baselines.em_ppca import em_ppca_by_likelihood
 from benchmarks.baselines.methods import block_matrix, em_ppca, rigid
 from benchmarks.data.mat_files import read_sequence
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
@@ -21,6 +20,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import consensus
+from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import em_ppca_by_likelihood
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, polar, rotation_from_camera
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 
