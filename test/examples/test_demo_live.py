@@ -59,7 +59,7 @@ def test_from_videos_to_the_table(command: list[str], tmp_path: Path) -> None:
     assert all(row[1] == str(FRAMES) for row in table[1:])
     # Nobody is in one image, and best effort may lose others where the machine is busy.
     assert all(0 < float(row[2]) < FRAMES for row in table[1:])
-    assert (tmp_path / "out" / "demo_live.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "out" / "demo.png").read_bytes().startswith(b"\x89PNG")
     with Reader(tmp_path / "out" / "recorded") as bag:
         counts = {topic: found.msgcount for topic, found in bag.topics.items()}
     assert counts["/keypoints"] == 4 * FRAMES
