@@ -129,6 +129,11 @@ setup(
             "ros-jazzy-common-interfaces",  # the messages it receives and sends
             "ros-jazzy-rmw-fastrtps-cpp",  # the DDS under it
         ],
+        "ros-kilted": [  # instead of "ros"
+            "ros-kilted-rclpy",
+            "ros-kilted-common-interfaces",
+            "ros-kilted-rmw-fastrtps-cpp",
+        ],
         "test": [
             "pytest",  # runs the tests; colcon test needs its name here to run any
             "pytest-xdist",  # several test files at a time: make test TEST_PROCESSES=2

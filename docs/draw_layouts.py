@@ -6,7 +6,7 @@ the index of each keypoint. The positions are made up; names, indices and edges 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from io import BytesIO
 from pathlib import Path
 
