@@ -99,6 +99,8 @@ These limits are chosen on the people of `benchmarks/real/judge.py`; the table t
 they do.
 """
 
+MOST_RESIDUAL = 0.5
+"""Residual above which a model does not fit the frames: doubtful, whatever it is compared with."""
 MOST_MIRRORED = 0.05
 """Share of mirrored frames above which a model is doubtful where there is none to compare with."""
 
@@ -185,6 +187,11 @@ def worse_figures(new: Figures, old: Figures | None) -> list[str]:
         new: of the new model.
         old: of the one at hand; None where there is none.
     """
+    return _worse(new, old) or (["misfit"] if new.residual > MOST_RESIDUAL else [])
+
+
+def _worse(new: Figures, old: Figures | None) -> list[str]:
+    """Return the names of the figures that are worse than those of the model at hand."""
     values = _known(new)
     shares = ("mirrored_share", "front_disagreement")
     if old is None:
