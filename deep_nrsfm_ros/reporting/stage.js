@@ -104,7 +104,7 @@ const orbit = new Orbit($("lifted"), 0, 0.24, () => {
   bones(data.target, shape, ([a, b], stroke) => drawn.push([project(a), project(b), stroke, 5]));
   drawn.sort((e, f) => e[0][2] + e[1][2] - f[0][2] - f[1][2]).forEach(line => stroke(...line));
   orbit.dots(orbit.joints, orbit.joints.map(() => "#20262b"), 3);
-  if (!orbit.joints.length) write(pen, 16, 28, "nothing was lifted in this frame");
+  if (!orbit.joints.length) write(pen, 16, 28, "no answer for this frame: dropped, or not lifted");
   write(pen, 14, orbit.height - 14, `floor: one square is ${data.grid} m`);
 });
 
