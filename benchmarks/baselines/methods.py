@@ -88,8 +88,8 @@ BASELINES |= {
     "Sparse, repaired": Baseline(
         sparse,
         _SPARSE,
-        "positive Gram matrices, atoms synchronised by all frames that they share, cameras from "
-        "all atoms, shapes moved onto the images",
+        "positive Gram matrices with an inverse, atoms synchronised by all frames that they share, "
+        "cameras from all atoms, shapes moved onto the images",
     ),
     "SfC (Kong et al.)": Baseline(
         lambda W, K, sparsity: structure_from_category(W, K, sparsity=sparsity, growth=1.03),
