@@ -5,5 +5,6 @@ rest; angles are in radians; lengths and positions are in the unit of the points
 
 - `kinematic_tree.py`: frames and angles of a layout's joints, and the way back to points.
 - `urdf.py`: the description of one object as URDF text, and its drawing as capsules.
+- `floor.py`: metres from the height of the camera above the floor.
 - `motion.py`: velocities and the state of tracking of each identity.
 """

@@ -26,9 +26,11 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
+from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
@@ -39,9 +41,11 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from deep_nrsfm_ros.body.floor import FloorScale
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
@@ -132,6 +136,7 @@ class LifterNode(Node):
         self._frame_id, self._last_frame = camera.frame_id, ""
         self._camera = CameraInfoSubscription(self, camera)
         self._gravity = GravityDirection(self, sources)
+        self._floor = FloorScale(camera.camera_height) if camera.camera_height else None
         self._target = TargetFrame(self, target, positioned=self._camera.enabled)
         self._tf = TransformBroadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
         self._lifter_diagnostics = LifterDiagnostics()
@@ -226,6 +231,8 @@ class LifterNode(Node):
             lifted, identities = self._pipeline.lift(
                 observation, intrinsics, identities, source.topic, moment, up
             )
+            if self._floor and identities and up is not None:
+                lifted = self._on_floor(source.topic, lifted, identities, up, moment)
             if self._target.name and identities:
                 header, lifted = self._target(header, lifted)
         except Exception as problem:  # one bad message must not end the node
@@ -257,6 +264,22 @@ class LifterNode(Node):
         self._publish_bodies(source, Scene(header, lifted, identities, detected, moment))
         self._lifter_diagnostics.lifted(
             time.perf_counter() - started, lifted.residual, lifted.confidence
+        )
+
+    def _on_floor(
+        self,
+        topic: str,
+        lifted: Lifted,
+        identities: Sequence[str],
+        up: NDArray[np.float64],
+        moment: Moment,
+    ) -> Lifted:
+        """Return objects at the size with which they stand on the floor."""
+        assert self._floor
+        names = [identity and f"{topic} {identity}" for identity in identities]
+        scales = self._floor(names, lifted.shapes, up, moment.seconds).astype(np.float32)
+        return lifted._replace(
+            shapes=scales[:, None, None] * lifted.shapes, scale=lifted.scale / scales
         )
 
     def _publish_bodies(self, source: KeypointTopic, scene: Scene) -> None:
