@@ -149,7 +149,7 @@ def rigid_errors(hand: Labelled) -> dict[str, float]:
     """Return the errors of the mean labelled shape in the orientation that fits each frame best."""
     from deep_nrsfm_ros.nrsfm.geometry import align
 
-    known = np.isfinite(hand.truth).all(2)
+    known = np.asarray(np.isfinite(hand.truth).all(2), bool)
     truth = centre(np.where(known[..., None], hand.truth, 0.0)[:, known.all(0)])
     mean = align(truth, np.broadcast_to(truth[0], truth.shape)).aligned.mean(0)
     turned = align(np.broadcast_to(mean, truth.shape), truth).aligned

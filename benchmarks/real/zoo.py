@@ -134,7 +134,7 @@ def _dataset(
     points: Floats, layout: KeypointLayout, source: str, shapes: Floats | None = None
 ) -> Dataset:
     """Return points (f, p, 2), NaN where missing, as a dataset."""
-    visible = np.isfinite(points).all(2)
+    visible = np.asarray(np.isfinite(points).all(2), bool)
     kept = visible.sum(1) >= 4
     points = np.where(visible[..., None], points, 0).astype(np.float32)[kept]
     truth = None if shapes is None else shapes[kept].astype(np.float32)

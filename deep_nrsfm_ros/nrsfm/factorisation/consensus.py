@@ -48,7 +48,7 @@ _SAME_SCALE = 0.15  # range of the middle half of the logarithms: 0.09 without d
 _LEAST_SCALE = 0.1
 _SAME_NORM = 1.005  # times the lowest nuclear norm: cameras that are kept
 _EM_ITERATIONS = 100
-_MORE_ITERATIONS = 200  # where there is no noise: EM converges slowly
+_MORE_ITERATIONS = 400  # where there is no noise: EM converges slowly
 _NO_NOISE = 1e-5  # variance of the noise, relative to that of the images, that is none
 _FEW_MODES = 3
 
@@ -154,7 +154,7 @@ def _exact(W: Floats) -> list[_Solution]:
     if model.variance > _NO_NOISE * float((W**2).mean()):
         return []
     K = len(model.basis) - 1
-    model = from_shapes(W, model.Q, shapes_of(W, model), K, iterations=_MORE_ITERATIONS)
+    model = from_shapes(W, start.Q, start.S, K, iterations=_MORE_ITERATIONS)
     return [_meeting(W, model.Q, shapes_of(W, model))]
 
 
