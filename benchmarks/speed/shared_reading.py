@@ -82,25 +82,24 @@ def train(bag: Path, frames: int, folder: Path) -> tuple[float, float]:
 
 def benchmark(args: Namespace) -> Iterator[Table]:
     """Yield the table of rates, and with `--long` that of the large training."""
-    frames = 2000 if args.quick else 200_000
     table = Table(
         "shared_reading",
-        f"Reading {frames} frames of {len(HUMAN17)} keypoints from a bag",
-        ("objects a message", "processes"),
+        f"Reading frames of {len(HUMAN17)} keypoints from a bag",
+        ("objects a message", "frames", "processes"),
         ("frames/s", "ratio"),
         {"frames/s": "all frames over the processor time of the slowest process"},
         bars("frames/s"),
     )
     with tempfile.TemporaryDirectory() as folder:
-        for objects in (1, 100):
+        for objects, frames in ((1, 60_000), (100, 1_000_000)):
+            frames //= 100 if args.quick else 1
             bag = Path(folder) / f"of_{objects}"
-            write_bag(bag, TOPIC, repeated_frames(frames // (10 if objects == 1 else 1), objects))
-            total = frames // (10 if objects == 1 else 1)
-            alone = rate(bag, total, 1)
+            write_bag(bag, TOPIC, repeated_frames(frames, objects))
+            alone = rate(bag, frames, 1)
             for processes in (1, 2):
-                measured = alone if processes == 1 else rate(bag, total, processes)
+                measured = alone if processes == 1 else rate(bag, frames, processes)
                 figures = {"frames/s": measured, "ratio": measured / alone}
-                table.add((str(objects), str(processes)), figures)
+                table.add((str(objects), str(frames), str(processes)), figures)
         yield table
         if args.long:
             bag = Path(folder) / "large"
