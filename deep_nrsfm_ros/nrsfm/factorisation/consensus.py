@@ -29,8 +29,8 @@ from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import (
     block_rotations,
     least_nuclear_norm,
 )
-from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import from_shapes, shapes_of
-from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations, rigid_shape
+from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import fit, from_shapes, shapes_of
+from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations
 from deep_nrsfm_ros.nrsfm.geometry import back_project, centre, rotation_from_camera
 
 Floats = NDArray[Any]
@@ -48,7 +48,7 @@ _SAME_SCALE = 0.15  # range of the middle half of the logarithms: 0.09 without d
 _LEAST_SCALE = 0.1
 _SAME_NORM = 1.005  # times the lowest nuclear norm: cameras that are kept
 _EM_ITERATIONS = 100
-_MORE_ITERATIONS = 400  # where there is no noise: EM converges slowly
+_MORE_ITERATIONS = 300  # where there is no noise: EM converges slowly
 _NO_NOISE = 1e-5  # variance of the noise, relative to that of the images, that is none
 _FEW_MODES = 3
 
@@ -144,17 +144,11 @@ def _exact(W: Floats) -> list[_Solution]:
 
     It starts from rigid factorisation: the least nuclear norm is far from few modes.
     """
-    R = rigid_rotations(W)
-    mean = np.broadcast_to(rigid_shape(W, R), (*W.shape[:2], 3))
-    start = _meeting(W, rotation_from_camera(R.swapaxes(1, 2)), mean)
-    models = [
-        from_shapes(W, start.Q, start.S, K, iterations=_EM_ITERATIONS) for K in (2, _FEW_MODES)
-    ]
+    models = [fit(W, K, iterations=_EM_ITERATIONS) for K in (2, _FEW_MODES)]
     model = min(models, key=lambda model: model.variance)
     if model.variance > _NO_NOISE * float((W**2).mean()):
         return []
-    K = len(model.basis) - 1
-    model = from_shapes(W, start.Q, start.S, K, iterations=_MORE_ITERATIONS)
+    model = fit(W, len(model.basis) - 1, iterations=_MORE_ITERATIONS)
     return [_meeting(W, model.Q, shapes_of(W, model))]
 
 
