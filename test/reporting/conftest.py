@@ -172,3 +172,4 @@ def tab(browser: Browser) -> Iterator[Browser]:
     browser.errors.clear()
     yield browser
     assert not browser.errors
+    browser.open("about:blank")  # a page that plays would take a core from the other tests
