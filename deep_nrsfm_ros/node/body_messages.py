@@ -187,19 +187,31 @@ def _track(identity: str, state: str, values: dict[str, str]) -> DiagnosticStatu
     )
 
 
-def position(header: Header, point: Floats) -> PointStamped:
-    """Return the PointStamped of a point (3,)."""
-    message = PointStamped(header=publishing.to_header(header))
-    message.point.x, message.point.y, message.point.z = point.tolist()
-    return message
+def position(header: Header, point: Floats) -> bytes:
+    """Return the serialised PointStamped of a point (3,)."""
+    return _position(header.frame_id)(header, point)
 
 
-def velocity(header: Header, linear: Floats) -> TwistStamped:
-    """Return the TwistStamped of a linear velocity (3,)."""
-    message = TwistStamped(header=publishing.to_header(header))
+@lru_cache(_MAX_TEMPLATES)
+def _position(frame_id: str) -> SerialisedTemplate:
+    """Return the template of a point."""
+    message = PointStamped(header=_header(frame_id))
+    message.point.x, message.point.y, message.point.z = mark(0), mark(1), mark(2)
+    return SerialisedTemplate(message, 3)
+
+
+def velocity(header: Header, linear: Floats) -> bytes:
+    """Return the serialised TwistStamped of a linear velocity (3,)."""
+    return _velocity(header.frame_id)(header, linear)
+
+
+@lru_cache(_MAX_TEMPLATES)
+def _velocity(frame_id: str) -> SerialisedTemplate:
+    """Return the template of a velocity."""
+    message = TwistStamped(header=_header(frame_id))
     v = message.twist.linear
-    v.x, v.y, v.z = linear.tolist()
-    return message
+    v.x, v.y, v.z = mark(0), mark(1), mark(2)
+    return SerialisedTemplate(message, 3)
 
 
 def _header(frame_id: str) -> std_msgs.Header:
