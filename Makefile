@@ -43,12 +43,14 @@ TEST_PROCESSES ?= 1
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
+# The demo alone needs neither linters nor what tests and benchmarks need.
+DEMO_READY := .venv/.ready-demo
 # Only what runs a detector needs it, and not every Python has it, so the lock leaves it out.
 EXAMPLES_READY := .venv/.ready-examples
 
-.PHONY: docs demo demo-live test lint sanitize fuzz benchmark benchmark-speed audit lock clean clean-demo reference
+.PHONY: python-version docs demo demo-live test lint sanitize fuzz benchmark benchmark-speed audit lock clean clean-demo reference
 
-demo: $(READY)
+demo: $(if $(wildcard $(READY)),$(READY),$(DEMO_READY))
 	$(PYTHON) -m deep_nrsfm_ros.commands.demo --node
 
 demo-live: $(EXAMPLES_READY)
@@ -98,14 +100,22 @@ benchmark-speed: $(READY)
 	set -e; for name in $(SPEED); do $(PYTHON) -m benchmarks.$$name; done
 	test -z "$(DATA)" || $(PYTHON) -m benchmarks.speed.time_to_error --data $(DATA)
 
-# Editable, so that a stale copy never shadows the source; the tests install real copies elsewhere.
-$(READY): requirements.lock setup.py
+python-version:
 	@$(PYTHON3) -c 'import sys; (3, 11) <= sys.version_info < (3, 14) or sys.exit( \
 	    "Python 3.11 to 3.13 is needed and $(PYTHON3) is %d.%d; choose one: " \
 	    "make PYTHON3=python3.12" % sys.version_info[:2])'
+
+# Editable, so that a stale copy never shadows the source; the tests install real copies elsewhere.
+$(READY): requirements.lock setup.py | python-version
 	$(PYTHON3) -m venv .venv
 	$(PYTHON) -m pip install --requirement requirements.lock
 	$(PYTHON) -m pip install --no-deps --no-build-isolation --editable .
+	touch $@
+
+$(DEMO_READY): requirements.lock setup.py | python-version
+	$(PYTHON3) -m venv .venv
+	$(PYTHON) -m pip install --quiet --constraint requirements.lock setuptools
+	$(PYTHON) -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[ros,train,demo]'
 	touch $@
 
 $(EXAMPLES_READY): $(READY)

@@ -90,9 +90,10 @@ def descendants(folder: Path) -> list[str]:
     return lines
 
 
+@pytest.mark.timeout(420)  # on a machine that does other work
 def test_demo_from_keypoints_to_trained_model(start: Start, tmp_path: Path) -> None:
     process = start(train_steps=20)
-    said, _ = process.communicate(timeout=170)
+    said, _ = process.communicate(timeout=400)
     assert process.returncode == 0, said
     output = tmp_path / "output"
     table = [line.split() for line in said.splitlines() if line.lstrip().startswith(("cam", "mea"))]
