@@ -57,7 +57,7 @@ def rate(bag: Path, frames: int, processes: int) -> float:
             words, env=environment, stdout=subprocess.PIPE, text=True, check=True
         )
         seconds.append(json.loads(ended.stdout))
-    return frames / max(seconds)
+    return float(frames / max(seconds))
 
 
 def read_share(bag: Path, share: Share) -> float:

@@ -24,10 +24,10 @@ def target(pose: tuple[float, ...] = LEVEL, frame: str = "map") -> TargetFrame:
 
 def test_objects_before_a_level_camera_are_where_they_are_on_the_map() -> None:
     objects = lifted(1, 3)
-    objects.shapes[0] = [[0, 0, 3], [1, 0, 3], [0, 1.4, 3]]  # ahead, to the right, on the floor
+    objects.shapes[0] = np.array([[0, 0, 3], [1, 0, 3], [0, 1.4, 3]])  # ahead, to the right, on the floor
     header, moved = target()(Header(1, 2, "camera"), objects)
     assert header == Header(1, 2, "map")
-    wanted = [[5, 0, 1.4], [5, -1, 1.4], [5, 0, 0]]
+    wanted = np.array([[5, 0, 1.4], [5, -1, 1.4], [5, 0, 0]])
     np.testing.assert_allclose(moved.shapes[0], wanted, atol=1e-6)
     np.testing.assert_allclose(moved.rotations[0] @ [0, 0, 1], [1, 0, 0], atol=1e-6)
     np.testing.assert_array_equal(moved.residual, objects.residual)
