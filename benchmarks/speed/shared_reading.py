@@ -50,7 +50,7 @@ def rate(bag: Path, frames: int, processes: int) -> float:
     """Return the frames per second of processor time that processes read together."""
     command = [sys.executable, "-m", "benchmarks.speed.shared_reading", "--bag", str(bag)]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    seconds = []
+    seconds: list[float] = []
     for index in range(processes):  # one after the other, since their times do not depend on it
         words = [*command, "--share", str(index), str(processes)]
         ended = subprocess.run(
