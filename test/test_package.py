@@ -149,7 +149,7 @@ def test_share_has_what_the_source_has(prefix: Path) -> None:
     assert (share / "package.xml").read_bytes() == (ROOT / "package.xml").read_bytes()
     for folder, patterns in {
         "launch": ["*.launch.py"],
-        "config": ["*.yaml", "*.rviz", "*.xml"],
+        "config": ["*.yaml", "*.rviz", "*.xml", "*.json"],
         "config/layouts": ["*.yaml"],
         "config/security": ["*.xml"],
         "config/mappings": ["*.yaml"],
