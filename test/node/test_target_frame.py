@@ -24,7 +24,8 @@ def target(pose: tuple[float, ...] = LEVEL, frame: str = "map") -> TargetFrame:
 
 def test_objects_before_a_level_camera_are_where_they_are_on_the_map() -> None:
     objects = lifted(1, 3)
-    objects.shapes[0] = np.array([[0, 0, 3], [1, 0, 3], [0, 1.4, 3]])  # ahead, to the right, on the floor
+    # Ahead, to the right, on the floor.
+    objects.shapes[0] = np.array([[0, 0, 3], [1, 0, 3], [0, 1.4, 3]])
     header, moved = target()(Header(1, 2, "camera"), objects)
     assert header == Header(1, 2, "map")
     wanted = np.array([[5, 0, 1.4], [5, -1, 1.4], [5, 0, 0]])
