@@ -71,6 +71,7 @@ class Case(NamedTuple):
         rows: the objects in it, in order.
         options: with which the programs are called.
         layout: preset in which `train` is told the keypoints are; "" = the input says it.
+        trained: the objects that a training takes from it, where they are not `rows`.
     """
 
     kind: str
@@ -79,6 +80,7 @@ class Case(NamedTuple):
     rows: Sequence[Row]
     options: tuple[str, ...] = ()
     layout: str = "coco17"
+    trained: Sequence[Row] = ()
 
 
 def _truth(start: int, across: float) -> Truth:
@@ -461,7 +463,10 @@ CASES = (
         partial(coordinate_table, extra=str, head="frame", decimal=","),
         ONE,
     ),
-    Case(FORMATS, "folder of folders (pose2sim 120)", folders_of_cameras, ONE),
+    Case(
+        *(FORMATS, "folder of folders (pose2sim 120)", folders_of_cameras, ONE),
+        trained=ONE * 2,
+    ),
     Case(
         *(FORMATS, "x, y, z, visibility in a row (mediapipe 2414)"),
         partial(mediapipe_flat, width=4),

@@ -131,12 +131,13 @@ def by_train(path: Path, case: Case) -> Answer:
     except ValueError as error:
         return Answer(str(error), "no answer")
     said = "; ".join(warnings)
-    if len(dataset) != len(case.rows):
-        return Answer(said, f"{len(dataset)} objects, not {len(case.rows)}")
-    order = sorted(range(len(case.rows)), key=lambda i: (case.rows[i].identity or "", i))
+    rows = case.trained or case.rows
+    if len(dataset) != len(rows):
+        return Answer(said, f"{len(dataset)} objects, not {len(rows)}")
+    order = sorted(range(len(rows)), key=lambda i: (rows[i].identity or "", i))
     worst = 0.0
     for points, visible, i in zip(dataset.points, dataset.visible, order, strict=True):
-        truth = TRUTH[case.rows[i].person].pixels[case.rows[i].frame]
+        truth = TRUTH[rows[i].person].pixels[rows[i].frame]
         distance = np.linalg.norm(points - truth, axis=-1)[LIMBS][visible[LIMBS]]
         worst = max(worst, float(np.median(distance)) if len(distance) else np.inf)
     return Answer(said, f"keypoints {worst:.0f} pixels off" if worst > MAX_DISTANCE else "")
