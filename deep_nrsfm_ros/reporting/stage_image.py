@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -166,12 +167,18 @@ def animation_frames(
 ) -> Iterator[Image.Image]:
     """Yield images of a camera's view beside the person, around whom the viewer goes.
 
+    The ground truth has the middle of the lifted person, so that the eye compares the shapes: from
+    another side an error of the distance from the camera would be all that it sees.
+
     Args:
         stage: to show.
         view: of the camera.
         height: of the images in pixels.
         turn: radians by which the viewer goes to and fro while the clip plays.
     """
+    limbs = [stage.target.index(joint) for joint in stage.truth.keypoints]
+    away = np.mean(view.shapes[:, limbs] - view.truth, axis=1, keepdims=True)
+    view = replace(view, truth=view.truth + away)
     start, count = _yaw_of(stage, view), len(stage.frames)
     words = _font(round(height / 26))
     for k, frame in enumerate(stage.frames):
@@ -184,7 +191,7 @@ def animation_frames(
         pen, margin = ImageDraw.Draw(both), round(height / 50)
         for left, text in (
             (0, "2D keypoints of a detector"),
-            (photo.width, "3D from this camera alone (grey: truth)"),
+            (photo.width, "3D from this camera alone (grey: truth, moved to it)"),
         ):
             at = (left + 2 * margin, height - round(height / 26) - 3 * margin)
             x1, y1, x2, y2 = pen.textbbox(at, text, font=words)
