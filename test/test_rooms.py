@@ -15,7 +15,8 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "deep_nrsfm_ros"
 NAME = PACKAGE.name
 FLOORS = (
-    {"configuration", "yaml_file", "batched", "large_arrays", "extras"},
+    {"configuration", "yaml_file", "batched", "extras"},
+    {"large_arrays"},
     {"layouts"},
     {"nrsfm"},
     {"kernel"},

@@ -162,6 +162,24 @@ def update_tracks(spoiler: Spoiler) -> Arguments:
     return [*arguments[:8], assigned, floats(spoiler, n, m, 2)]
 
 
+def joint_frames(spoiler: Spoiler) -> Arguments:
+    """Return arguments of `joint_frames`."""
+    n, k, m, a = spoiler.randint(1, 3), spoiler.randint(0, 5), spoiler.randint(1, 4), 3
+    j = k + spoiler.randint(1, 3)
+    indices = []
+    for joint in range(k):
+        parent = spoiler.randrange(-1, joint)
+        others = [spoiler.randrange(m) for _ in range(3)]
+        angles = [spoiler.randrange(-1, a) for _ in range(3)]
+        kind, proper = spoiler.randint(0, 2), spoiler.randint(0, 1)
+        numbers = (kind, proper, joint, parent, spoiler.randrange(m), spoiler.randint(0, 3))
+        indices.append([*numbers, *others, *angles])
+    arrays = [np.array(indices, np.int32).reshape(k, 12), floats(spoiler, k, 39).astype(float)]
+    directions = floats(spoiler, n, m, 3).astype(float)
+    outputs = [output(n, j, 3, 3, dtype=np.float64), output(n, a, dtype=np.float64)]
+    return [*arrays, directions, *outputs, (n, j)]
+
+
 def worker_pool(spoiler: Spoiler, network: Sizes | None = None) -> Arguments:
     """Return arguments of `worker_pool`."""
     p, widths = network or sizes(spoiler)
@@ -208,6 +226,8 @@ ENTRY_POINTS: dict[str, Callable[[Spoiler], Arguments]] = {
     "decode_keypoints": decode_keypoints,
     "match_tracks": match_tracks,
     "update_tracks": update_tracks,
+    "joint_frames": joint_frames,
+    "quaternions": lambda s: [floats(s, 4, 3, 3).astype(float), output(4, 4, dtype=np.float64)],
     "choose_vectors": lambda spoiler: [spoiler.choice((16, 32, 64))],
     "worker_pool": worker_pool,
     "activations_per_frame": lambda s: [COMPILED.worker_pool(*worker_pool(s))],

@@ -89,14 +89,17 @@ def test_name_and_keypoints_are_enough(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_the_examples_are_sound(path: Path) -> None:
     layout = read_layout(path)
-    assert layout.edges and layout.handedness and layout.reference and layout.reference_length
     joined = {name for edge in layout.edges for name in edge}
-    assert joined == set(layout.keypoints)
+    assert len(joined) >= 0.6 * len(layout) and joined <= set(layout.keypoints)
 
 
 def test_there_are_examples() -> None:
     names = {path.stem: read_layout(path) for path in EXAMPLES}
-    assert set(names) == {"excavator", "hand"}
+    assert set(names) == {"excavator", "hand", "mouse22", "fly12", "chair10", "bird15", "car20"}
+    # What a user copies has everything.
+    for layout in (names["excavator"], names["hand"]):
+        assert layout.handedness and layout.reference and layout.reference_length
+        assert {name for edge in layout.edges for name in edge} == set(layout.keypoints)
     # Places that MediaPipe documents.
     hand = names["hand"]
     assert len(hand) == 21

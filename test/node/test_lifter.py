@@ -330,7 +330,9 @@ def test_parameters_change_what_the_next_message_gets(
 
     assert client.set_parameters(reference_length=3) == ""
     np.testing.assert_allclose(
-        unpack(client.exchange(publisher, human))[..., :3], 3 * first[..., :3], rtol=1e-4
+        unpack(client.exchange(publisher, human))[..., :3],
+        6 * first[..., :3],  # of people it is 0.5 m by default
+        rtol=1e-4,
     )
     for refused, reason in {
         "broken": "damaged",
