@@ -64,6 +64,25 @@ def unused_options(
     return warnings
 
 
+def unused_height(
+    height: float, up: GravityOptions, sources: Sources, target_frame: str
+) -> dict[str, str]:
+    """Return a warning, by its name, if the camera's height has no effect.
+
+    Args:
+        height: of the camera above the floor in metres, above 0.
+        up: the direction that a parameter gives.
+        sources: the other sources of gravity.
+        target_frame: fixed frame, which has z up; "" = none.
+    """
+    if up.direction is not None or sources.imu or sources.frame or target_frame:
+        return {}
+    return {
+        "camera_height": f"camera_height is {height:g} and has no effect, since the direction of "
+        "gravity is unknown: set gravity.up, gravity.imu, gravity.frame or target_frame"
+    }
+
+
 def unused_gravity(
     up: GravityOptions, sources: Sources, lifting: LiftingOptions, layout: KeypointLayout
 ) -> dict[str, str]:

@@ -55,7 +55,7 @@ from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
-from deep_nrsfm_ros.messages.unused_options import unused_gravity, unused_options
+from deep_nrsfm_ros.messages.unused_options import unused_gravity, unused_height, unused_options
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
@@ -525,12 +525,13 @@ class LifterNode(Node):
             parameter_bridge.read(self, SmoothingOptions, _SMOOTHING),
             parameter_bridge.read(self, HistoryOptions, _HISTORY),
         )
-        warnings |= unused_gravity(
-            parameter_bridge.read(self, GravityOptions, _GRAVITY),
-            parameter_bridge.read(self, GravitySources, _GRAVITY),
-            lifting,
-            self._pipeline.model.layout,
-        )
+        up = parameter_bridge.read(self, GravityOptions, _GRAVITY)
+        sources = parameter_bridge.read(self, GravitySources, _GRAVITY)
+        if self._floor:
+            height = parameter_bridge.read(self, CameraOptions).camera_height
+            warnings |= unused_height(height, up, sources, self._target.name)
+        else:
+            warnings |= unused_gravity(up, sources, lifting, self._pipeline.model.layout)
         changed = {change.name for change in changes}
         said, self._unused = self._unused, frozenset(warnings)
         return list({t: 0 for name, t in warnings.items() if name in changed or name not in said})

@@ -11,7 +11,7 @@ from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.options import GravityOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
-from deep_nrsfm_ros.messages.unused_options import unused_gravity, unused_options
+from deep_nrsfm_ros.messages.unused_options import unused_gravity, unused_height, unused_options
 
 DEFAULTS = (InputOptions(), LiftingOptions(), SmoothingOptions())
 
@@ -50,3 +50,18 @@ def test_gravity_without_effect_is_warned_of() -> None:
     warnings = unused_gravity(level, Sources(), LiftingOptions(correction="none"), HUMAN17)
     assert "no effect, since correction is 'none'" in warnings["gravity.up"]
     assert not unused_gravity(level, Sources(), LiftingOptions(), HUMAN17)
+
+
+class NoSources:
+    """As the node's parameters by default."""
+
+    imu, frame = "", ""
+
+
+def test_a_height_above_the_floor_without_gravity_is_warned_of() -> None:
+    unknown, level = GravityOptions(), GravityOptions((0, -1.0, 0))
+    (warning,) = unused_height(1.4, unknown, NoSources(), "").values()
+    assert "camera_height is 1.4" in warning and "gravity.imu" in warning
+    assert not unused_height(1.4, level, NoSources(), "")
+    assert not unused_height(1.4, unknown, Sources(), "")
+    assert not unused_height(1.4, unknown, NoSources(), "map")
