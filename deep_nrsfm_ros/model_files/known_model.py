@@ -26,6 +26,8 @@ def knows(model: KeypointLayout, layout: KeypointLayout) -> bool:
 def known_model(object_layout: KeypointLayout | str, preferred: Sequence[Path] = ()) -> Path | None:
     """Return the file of a model that has the keypoints of an object, None if there is none.
 
+    A model of the very keypoints, in their order, comes before one that shares most of them.
+
     Args:
         object_layout: layout of the object, or its name as `find_layout` takes it. "numbered",
             which has no names, and what is no layout have no model.
@@ -37,8 +39,16 @@ def known_model(object_layout: KeypointLayout | str, preferred: Sequence[Path] =
         layout = object_layout
         if isinstance(layout, str):
             layout = find_layout("object", layout)
+        found: list[Path] = []
         for path in (*preferred, *shipped_models()):
             with suppress(ModelFileError):
-                if path.suffix == MODEL_SUFFIX and knows(load_model(path).layout, layout):
+                if path.suffix != MODEL_SUFFIX:
+                    continue
+                own = load_model(path).layout
+                if own.keypoints == layout.keypoints:
                     return path
+                if knows(own, layout):
+                    found.append(path)
+        if found:
+            return found[0]
     return None

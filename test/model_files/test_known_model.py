@@ -10,7 +10,7 @@ import pytest
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17, LAYOUTS
 from deep_nrsfm_ros.model_files.known_model import known_model, knows
-from deep_nrsfm_ros.model_files.model_file import Model, save_model
+from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
@@ -30,6 +30,12 @@ def test_people_of_every_detector_have_human(name: str) -> None:
         pytest.skip(f"there is no layout {name}")
     found = known_model(name)
     assert found is not None and found.stem == "human"
+
+
+@pytest.mark.parametrize("name", ["human17", "human25", "cmu31", "hand21"])
+def test_a_model_of_the_very_keypoints_comes_before_one_that_shares_most(name: str) -> None:
+    found = known_model(name)
+    assert found is not None and load_model(found).layout.keypoints == LAYOUTS[name].keypoints
 
 
 @pytest.mark.parametrize("name", ["hand21", "ap10k17", "numbered", "no such layout"])
