@@ -187,7 +187,8 @@ _HUMAN17_FROM_CMU = {
 
 def human17(motion: Motion) -> NDArray[np.float32]:
     """Return the keypoints of HUMAN17 (f, 17, 3) in metres, where a detector places them."""
-    return np.stack([_body(motion)[name] for name in HUMAN17.keypoints], 1)
+    points = _body(motion)
+    return np.stack([points[name] for name in HUMAN17.keypoints], 1)
 
 
 def human25(motion: Motion) -> NDArray[np.float32]:
