@@ -167,11 +167,7 @@ def match(
     score, shift = np.empty((n, m), np.float32), np.empty((n, m), np.complex64)
     best = np.empty(n, np.int32)
     kernel._kernel.match_tracks(
-        _CONSTANTS,
-        np.ascontiguousarray(points),
-        np.ascontiguousarray(confidence),
-        passed,
-        *_buffers(tracks),
+        *_kernel_arguments(tracks, passed, points, confidence),
         tolerances,
         score,
         shift.view(np.float32),
@@ -246,11 +242,7 @@ def update(
         return update_by_numpy(tracks, passed, points, confidence, assigned, shift)
     updated = Tracks(*(part.copy() for part in tracks))
     kernel._kernel.update_tracks(
-        _CONSTANTS,
-        np.ascontiguousarray(points),
-        np.ascontiguousarray(confidence),
-        passed,
-        *_buffers(updated),
+        *_kernel_arguments(updated, passed, points, confidence),
         assigned,
         shift.view(np.float32),
     )
@@ -283,10 +275,20 @@ def update_by_numpy(
     return updated
 
 
-def _buffers(tracks: Tracks) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the arrays of tracks without the time, complex numbers as pairs of float32."""
-    points, velocity = tracks.points.view(np.float32), tracks.velocity.view(np.float32)
-    return points, tracks.age, velocity, tracks.size
+def _kernel_arguments(
+    tracks: Tracks, passed: Floats, points: NDArray[np.float32], confidence: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Return what both entry points of the kernel take; complex numbers are pairs of float32."""
+    return (
+        _CONSTANTS,
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(confidence),
+        passed,
+        tracks.points.view(np.float32),
+        tracks.age,
+        tracks.velocity.view(np.float32),
+        tracks.size,
+    )
 
 
 def _detections(points: NDArray[np.float32], confidence: Floats) -> _Detections:
