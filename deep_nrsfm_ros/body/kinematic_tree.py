@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.layouts.joints import MAX_ANGLES, WORDS, Joint, direction_vector
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.nrsfm.geometry import quaternion
 
 Floats = NDArray[Any]
 
@@ -423,20 +424,7 @@ def quaternions(R: Floats) -> Floats:
 
 def _quaternions(R: Floats) -> Floats:
     """Return unit quaternions, as the kernel does: for reading and tests."""
-    a, b, c, d, e, f, g, h, i = np.moveaxis(R.reshape(*R.shape[:-2], 9), -1, 0)
-    trace = a + e + i
-    columns = (
-        *(h - f, c - g, d - b, 1 + trace),
-        *(1 + 2 * a - trace, b + d, g + c, h - f),
-        *(b + d, 1 + 2 * e - trace, f + h, c - g),
-        *(g + c, f + h, 1 + 2 * i - trace, d - b),
-    )
-    candidates = np.stack(columns, -1).reshape(*trace.shape, 4, 4)
-    # The largest component is computed first: the others would lose digits near 0.
-    best = np.stack((trace, a, e, i), -1).argmax(-1)[..., None, None]
-    q = np.take_along_axis(candidates, best, -2)[..., 0, :]
-    size = np.sqrt(_dot(q, q))
-    return np.asarray(q / np.where(q[..., 3] < 0, -size, size)[..., None])
+    return np.reshape([quaternion(each) for each in R.reshape(-1, 3, 3)], (*R.shape[:-2], 4))
 
 
 def _free(group: _Group, parents: Floats, v: Floats, w: Floats) -> tuple[Floats, Floats]:
