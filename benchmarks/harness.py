@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import hashlib
 import json
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks.table import Table
+from benchmarks.table import Table, print_tables
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.commands.evaluate import evaluate, figures
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
@@ -225,10 +224,4 @@ def run_program(
         *(args.steps, args.stride, args.batches),
         baselines=None if args.baselines is None else tuple(args.baselines),
     )
-    try:
-        table = benchmark(session)
-    except (ValueError, OSError) as error:
-        print(f"failed: {error}", file=sys.stderr)
-        sys.exit(2)
-    print(table.markdown())
-    table.write(session.output)
+    print_tables(lambda: [benchmark(session)], session.output)

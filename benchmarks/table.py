@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -151,3 +152,21 @@ def lines(names: Sequence[str], across: str, up: str) -> Callable[[Table, Figure
         axes.legend(fontsize="small")
 
     return draw
+
+
+def print_tables(make: Callable[[], Sequence[Table]], output: Path) -> None:
+    """Print and write tables.
+
+    Args:
+        make: returns them; its ValueError or OSError, as of data that are not there, ends the
+            program with one sentence and code 2.
+        output: folder of the files.
+    """
+    try:
+        tables = make()
+    except (ValueError, OSError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        sys.exit(2)
+    for table in tables:
+        print(table.markdown())
+        table.write(output)

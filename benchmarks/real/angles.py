@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from benchmarks.data.people_scenes import CMU, HELD_OUT, HUMANEVA, people_scenes
 from benchmarks.real.people import SYSTEMS, lift_track
-from benchmarks.table import Table, bars
+from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.body.kinematic_tree import KinematicTree
 from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
 from deep_nrsfm_ros.data.pose2sim import JOINTS
@@ -194,18 +194,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of scenes")
     parser.add_argument("--frames", type=int, default=10_000, help="poses of a subject to close")
     args = parser.parse_args(argv)
-    try:
+
+    def tables() -> list[Table]:
         lifter = Lifter(load_model(args.model))
-        tables = [
-            closure_table(args.data, args.frames),
-            scene_angles(lifter, args.data, args.output, args.stride, args.scenes),
-        ]
-    except (ValueError, OSError) as error:
-        print(f"failed: {error}", file=sys.stderr)
-        sys.exit(2)
-    for table in tables:
-        print(table.markdown())
-        table.write(args.output)
+        closure = closure_table(args.data, args.frames)
+        return [closure, scene_angles(lifter, args.data, args.output, args.stride, args.scenes)]
+
+    print_tables(tables, args.output)
 
 
 if __name__ == "__main__":

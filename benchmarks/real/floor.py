@@ -7,7 +7,6 @@ detector's noise; smaller people are the same motions at 70 % of their size.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks.data.people_scenes import HEIGHT, Track, filmed, held_out_motions, noisy
 from benchmarks.real.people import SYSTEMS, lift_track
-from benchmarks.table import Table, bars
+from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.body.floor import FloorScale
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.lifting.lifter import Lifter
@@ -83,13 +82,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     parser.add_argument("--stride", type=int, default=1, help="use every n-th trial")
     args = parser.parse_args(argv)
-    try:
-        table = benchmark(Lifter(load_model(args.model)), args.data, args.stride)
-    except (ValueError, OSError) as error:
-        print(f"failed: {error}", file=sys.stderr)
-        sys.exit(2)
-    print(table.markdown())
-    table.write(args.output)
+    print_tables(
+        lambda: [benchmark(Lifter(load_model(args.model)), args.data, args.stride)], args.output
+    )
 
 
 if __name__ == "__main__":

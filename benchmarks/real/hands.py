@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.table import Table, bars
+from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.data.hands import mirrored, palms_as_right_hands, right_hands
 from deep_nrsfm_ros.layouts.presets import preset
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
@@ -202,16 +202,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
-    if args.model:
-        path = Path(args.model)
-        row = (args.model, 0.0, load_model(path if path.suffix == MODEL_SUFFIX else args.model))
-    else:
-        model, seconds = train(args.data, args.collections, args.steps, args.seed)
-        save_model(args.output / f"hand21{MODEL_SUFFIX}", model)
-        row = (", ".join(args.collections), seconds / 60, model)
-    table = benchmark([row], labelled(args.data))
-    print(table.markdown())
-    table.write(args.output)
+
+    def tables() -> list[Table]:
+        if args.model:
+            path = Path(args.model)
+            row = (args.model, 0.0, load_model(path if path.suffix == MODEL_SUFFIX else args.model))
+        else:
+            model, seconds = train(args.data, args.collections, args.steps, args.seed)
+            save_model(args.output / f"hand21{MODEL_SUFFIX}", model)
+            row = (", ".join(args.collections), seconds / 60, model)
+        return [benchmark([row], labelled(args.data))]
+
+    print_tables(tables, args.output)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.data.people_scenes import Track, people_scenes
 from benchmarks.real import plausibility
 from benchmarks.real.mediapipe_comparison import SUBJECTS, mean_shape
-from benchmarks.table import Table, bars
+from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import read_trials, trials
@@ -447,21 +447,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     add_arguments(parser, LiftingOptions)
     args = parser.parse_args(argv)
-    try:
+
+    def tables() -> list[Table]:
         options = override(LiftingOptions(), args)
         files = [find_model(name, model_folders(default_models_dir())) for name in args.models]
         lifters = {file.stem: Lifter(load_model(file), options) for file in files}
         systems = {name: SYSTEMS[name] for name in args.systems}
         choice = (args.stride, args.scenes)
-        tables = [benchmark(lifters, systems, args.data, args.output, *choice)]
-        if not args.scenes:
-            tables.append(look_at(lifters, args.data, args.output))
-    except (ValueError, OSError) as error:
-        print(f"failed: {error}", file=sys.stderr)
-        sys.exit(2)
-    for table in tables:
-        print(table.markdown())
-        table.write(args.output)
+        errors = benchmark(lifters, systems, args.data, args.output, *choice)
+        return [errors] if args.scenes else [errors, look_at(lifters, args.data, args.output)]
+
+    print_tables(tables, args.output)
 
 
 if __name__ == "__main__":

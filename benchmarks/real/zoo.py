@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.data import synthetic_excavator
 from benchmarks.paper.table2_categories import read_chairs
-from benchmarks.table import Table, bars
+from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import read_layout
@@ -282,9 +282,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=OBJECTS)
     parser.add_argument("--steps", type=int, default=2000)
     args = parser.parse_args(argv)
-    table = benchmark(args.data, args.output, args.objects, args.steps)
-    print(table.markdown())
-    table.write(args.output)
+    print_tables(lambda: [benchmark(args.data, args.output, args.objects, args.steps)], args.output)
 
 
 if __name__ == "__main__":
