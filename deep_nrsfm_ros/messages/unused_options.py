@@ -6,7 +6,7 @@ from dataclasses import fields
 from typing import Protocol
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
+from deep_nrsfm_ros.lifting.options import TRUNK, GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
 
@@ -31,8 +31,17 @@ def unused_options(
     lifting: LiftingOptions,
     smoothing: SmoothingOptions,
     history: HistoryOptions = _DEFAULT_HISTORY,
+    layout: KeypointLayout | None = None,
 ) -> dict[str, str]:
-    """Return a warning for each parameter of the lifter that has no effect, by its name."""
+    """Return a warning for each parameter of the lifter that has no effect, by its name.
+
+    Args:
+        inputs: how messages are read.
+        lifting: how keypoints are lifted.
+        smoothing: the filter after the correction.
+        history: what is remembered.
+        layout: of the model; None: unknown.
+    """
     warnings: dict[str, str] = {}
     size = {"image_width": inputs.image_width, "image_height": inputs.image_height}
     if any(size.values()) and not all(size.values()):
@@ -60,6 +69,12 @@ def unused_options(
         warnings["person_height"] = (
             f"person_height is {lifting.person_height:g} and has no effect, since reference_length "
             f"is {lifting.reference_length:g}"
+        )
+    elif lifting.person_height and layout and layout.reference != TRUNK:
+        warnings["person_height"] = (
+            f"person_height is {lifting.person_height:g} and has no effect, since the reference of "
+            f"the model's layout {layout.name!r} is not {TRUNK[0]} to {TRUNK[1]}: set "
+            "reference_length"
         )
     return warnings
 

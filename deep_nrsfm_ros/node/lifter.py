@@ -524,6 +524,7 @@ class LifterNode(Node):
             lifting,
             parameter_bridge.read(self, SmoothingOptions, _SMOOTHING),
             parameter_bridge.read(self, HistoryOptions, _HISTORY),
+            self._pipeline.model.layout,
         )
         up = parameter_bridge.read(self, GravityOptions, _GRAVITY)
         sources = parameter_bridge.read(self, GravitySources, _GRAVITY)

@@ -8,7 +8,7 @@ import pytest
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
-from deep_nrsfm_ros.lifting.options import GravityOptions, LiftingOptions
+from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.unused_options import unused_gravity, unused_height, unused_options
@@ -50,6 +50,14 @@ def test_gravity_without_effect_is_warned_of() -> None:
     warnings = unused_gravity(level, Sources(), LiftingOptions(correction="none"), HUMAN17)
     assert "no effect, since correction is 'none'" in warnings["gravity.up"]
     assert not unused_gravity(level, Sources(), LiftingOptions(), HUMAN17)
+
+
+def test_the_height_of_people_says_nothing_of_other_objects() -> None:
+    lifting, chair = LiftingOptions(person_height=1.8), KeypointLayout("chair", ("a", "b"))
+    defaults = (InputOptions(), lifting, SmoothingOptions(), HistoryOptions())
+    (warning,) = unused_options(*defaults, chair).values()
+    assert "person_height is 1.8" in warning and "'chair'" in warning
+    assert not unused_options(*defaults, HUMAN17) and not unused_options(*defaults)
 
 
 class NoSources:
