@@ -142,6 +142,8 @@ def check_options(args: argparse.Namespace, model: Model) -> None:
         raise ValueError("--rectified has no effect without --intrinsics: it chooses P there")
     if "noise" in args and lifting.correction == "none":
         raise ValueError("--noise has no effect with --correction none: leave one out")
+    if reason := lifting.unused_height(model.layout):
+        raise ValueError(f"--person-height has no effect, since {reason}")
     if lifting.mirror and model.layout.partners() is None:
         raise ValueError(
             f"--mirror has no effect on model {model.name!r}: its layout {model.layout.name!r} has "

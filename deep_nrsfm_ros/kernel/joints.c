@@ -2,23 +2,26 @@
 #include "joints.h"
 
 #include <math.h>
+#include <stdlib.h>
 
 static const double SMALL = 1e-9, GIMBAL = 1e-6, FAR = 2.0943951023931953;
 
 static int within(int index, ptrdiff_t size) { return index >= 0 && index < size; }
 
 int joints_are_sound(const JointTree *tree) {
-    for (ptrdiff_t i = 0; i < tree->k; i++) {
+    char *has_frame = calloc((size_t)tree->j, 1);
+    int sound = has_frame != NULL;
+    for (ptrdiff_t i = 0; sound && i < tree->k; i++) {
         const JointIndices *x = tree->indices + i;
-        int sound = x->kind >= FREE_JOINT && x->kind <= AIMED_JOINT && within(x->joint, tree->j) && within(x->pair, tree->m) &&
+        sound = x->kind >= FREE_JOINT && x->kind <= AIMED_JOINT && within(x->joint, tree->j) && within(x->pair, tree->m) &&
                     x->others >= 0 && x->others <= MAX_OTHERS && x->parent < tree->j;
-        int parent_first = x->parent < 0;
-        for (ptrdiff_t before = 0; before < i; before++) parent_first |= tree->indices[before].joint == x->parent;
+        sound = sound && (x->parent < 0 || has_frame[x->parent]);
         for (int s = 0; sound && s < x->others; s++) sound = within(x->other_pairs[s], tree->m);
         for (int s = 0; sound && s < 3; s++) sound = x->angles[s] < tree->a;
-        if (!sound || !parent_first) return 0;
+        if (sound) has_frame[x->joint] = 1;
     }
-    return 1;
+    free(has_frame);
+    return sound;
 }
 
 static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }

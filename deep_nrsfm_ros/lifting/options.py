@@ -95,6 +95,19 @@ class LiftingOptions:
             return TRUNK_SHARE * self.person_height
         return layout.reference_length or 1.0
 
+    def unused_height(self, layout: KeypointLayout) -> str:
+        """Return why `person_height` has no effect with a layout; "" if it has one, or is 0."""
+        if not self.person_height:
+            return ""
+        if self.reference_length:
+            return f"reference_length is {self.reference_length:g}"
+        if layout.reference != TRUNK:
+            return (
+                f"the reference of the model's layout {layout.name!r} is not {TRUNK[0]} to "
+                f"{TRUNK[1]}: set reference_length"
+            )
+        return ""
+
 
 @dataclass(frozen=True)
 class HistoryOptions:

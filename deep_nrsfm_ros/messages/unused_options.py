@@ -6,7 +6,7 @@ from dataclasses import fields
 from typing import Protocol
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.options import TRUNK, GravityOptions, HistoryOptions, LiftingOptions
+from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
 
@@ -65,17 +65,9 @@ def unused_options(
             if value != field.default and field.name != "enabled":
                 name = f"history.{field.name}"
                 warnings[name] = f"{name} is {value:g} and has no effect, since {reason}"
-    if lifting.person_height and lifting.reference_length:
-        warnings["person_height"] = (
-            f"person_height is {lifting.person_height:g} and has no effect, since reference_length "
-            f"is {lifting.reference_length:g}"
-        )
-    elif lifting.person_height and layout and layout.reference != TRUNK:
-        warnings["person_height"] = (
-            f"person_height is {lifting.person_height:g} and has no effect, since the reference of "
-            f"the model's layout {layout.name!r} is not {TRUNK[0]} to {TRUNK[1]}: set "
-            "reference_length"
-        )
+    if layout and (reason := lifting.unused_height(layout)):
+        text = f"person_height is {lifting.person_height:g} and has no effect, since {reason}"
+        warnings["person_height"] = text
     return warnings
 
 

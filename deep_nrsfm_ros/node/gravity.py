@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from sensor_msgs.msg import Imu
 
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.messages.frame_tree import FrameTree
+from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 
 _STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -37,14 +39,15 @@ def subscribe_to_frames(node: Node, kind: type, tree: FrameTree) -> None:
         tree: is filled.
     """
 
-    def receive(message: Any) -> None:
+    def receive(message: Any, *, is_static: bool = False) -> None:
         for each in message.transforms:
-            q, t = each.transform.rotation, each.transform.translation
+            q, t, at = each.transform.rotation, each.transform.translation, each.header.stamp
+            stamp = 0 if is_static else Header(at.sec, at.nanosec).stamp
             turn, shift = (q.x, q.y, q.z, q.w), (t.x, t.y, t.z)
-            tree.add(each.header.frame_id, each.child_frame_id, turn, shift)
+            tree.add(each.header.frame_id, each.child_frame_id, turn, shift, stamp)
 
-    for topic, qos in (("/tf", QoSProfile(depth=100)), ("/tf_static", _STATIC)):
-        node.create_subscription(kind, topic, receive, qos)
+    node.create_subscription(kind, "/tf", receive, QoSProfile(depth=100))
+    node.create_subscription(kind, "/tf_static", partial(receive, is_static=True), _STATIC)
 
 
 @dataclass(frozen=True)
@@ -84,16 +87,19 @@ class GravityDirection:
         if sources.imu or sources.frame:
             self._listen_to_frames(required=bool(sources.frame))
 
-    def __call__(self, up: NDArray[np.float64] | None, frame: str) -> NDArray[np.float64] | None:
+    def __call__(
+        self, up: NDArray[np.float64] | None, frame: str, stamp: int = 0
+    ) -> NDArray[np.float64] | None:
         """Return the unit vector (3,) against gravity in the axes of `frame`; None: unknown.
 
         Args:
             up: what the parameter says; None: nothing.
             frame: optical frame of the keypoints.
+            stamp: of the keypoints in ns, for the transforms of /tf; 0: the newest.
         """
         sources = self._sources
         if sources.frame and frame:
-            R = self._tree.rotation(frame, sources.frame)
+            R = self._tree.rotation(frame, sources.frame, stamp)
             if R is not None:
                 return np.ascontiguousarray(R[:, 2])
         if self._mean is not None and self._now() - self._measured <= _MAX_AGE:

@@ -224,9 +224,9 @@ class LifterNode(Node):
             if not header.frame_id or (self._frame_id and header.frame_id != self._frame_id):
                 header = header._replace(frame_id=self._frame(source, header.frame_id))
             self._last_frame = header.frame_id
-            up = self._gravity(self._up, header.frame_id)
+            up = self._gravity(self._up, header.frame_id, header.stamp)
             if up is None and self._target.name:
-                up = self._target.up(header.frame_id)
+                up = self._target.up(header)
             detected = len(identities)
             lifted, identities = self._pipeline.lift(
                 observation, intrinsics, identities, source.topic, moment, up

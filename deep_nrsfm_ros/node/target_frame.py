@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +12,13 @@ from rclpy.node import Node
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import MessageError
-from deep_nrsfm_ros.messages.frame_tree import FrameTree
+from deep_nrsfm_ros.messages.frame_tree import FrameTree, Transform
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.node.gravity import subscribe_to_frames
 from deep_nrsfm_ros.node.message_types import message_class
 
-Transform = tuple[NDArray[Any], NDArray[Any]]
 _NUMBERS = 7
+_MAX_GAP = 0.05  # s between keypoints and the nearest transform, above which there is a warning
 
 
 @dataclass(frozen=True)
@@ -65,6 +64,7 @@ class TargetFrame:
         self.name = options.target_frame
         self._pose = options.camera_pose if any(options.camera_pose[3:]) else None
         self._tree = FrameTree()
+        self._node, self._warned = node, False
         if not self.name:
             if self._pose:
                 raise ValueError("camera_pose is set without target_frame, the frame that it is in")
@@ -83,17 +83,25 @@ class TargetFrame:
                 ) from None
             subscribe_to_frames(node, message, self._tree)
 
-    def transform(self, frame: str) -> Transform | None:
-        """Return R (3, 3) and t (3,) from a camera's frame to the target; None: unknown."""
+    def transform(self, header: Header) -> Transform | None:
+        """Return the transform from a camera's frame to the target at a stamp; None: unknown."""
+        frame = header.frame_id or "camera"
         if self._pose is not None:
             x, y, z, *q = self._pose
-            self._tree.add(self.name, frame or "camera", (q[0], q[1], q[2], q[3]), (x, y, z))
-        return self._tree.transform(self.name, frame or "camera")
+            self._tree.add(self.name, frame, (q[0], q[1], q[2], q[3]), (x, y, z))
+        found = self._tree.transform(self.name, frame, header.stamp)
+        if found and found.gap > _MAX_GAP and not self._warned:
+            self._warned = True
+            self._node.get_logger().warning(
+                f"no transform from {frame!r} to target_frame {self.name!r} at the stamps of the "
+                f"keypoints ({found.gap:.3f} s off): the nearest in time is used"
+            )
+        return found
 
-    def up(self, frame: str) -> NDArray[np.float64] | None:
+    def up(self, header: Header) -> NDArray[np.float64] | None:
         """Return the direction (3,) of the target's z axis in a camera's axes; None: unknown."""
-        found = self.transform(frame) if self.name else None
-        return None if found is None else np.ascontiguousarray(found[0][2])
+        found = self.transform(header) if self.name else None
+        return None if found is None else np.ascontiguousarray(found.rotation[2])
 
     def __call__(self, header: Header, lifted: Lifted) -> tuple[Header, Lifted]:
         """Return objects in the target frame, and their header.
@@ -101,11 +109,11 @@ class TargetFrame:
         Raises:
             MessageError: the camera's pose in the target frame is not known yet.
         """
-        found = self.transform(header.frame_id)
+        found = self.transform(header)
         if found is None:
             raise MessageError(
                 f"no transform from {header.frame_id!r} to target_frame {self.name!r} on /tf yet"
             )
-        R, t = (part.astype(np.float32) for part in found)
+        R, t = (part.astype(np.float32) for part in found[:2])
         moved = lifted._replace(shapes=lifted.shapes @ R.T + t, rotations=R @ lifted.rotations)
         return header._replace(frame_id=self.name), moved

@@ -220,6 +220,12 @@ SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
         ({}, ("--image-width", "640"), 2, "--image-height is 0: the size of the image needs both"),
         ({}, ("--rectified",), 2, "--rectified has no effect without --intrinsics"),
         ({}, ("--correction", "none", "--noise", "0.1"), 2, "--noise has no effect"),
+        (
+            {},
+            ("--person-height", "1.8", "--reference-length", "0.5"),
+            2,
+            "--person-height has no effect, since reference_length is 0.5",
+        ),
         ({}, ("--image-width", "160", "--image-height", "90"), 3, "far outside the image of 160 x"),
     ],
 )

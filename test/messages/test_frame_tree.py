@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from deep_nrsfm_ros.messages.frame_tree import _MAX_FRAMES, FrameTree
 
@@ -51,4 +51,41 @@ def test_frames_that_come_and_go_do_not_fill_the_memory() -> None:
     tree = FrameTree()
     for i in range(3 * _MAX_FRAMES):
         add(tree, "camera", f"object{i}", Rotation.identity())
-    assert len(tree._parents) <= _MAX_FRAMES
+    assert len(tree._frames) <= _MAX_FRAMES
+
+
+def test_a_transform_is_interpolated_to_its_time() -> None:
+    tree, second = FrameTree(), 1_000_000_000
+    ends = [Rotation.from_euler("xyz", a, degrees=True) for a in ((5, -70, 20), (60, 10, -90))]
+    for i in (1, 0):  # in any order
+        x, y, z, w = ends[i].as_quat(canonical=bool(i)).tolist()
+        tree.add("map", "base", (-x, -y, -z, -w), (i, 2.0 * i, 0.0), (100 + i) * second)
+    tree.add("base", "camera", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0))  # of /tf_static
+    found = tree.transform("map", "camera", 100 * second + second // 4)
+    assert found is not None and found.gap == 0
+    wanted = Slerp([0, 1], Rotation.concatenate(ends))(0.25)
+    np.testing.assert_allclose(found.rotation, wanted.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(found.translation, [0.25, 0.5, 0] + wanted.apply([0, 0, 1]))
+
+
+def test_outside_of_what_is_kept_the_nearest_is_taken_and_the_gap_told() -> None:
+    tree, second = FrameTree(), 1_000_000_000
+    for i in range(300):
+        tree.add("map", "base", (0.0, 0.0, 0.0, 1.0), (float(i), 0.0, 0.0), 1 + i * second // 10)
+
+    def at(stamp: int) -> tuple[float, float]:
+        found = tree.transform("map", "base", stamp)
+        assert found is not None
+        return float(found.translation[0]), round(found.gap, 6)
+
+    assert at(0) == (299.0, 0.0) and at(1 + 30 * second) == (299.0, 0.1)
+    assert at(1) == (249.0, 24.9)  # 5 s are kept
+    tree.add("map", "base", (0.0, 0.0, 0.0, 1.0), (7.0, 0.0, 0.0), second)  # the clock begins anew
+    assert at(second) == at(0) == (7.0, 0.0)
+
+
+def test_the_same_stamp_twice_is_the_last_one() -> None:
+    tree = FrameTree()
+    for x in (1.0, 2.0):
+        tree.add("map", "base", (0.0, 0.0, 0.0, 1.0), (x, 0.0, 0.0), 5)
+    assert tree.transform("map", "base", 5)[1][0] == 2  # type: ignore[index]

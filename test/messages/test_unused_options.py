@@ -58,6 +58,9 @@ def test_the_height_of_people_says_nothing_of_other_objects() -> None:
     (warning,) = unused_options(*defaults, chair).values()
     assert "person_height is 1.8" in warning and "'chair'" in warning
     assert not unused_options(*defaults, HUMAN17) and not unused_options(*defaults)
+    both = LiftingOptions(person_height=1.8, reference_length=0.5)
+    (warning,) = unused_options(InputOptions(), both, *defaults[2:], HUMAN17).values()
+    assert "since reference_length is 0.5" in warning
 
 
 class NoSources:

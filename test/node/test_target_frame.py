@@ -16,6 +16,7 @@ from test.node.test_publishing import lifted
 
 LEVEL = (2.0, 0.0, 1.4, -0.5, 0.5, -0.5, 0.5)  # looks along x, 1.4 m high
 NODE: Any = None
+CAMERA = Header(frame_id="camera")
 
 
 def target(pose: tuple[float, ...] = LEVEL, frame: str = "map") -> TargetFrame:
@@ -35,23 +36,56 @@ def test_objects_before_a_level_camera_are_where_they_are_on_the_map() -> None:
 
 
 def test_gravity_is_known_with_the_target() -> None:
-    up = target().up("camera")
+    up = target().up(CAMERA)
     assert up is not None
     np.testing.assert_allclose(up, [0, -1, 0], atol=1e-9)
-    assert target((0.0,) * 7, "").up("camera") is None
+    assert target((0.0,) * 7, "").up(CAMERA) is None
 
 
 def test_frames_of_tf_are_followed() -> None:
     frames = target()
     frames._pose = None
     with pytest.raises(MessageError, match="no transform from 'camera' to target_frame 'map'"):
-        frames(Header(frame_id="camera"), lifted(1))
+        frames(CAMERA, lifted(1))
     frames._tree.add("map", "base", (0, 0, 2**-0.5, 2**-0.5), (1, 2, 0))  # a quarter to the left
     frames._tree.add("base", "camera", (-0.5, 0.5, -0.5, 0.5), (0.1, 0, 1))
     objects = lifted(1, 1)
     objects.shapes[0] = [[0, 0, 2]]
-    _, moved = frames(Header(frame_id="camera"), objects)
+    _, moved = frames(CAMERA, objects)
     np.testing.assert_allclose(moved.shapes[0, 0], [1, 4.1, 1], atol=1e-6)
+
+
+class Log:
+    """Stands in for a node and its logger."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+
+    def get_logger(self) -> Log:
+        return self
+
+    def warning(self, text: str) -> None:
+        self.warnings.append(text)
+
+
+def test_the_transform_is_that_of_the_stamp_or_the_newest_with_one_warning() -> None:
+    node: Any = Log()
+    frames = TargetFrame(node, TargetOptions("map", LEVEL), positioned=True)
+    frames._pose = None
+    for second in (10, 11):  # 1 m/s
+        translation = (float(second), 0.0, 0.0)
+        frames._tree.add("map", "camera", (0, 0, 0, 1), translation, second * 1_000_000_000)
+
+    def place(seconds: int, nanoseconds: int) -> float:
+        objects = lifted(1, 1)
+        objects.shapes[0] = 0
+        _, moved = frames(Header(seconds, nanoseconds, "camera"), objects)
+        return float(moved.shapes[0, 0, 0])
+
+    assert place(10, 250_000_000) == 10.25 and place(11, 40_000_000) == 11 and not node.warnings
+    assert place(11, 300_000_000) == 11 and place(9, 0) == 10
+    (warning,) = node.warnings
+    assert "0.300 s off" in warning
 
 
 @pytest.mark.parametrize(
