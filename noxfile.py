@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests on several Pythons: `nox` runs the smoke set on each that there is, `nox -s full` all."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Install the package, its executables and what ROS 2 looks up in share/deep_nrsfm_ros."""
 
 import os

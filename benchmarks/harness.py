@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command line, motion capture and kept trainings of the benchmarks that train on CMU."""
 
 from __future__ import annotations

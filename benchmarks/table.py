@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of figures: Markdown, CSV and a plot."""
 
 from __future__ import annotations

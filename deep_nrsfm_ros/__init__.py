@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Deep NRSfM for ROS 2: 2D keypoints in, 3D shape and camera out, learned from 2D alone.
 
 Lift the keypoints of n objects with a model that comes with the package:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slices of a large array, to bound memory and to stay in the processor's cache."""
 
 from __future__ import annotations

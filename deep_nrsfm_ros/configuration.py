@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options: fields of frozen dataclasses with a description and a range.
 
 Each option is declared once. It is a Python default, a command-line option (`add_arguments`) and,

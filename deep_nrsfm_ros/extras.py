@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The extras of the package: what an installation may lack, and how to add it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Large arrays in temporary files: memory holds the part that is in use, the file the whole."""
 
 from __future__ import annotations

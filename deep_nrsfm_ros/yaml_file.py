@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """YAML files that people write: layouts, field mappings, cameras. Read with helpful errors."""
 
 from __future__ import annotations

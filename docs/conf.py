@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sphinx configuration: `make docs` builds the site with warnings as errors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draw the animation of the README from the clip that comes with the package.
 
     python -m docs.draw_animation

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draw the frames of a person's joints, for docs/body.md: `python -m docs.draw_joints`.
 
 The left picture is the pose in which all angles are 0; the right one is a pose with its angles. The

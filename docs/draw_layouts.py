@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draw each preset of a keypoint layout once: `python -m docs.draw_layouts`.
 
 A picture shows a person from the front, an animal from its left, or the back of a hand, with

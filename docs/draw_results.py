@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draw the figures of the results from the tables of docs/results.md.
 
     python -m docs.draw_results     # after a table has changed

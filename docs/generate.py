@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write the pages that follow from the code: parameters, layouts, command line, faults, schema.
 
 Run `make reference` after a change of an option or a layout. A test fails when a page is stale.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make the clip that comes with the package from the wheel of Pose2Sim.
 
     python -m docs.make_clip     # OpenCV decodes the videos: pip install '.[examples,demo]'

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Links of the site: pages and files of the repository that lie beside docs/."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From video to 3D over DDS with nothing computed before: MediaPipe Pose and the lifter.
 
 Four cameras' videos of one person, one after the other. The detector, the lifter and this program,

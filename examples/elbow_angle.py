@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Show the angle of each person's left elbow, live: ros2 run deep_nrsfm_ros lifter, then this."""
 
 import math

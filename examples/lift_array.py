@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lift arrays of 2D keypoints to 3D, in twenty lines: neither ROS nor torch is needed."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Print where the nose of each lifted person is: a subscriber to copy."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publish keypoints of one person to the lifter, ten times a second: put your detector in here."""
 
 from typing import Any

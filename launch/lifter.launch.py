@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Start the lifter: ros2 launch deep_nrsfm_ros lifter.launch.py keypoints:=/detector/keypoints."""
 
 import os

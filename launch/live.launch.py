@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Start detector, lifter and RViz; the detector is a command, or is already running.
 
 ros2 launch deep_nrsfm_ros live.launch.py keypoints:=/keypoints config:=my_lifter.yaml \

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Play a bag to the lifter and show the result in RViz.
 
 ros2 launch deep_nrsfm_ros replay_bag.launch.py bag:=my_bag keypoints:=/keypoints

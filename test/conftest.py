@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fixtures that several rooms share, each kind in a file of its own."""
 
 import os

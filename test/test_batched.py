@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Blocks are all there is, in order, and none is larger than asked for."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options: one declaration, ranges that hold, and only what is given is overridden."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands of the README and the documentation have options and parameters that exist."""
 
 from __future__ import annotations

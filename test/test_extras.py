@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """torch and rclpy are extras: what needs neither works without them, the rest says what to install.
 
 A meta-path finder stands for an installation without a package, in a process of its own.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The front door: five lines lift, one call trains, and importing the package imports nothing."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arrays in temporary files, and recordings of which memory holds the keypoints but once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Launch files name only what exists: stand-ins for `launch`, not on PyPI, record what they say."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The package as others meet it: installed by pip, built by colcon, started by launch files."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The generated pages are up to date, links of README and docs lead somewhere, the site builds."""
 
 from __future__ import annotations

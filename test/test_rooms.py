@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rooms import one way, and ROS is imported where it belongs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Factorisation of frames that look alike, which needs neither labels nor their order.
 
 Two orthographic images of one rigid shape, stacked, are a matrix (4, p) of rank three. Frames of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The baselines on whole subjects, as in the paper: shuffled batches, mean of the errors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The methods that the paper compares with and their peers, written from their papers' equations.
 
 Each takes W (f, p, 2), one orthographic image a frame, centred on its points, and returns

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Dictionaries of 3D poses, which the supervised methods of the paper's Table 3 learn from labels.
 
 Shapes here are S (f, p, 3), dictionaries B (K, 3, p). All shapes share one unit: the mean over

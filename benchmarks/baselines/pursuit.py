@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Projected matching pursuit of Ramakrishna, Kanade and Sheikh: "PMP" in the paper's Table 3.
 
 "Reconstructing 3D human pose from 2D image landmarks", ECCV 2012. A pose is the mean mu and few

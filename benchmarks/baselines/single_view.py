@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Convex and Alternate of Zhou et al.: poses of single views from a 3D dictionary (Table 3).
 
 Zhou, Leonardos, Hu and Daniilidis, "3D shape estimation from 2D landmarks: a convex relaxation

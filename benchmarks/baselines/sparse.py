@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Block-sparse dictionary learning of Kong and Lucey: "Sparse" in the paper's Table 1.
 
 Kong and Lucey, "Prior-less compressible structure from motion", CVPR 2016. Each shape is a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The spectral norm of 2 x 3 blocks, by which SfC and Convex relax sparsity and orthonormality."""
 
 from __future__ import annotations

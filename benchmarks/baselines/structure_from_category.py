@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Structure from category of Kong, Zhu, Kiani and Lucey: "SfC" in the paper's Table 2.
 
 "Structure from category: a generic and prior-less approach", 3DV 2016. Each basis shape turns by

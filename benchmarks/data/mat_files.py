@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readers of the MATLAB files of the classic sequences and of FRGC faces."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files and bags of people as programs and people write them, after public bug reports.
 
 Each case is a function that writes an input into a folder, with the objects that a reader should

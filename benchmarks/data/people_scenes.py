@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """People over time before calibrated cameras, with the truth; real and simulated detections."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenes of the pose2sim clip: detections of four cameras, MediaPipe's results and the truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A synthetic excavator, seen by a camera that moves around it; layout excavator.yaml.
 
 Metres; x to the front of the tracks, y left, z up. The upper structure rotates on the tracks; boom,

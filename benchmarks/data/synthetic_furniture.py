@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Synthetic furniture with random sizes: a substitute for the IKEA data of the paper.
 
 A category has a few random lengths and angles, and arms or a footboard in half of its objects; real

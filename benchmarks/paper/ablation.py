@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ablation: the default recipe with one part changed, in short trainings."""
 
 from __future__ import annotations

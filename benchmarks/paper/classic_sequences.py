@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Classic sequences of motion capture, a face and a shark; shorter than the network needs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Label-free model selection: correlation of coherence and other figures with the error."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Share of frames with mirrored depth, by seed: one seed, repaired or not, and the paper's network.
 
 One seed alone, without rivals and without the reference shapes, shows what the method does by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the paper's protocol gives: a camera a frame at 120 Hz, every 24th frame, a camera a trial.
 
 In the protocol each frame of a 120 Hz motion has a random camera, so that frames near in time are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Table 1 of the paper, NRSfM on CMU: errors on the training frames, 80 % of the trials."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Table 2 of the paper, structure from category: many rigid objects of one kind.
 
 The paper's IKEA data cannot be shipped. `chairs` are real: 3D annotations of ShapeNet models by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Table 3 of the paper, unseen data: poses of other subjects, and held-out trials.
 
 The paper follows Zhou et al. (CVPR 2015): learned on subject 86, tested on 13, 14 and 15, of which

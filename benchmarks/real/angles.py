@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint angles of lifted people against those of the truth by the same formulas, and their closure.
 
 The angles of both follow from the 12 limb joints, so that the table shows what lifting costs.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Place and size of people by the camera's height above the floor, against an assumed body height.
 
 Motion capture that `human` was not trained on, before simulated cameras 1.4 m high with a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A model of hands from 2D detections alone, and its errors on another person's labelled hand.
 
     python -m benchmarks.real.hands --data DIR           train on Apache and MIT data

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identity switches of people who cross: assignment by keypoint similarity against the nearest.
 
 Real detections of several people by five cameras (Shelf), and two dancers of CMU before a simulated

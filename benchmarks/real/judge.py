@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether figures without labels tell good models from bad: short trainings and their true errors.
 
 Each scene is trained on several times: from random weights and, where it shows a person, from

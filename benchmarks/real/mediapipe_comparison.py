@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One person seen by four cameras: the lifter, MediaPipe's own 3D and a mean shape.
 
 Needs MediaPipe, which `make demo-live` installs, and downloads the pose2sim clip from PyPI.

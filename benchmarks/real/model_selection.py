@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures for the choice of a model of people, without the pose2sim clip.
 
 Proportions of detectors' joints and of motion capture, and errors of models on both. The model

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real people before calibrated cameras, frame by frame and in time, beside a mean shape.
 
 Real detections (Shelf, the pose2sim clip) and motion capture with simulated detections (HumanEva,

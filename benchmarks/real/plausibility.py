@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Label-free measures of lifted people: facing, knees, toes, bone lengths, depth."""
 
 from __future__ import annotations

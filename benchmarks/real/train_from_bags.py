@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Models trained from bags: a real video, an excavator, and CMU 01 through the lifter's service.
 
 Each is written to a bag as a detector would publish it, trained by the program `train` or by the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Models of objects that are no people, from real 2D points: a mouse, a fly, chairs, birds, cars.
 
 And of a synthetic excavator. One row of a table and one picture an object. Scenes are divided by

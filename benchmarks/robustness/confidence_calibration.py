@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration of the confidence: share of correct points against the published confidence.
 
 With `--fit` the program fits the calibration to the first subject, prints the constants for

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Share of inserted jumps and left-right swaps that curation finds in motion capture."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Error against missing keypoints: some of 31 at random, and whole limbs."""
 
 from __future__ import annotations

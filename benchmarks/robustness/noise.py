@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Error against noise of 0 to 20 % of the frame size, for training with and without noise."""
 
 from __future__ import annotations

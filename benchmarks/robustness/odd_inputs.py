@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Odd inputs after public bug reports, given to lift, train and the steps of the lifter.
 
 Each input shows a person, or two, who walk and turn before a camera, as some program writes it. The

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """People in front of a perspective camera, lifted without and with its intrinsics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Jitter, error and lag of lifted shapes with the temporal filter off and on."""
 
 from __future__ import annotations

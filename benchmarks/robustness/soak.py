@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keep the lifter at work for long, training and not: is every message counted, does memory grow?
 
 Prints a line every ten seconds. The lifter listens as it does by itself, best effort and depth 1:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages per second read from bags into a dataset, against rosbags alone."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One pass of the network, compiled and in NumPy, against torch and ONNX Runtime."""
 
 from __future__ import annotations

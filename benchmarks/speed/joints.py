@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """CPU time of a message of five people, with and without what the lifter says of their joints."""
 
 from __future__ import annotations

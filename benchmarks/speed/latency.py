@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifter against a relay node, over DDS: latency, highest rate, start time and memory.
 
 Both receive the same messages from the same client, in alternating rounds. The relay is the lower

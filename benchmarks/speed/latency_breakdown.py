@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time of each step of one message, in microseconds.
 
 A lifter in this process receives serialised messages; its answers go over DDS to another process.

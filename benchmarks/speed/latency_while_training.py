@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Latency of the lifter over DDS, idle and during a training."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's network and losses in plain torch: the reference of the benchmarks.
 
 Each layer is a convolution, or its transpose, over k blocks of 3 x 2. The camera comes from an SVD,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node that publishes each message again: the lower bound of the latency of a node in Python.
 
 It receives a PointCloud2 on `keypoints` and publishes it on ~/points, with a quaternion on

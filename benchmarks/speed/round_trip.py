@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node in a process of its own, and a client that sends it keypoints and times the answers.
 
 Each node has a DDS domain of its own, so that several run at once without hearing each other and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames per second that processes of a training read from a bag, and memory of a large training.
 
 Each process reads its own share of the bag. The rate is all frames over the processor time of the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Wall time until the shape error on subject 01 is that of the paper, by both presets.
 
 `--limit-minutes` ends a long training; its time and the ratio are then lower bounds.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Interleaved timing, name of the machine and command line of the benchmarks of speed.
 
 A time depends on the machine and on its load. The ratio of two contenders that are measured side by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time and memory of curation and one epoch against the number of frames."""
 
 from __future__ import annotations

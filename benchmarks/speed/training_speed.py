@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training samples per second, against plain torch, and the gain from two torchrun processes."""
 
 from __future__ import annotations

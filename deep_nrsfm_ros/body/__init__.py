@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a robot needs of lifted points: frames of joints, angles, forward kinematics, URDF, motion.
 
 Legend: n objects, p keypoints, j joints, a angles. Frames are x front, y left, z up (REP-103) at

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Metres from the floor: the camera's height says how large a person is who stands on it.
 
 Size and place of a lifted object scale together. The scale is the one with which the lowest point

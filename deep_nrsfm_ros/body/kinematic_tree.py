@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames and angles of the joints of lifted objects in closed form, and forward kinematics.
 
 Joints of one kind are computed together, for all objects at once, as soon as their parents' frames

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Velocities and the state of tracking of identities.
 
 A velocity is the step of a position between two messages, through a first-order low-pass: it lags

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The URDF of an object with a kinematic tree, and the capsules that draw a URDF.
 
 Each angle is a revolute joint with its name; the links between the angles of one joint have the

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command-line programs, each thin: options in, the library called, progress shown."""

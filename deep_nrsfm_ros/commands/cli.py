@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One command for all programs: `deep-nrsfm lift`, `deep-nrsfm train` and so on."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Check an installation from the imports to an answer over DDS, and name the remedy of each fault.
 
 Exit code 0: all that lifting needs works; 1: something does not.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compare models with the ground truth of motion capture: the paper's metric and plainer ones."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real detections by four calibrated cameras: what intrinsics are worth, and where things are."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lift a file of 2D keypoints to 3D, without ROS: npz, JSON or bag in, npz, JSON or bag out.
 
 Exit code 0: the answer can be believed; 2: the input or an option is at fault; 3: the answer is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The summary that `lift` prints: what was lifted, how well, what was left out and why."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run the lifter, the ROS node that lifts keypoints and trains models, with ROS arguments."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """List the models that the lifter can use, with what the judge says of them and provenance."""
 
 from __future__ import annotations

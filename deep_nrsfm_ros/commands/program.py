@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What all programs have in common: how they end early, and their name in usages."""
 
 from __future__ import annotations

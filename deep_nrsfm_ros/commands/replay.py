@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Show a recording, or a running lifter, in a browser: 2D keypoints beside 3D skeletons."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Train a model from bags and files of 2D keypoints, or motion capture: one model file out."""
 
 from __future__ import annotations

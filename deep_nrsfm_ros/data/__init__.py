@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data: datasets, bags, keypoint files and motion capture; no ROS import."""

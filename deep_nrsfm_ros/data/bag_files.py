@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The serialised messages of a bag of ROS 2 or ROS 1, also of a damaged one.
 
 A recording that was cut off (power failure, full disk, killed recorder) has no index, no metadata

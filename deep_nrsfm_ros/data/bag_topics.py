@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The topics of a bag that carry keypoints, and how their messages are read."""
 
 from __future__ import annotations

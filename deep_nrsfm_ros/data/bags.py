@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags to datasets, and keypoints to bags: rosbag2 with both storages, without ROS."""
 
 from __future__ import annotations

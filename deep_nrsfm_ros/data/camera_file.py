@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera files: CameraInfo in YAML, as `ros2 topic echo` and camera_calibration write it."""
 
 from __future__ import annotations

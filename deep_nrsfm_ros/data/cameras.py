@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibrated cameras, and triangulation of points from several of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The clip that comes with the package: a real person, four calibrated cameras, ground truth.
 
 It is the balancing trial of Pose2Sim's demo session (`data/pose2sim.py`), made smaller: detections

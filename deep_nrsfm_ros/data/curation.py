@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Filter a dataset for training; count and report what was dropped."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dataset: 2D keypoints of one object or object category in many frames, from any source."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Definitions of message types: that of the bag, or where it carries none, one that is known here.
 
 A bag carries no definitions before ROS 2 Iron, and an empty one where the recorder did not find the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Detections: all objects in the frames of a recording, with the time of each frame."""
 
 from __future__ import annotations

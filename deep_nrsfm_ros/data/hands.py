@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hands as right hands: left and right told apart by their places, and one side mirrored.
 
 A model of hands learns right hands. Detectors report both, and recordings often do not say which is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames of a dataset that a training does not use: they tell how good its model is."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keypoint files of several kinds to detections: the table of formats, and what all share."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags with messages of the lifter, its points and camera rotations: read and written."""
 
 from __future__ import annotations

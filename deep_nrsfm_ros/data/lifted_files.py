@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lifted recordings as files: .npz, .json or a bag, by the suffix of the name."""
 
 from __future__ import annotations

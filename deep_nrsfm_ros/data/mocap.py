@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """CMU motion capture: ASF skeletons and AMC motions to datasets.
 
 Forward kinematics of the ASF/AMC definition: each bone rotates in its own `axis` frame C by the

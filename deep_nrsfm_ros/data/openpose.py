@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """OpenPose JSON: people as flat lists of x, y, confidence."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Outliers: keypoints that contradict the others of their frame, e.g. swapped left and right.
 
 A Gaussian over whole frames (all 2 p coordinates) is fitted robustly to the data. Each keypoint is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lifting of recordings over time: identities, and what is remembered of each."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo session of Pose2Sim: real detections of one person by four calibrated cameras.
 
 The session is part of the wheel pose2sim 0.6.0 (BSD-3). Triangulation of the four views gives 3D

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How keypoints are found and read in bags and files."""
 
 from __future__ import annotations

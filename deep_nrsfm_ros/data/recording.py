@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings: 2D keypoints as detected, and the 3D shapes lifted from them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Choose the keypoint layout of detections that do not name their own."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The part of a recording that one of several processes reads."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sufficiency: whether a dataset varies enough for NRSfM, from its 2D keypoints.
 
 Depth is observable only if the object rotates relative to the camera, and a shape basis only if the

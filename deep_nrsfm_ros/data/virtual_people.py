@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Virtual people: motion capture with other bodies, and with joints where detectors put them.
 
 Motion capture has few people, and all of them have the joints of one skeleton. Detectors put hips

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled kernel: the network's passes, the correction and the decoding of messages in C.
 
 All other rooms import the kernel from here: `_kernel` is the C module, None where there was no C

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Products and solutions: what NumPy is to the Python. */
 #ifndef ALGEBRA_H
 #define ALGEBRA_H

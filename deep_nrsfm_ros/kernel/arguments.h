@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Arrays as arguments of the module's entry points. */
 #ifndef ARGUMENTS_H
 #define ARGUMENTS_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The bones of one object: Bones of nrsfm/bones.py. */
 #include <math.h>
 

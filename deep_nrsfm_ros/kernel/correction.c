@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The correction of one object: `correct` of lifting/correction.py.
 
    The errors of a shape are normal, with the covariance Sigma of the model. Their mean given the keypoints, and

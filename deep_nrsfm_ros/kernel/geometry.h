@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Geometry of one object: nrsfm/geometry.py. */
 #ifndef GEOMETRY_H
 #define GEOMETRY_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* What is remembered of one object from frame to frame: lifting/history_update.py, network_smoothing.py, own_bones.py and
    gravity.py. */
 #include <math.h>

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Frames and angles of joints: the formulas are those of body/kinematic_tree.py, which test/body compares. */
 #include "joints.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Frames and angles of joints: body/kinematic_tree.py. */
 #ifndef JOINTS_H
 #define JOINTS_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The lift of a block of objects: NumpyBackend of lifting/numpy_backend.py in C.
 
    In NumPy a lift is some four hundred small calls, which cost ten times what they compute. What is computed of

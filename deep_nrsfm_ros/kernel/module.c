@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The module `_kernel`: its entry points of lifting, decoding and tracking, which hand Python's arrays to C.
 
    No argument is trusted: types, lengths, sizes and indices are checked here and in plan_layout.c, and whatever

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The forward pass of nrsfm/network.py for the default variant of an architecture and a block of objects.
 
    Each layer is one matrix product for all objects of the block, so that its weights are read once. */

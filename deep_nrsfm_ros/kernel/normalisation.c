@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The normalisation of one object: nrsfm/normalisation.py. */
 #include <math.h>
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* A plan: a lifter's constants in the kernel's layout, and the memory that it computes with.
 
    CompiledBackend in lifting/compiled_backend.py fills it. Symbols as in the paper: p keypoints, W (p, 2)

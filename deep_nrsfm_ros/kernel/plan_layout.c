@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Where each part of a plan lies in its arrays, and how much memory it computes with. */
 #include "plan.h"
 

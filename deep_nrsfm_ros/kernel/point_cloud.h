@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Keypoints in the data of serialised PointCloud2 messages. */
 #ifndef POINT_CLOUD_H
 #define POINT_CLOUD_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Detections and tracks of one topic: lifting/track_matching.py. */
 #ifndef TRACKING_H
 #define TRACKING_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Entry points of training in the module `_kernel`: Python's arrays to training_pass.c and back.
 
    As in module.c, no argument is trusted. */

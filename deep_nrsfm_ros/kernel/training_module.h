@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Entry points of training, for the method table of the module `_kernel`. */
 #ifndef TRAINING_MODULE_H
 #define TRAINING_MODULE_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The network forward and backward, a block of frames at a time and a part of the batch on each thread. */
 #include "training_pass.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The forward and the backward pass of a network in training: network.py, and its gradient as torch's
    autograd finds it. Symbols as in the legend of deep_nrsfm_ros.nrsfm; X_bar is the gradient of the loss by X.
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* `product`, `accumulate` and `solve` for processors with vectors of BYTES; `algebra.c` includes it once for each.
 
    FOR(name) is the name of that version of `name`; TARGET tells the compiler its processor. Functions on rows

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kinematic trees of layouts: joints, the directions that their frames follow, their angles."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints of one layout in the order of another, matched by name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The keypoint layout: keypoints in order, edges, handedness and reference length."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Layout files: keypoint layouts in YAML, those of the presets and those of users alike.
 
 `config/layouts/hand.yaml` explains each field; `layouts/presets/` has files to copy.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifter's computation as one call of the compiled kernel, for networks that it supports.
 
 `numpy_backend` computes the same for all networks, some ten times slower; a test compares the two.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Confidence: the probability that a lifted point is close to its true position.
 
 Close means within `CORRECT_DISTANCE` = 10 % of the object's size. The size is twice the RMS radius,

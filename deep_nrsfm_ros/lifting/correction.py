@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Correct lifted shapes, depth included, by what the network leaves unexplained of the keypoints.
 
 The errors E = S* - S of a network's points are correlated: where a hand is lifted too low, the

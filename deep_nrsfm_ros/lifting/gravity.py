@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gravity: objects whose layout names top and bottom are upright, more or less.
 
 One image does not show by how much an object leans towards the camera. Where the direction of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a lifter remembers of each identity from frame to frame.
 
 Three things are remembered: the shape and the rotation that the network has found, smoothed

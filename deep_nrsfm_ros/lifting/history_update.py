@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a context adds to the lift of a frame, in NumPy: the readable form of `kernel/history.c`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Intrinsics of a camera: from pixels to rays and back.
 
 Source: the lens models of sensor_msgs/CameraInfo, as OpenCV defines them.

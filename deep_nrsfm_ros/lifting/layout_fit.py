@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keypoint layouts ranked by how well a model explains keypoints in their order.
 
 Layouts of the same number of keypoints cannot be told apart by a count: human17 and coco17 both

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lift the 2D keypoints of n objects to 3D shapes and camera rotations; needs no torch."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Smoothing of what the network finds, before the keypoints correct it: no lag in the image.
 
 The shape and the rotation that a network finds jump from frame to frame, because each frame is seen

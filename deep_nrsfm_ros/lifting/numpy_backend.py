@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifter's computation in NumPy: the readable form, used where the kernel does not run.
 
 `compiled_backend` computes the same in C; one test compares the two.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What one message of a detector shows: keypoints, their confidence, and identities."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options of the lifter: command line, ROS parameters and Python take them from here."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bone lengths of one object, learned while it is seen.
 
 A model has the mean lengths of the bones of all objects that it has learned from, and their spread.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lifting before a perspective camera whose intrinsics are known.
 
 A weak-perspective camera sees along the optical axis. An object beside the axis is seen along

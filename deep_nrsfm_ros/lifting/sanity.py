@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Findings about values that look wrong: keypoints, stamps and lifted shapes that nobody meant.
 
 `lift`, `train` and the node share `check`. A finding names the number that looks wrong and the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Smoothing over time: less jitter of shapes and rotations, and short gaps filled.
 
 The One-Euro filter is a first-order low-pass whose cutoff frequency rises with the speed of its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How well each detected object matches each track, and tracks after their detections.
 
 A track predicts its keypoints at constant velocity that decays. The keypoint similarity (OKS) is a

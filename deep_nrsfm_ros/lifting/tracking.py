@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identities of objects from one message to the next, where the detector gives none.
 
 Detections are assigned to tracks so that the sum of their scores (track_matching.py) is largest.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The weight of a keypoint, from the confidence that the detector gives it.
 
 A top-down detector puts a hidden keypoint somewhere, with a low confidence. The weight is relative

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read the intrinsics from a sensor_msgs/CameraInfo, by duck typing: ROS is not imported."""
 
 from __future__ import annotations

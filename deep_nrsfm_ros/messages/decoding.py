@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read observations from decoded keypoint messages, by duck typing: ROS is not imported.
 
 Live messages of rclpy and messages that rosbags reads from a bag have the same fields and take the

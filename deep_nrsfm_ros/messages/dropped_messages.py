@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Count of dropped messages, from the sequence numbers of a topic's publisher."""
 
 from __future__ import annotations

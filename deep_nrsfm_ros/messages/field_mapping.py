@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Field mappings: the fields of a message type that hold its objects and their keypoints.
 
 A mapping reads a new detector's messages without code. The mappings of well-known detectors are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Paths into a message, as field mappings write them: `a.b`, `a[0]`, `a[]`, `a[0::3]`, `/a`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Transforms between the frames of /tf at a time, without tf2, which PyPI lacks."""
 
 from __future__ import annotations

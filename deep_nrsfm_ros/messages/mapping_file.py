@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read a field mapping from YAML, for message types that have none in this package.
 
 `config/mappings/` has examples; media_pipe_ros2.yaml explains each field.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options of the input: model, topics, layout and image size of keypoint messages."""
 
 from __future__ import annotations

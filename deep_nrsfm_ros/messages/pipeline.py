@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The way of one keypoint message to lifted shapes, as one configuration defines it."""
 
 from __future__ import annotations

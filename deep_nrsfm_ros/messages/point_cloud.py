@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The memory layout of keypoints in the data of a sensor_msgs/PointCloud2."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read serialised keypoint messages (CDR), fast where their format has been read before.
 
 Nearly all PointCloud2 messages of a topic differ only in stamp and data. The first one is decoded

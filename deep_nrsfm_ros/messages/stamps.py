@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One clock for the messages of a topic: stamps that are 0 or of another clock are replaced.
 
 A detector that starts before /clock stamps its first messages with 0 or with the wall clock. Such a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Looks at the last messages of a stream: the layout that fits them, and what looks wrong.
 
 The hot path only keeps references to messages. They are read a second time when the node asks, at

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Topic patterns: `*` stands for one part of a topic name, as in `/humans/bodies/*/skeleton2d`."""
 
 from __future__ import annotations

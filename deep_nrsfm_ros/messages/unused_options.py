@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options that are set and cannot have an effect, with the reason."""
 
 from __future__ import annotations

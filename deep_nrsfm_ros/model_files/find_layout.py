@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keypoint layouts by the name of a preset, a layout file or a model file."""
 
 from __future__ import annotations

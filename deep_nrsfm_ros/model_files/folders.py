@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where models, bags and layout files are looked for."""
 
 from __future__ import annotations

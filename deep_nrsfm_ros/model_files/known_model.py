@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Models that come with the package and have the keypoints of an object."""
 
 from __future__ import annotations

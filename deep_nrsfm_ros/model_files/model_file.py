@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Model files: safetensors weights with everything that is needed to use them, never pickle."""
 
 from __future__ import annotations

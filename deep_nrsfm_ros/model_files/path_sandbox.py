@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The files that the lifter may read and write at the request of others on the network.
 
 The owner of the lifter starts it, and may name any file at the start. Later, anybody on the

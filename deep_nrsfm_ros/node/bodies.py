@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publishers about the joints of objects, which cost nothing while nobody listens."""
 
 from __future__ import annotations

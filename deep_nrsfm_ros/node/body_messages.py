@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages about the joints of objects: frames, angles, state of tracking, names."""
 
 from __future__ import annotations

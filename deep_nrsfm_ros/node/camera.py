@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Subscription to the CameraInfo of the camera that the keypoints come from."""
 
 from __future__ import annotations

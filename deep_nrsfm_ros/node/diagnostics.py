@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Diagnostics of the lifter: counts of messages, their rating, and the message on /diagnostics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The direction of gravity in the camera's axes, from a parameter, an IMU or /tf."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node `lifter`: 2D keypoints in, 3D points and the camera's rotation out.
 
 For every message on `keypoints` the node publishes, with the header of that message,

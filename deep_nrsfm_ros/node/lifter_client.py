@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Client of a running lifter: its points and rotations, joined with their keypoints."""
 
 from __future__ import annotations

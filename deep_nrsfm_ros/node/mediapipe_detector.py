@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A detector for the lifter: MediaPipe Pose on a video, images, a camera or an image topic.
 
     pip install mediapipe==0.10.14

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message classes by name, imported on demand: no detector's package is required."""
 
 from __future__ import annotations

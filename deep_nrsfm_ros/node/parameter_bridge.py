@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Declare the options of a dataclass as ROS parameters, and read them back.
 
 A parameter's default, range and description stand in the dataclass: `lifting/options.py`,

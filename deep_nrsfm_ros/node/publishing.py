@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build the lifter's messages from arrays.
 
 Messages of the hot path are built serialised. They differ only in stamp and numbers, so a message

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Self-test: send keypoints over DDS to a lifter in its own process and wait for points."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages with many numbers, serialised once: later ones differ in stamps and numbers only.
 
 A message of 100 transforms takes milliseconds to build of Python objects, and microseconds so.

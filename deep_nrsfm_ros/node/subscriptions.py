@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Subscriptions to the keypoint topics: their types, and publishers that cannot be received."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a lifter finds around it: a node of the same name, and the launch that started it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Objects in a fixed frame, such as map, and not in that of the camera."""
 
 from __future__ import annotations

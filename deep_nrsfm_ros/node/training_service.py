@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The services ~/train and ~/cancel_training and the topic ~/training_status."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames of the objects on /tf."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Deep NRSfM (Kong & Lucey 2019, arXiv 1902.10840): the method, in torch and numpy, never ROS.
 
 Legend: the paper's symbols, as the code names and stores them. `...` is any batch shape.

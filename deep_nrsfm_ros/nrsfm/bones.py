@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bone lengths: edges of the layout, and other rigid pairs of keypoints, that keep their lengths.
 
 The lengths relative to their sum, and how much they vary, are estimated from the lifted shapes of

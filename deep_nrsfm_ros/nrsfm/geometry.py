@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Geometry: cameras, centring, alignment of shapes, weak perspective and rotations.
 
 Functions with `Array` in their signature use only operations that NumPy and torch share, and take

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Handedness: whether lifted shapes are mirrored in depth.
 
 No 2D image tells an object from its mirror image. The layout names tetrahedra of keypoints (left,

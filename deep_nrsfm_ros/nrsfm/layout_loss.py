@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Losses of bone lengths, handedness and depth, from the edges and corners of a keypoint layout.
 
 Not of the paper, and without 3D labels: a layout file gives edges and handedness in words. Views

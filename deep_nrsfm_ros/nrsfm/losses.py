@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What training minimises: "Loss function" of the paper, the cycle loss, and the layout's losses.
 
 The losses of bone lengths, handedness and depth are in `layout_loss.py`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors of reconstructed shapes against ground truth: the paper's and stricter ones."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which frames are lifted with a mirrored depth, found without labels.
 
 1. `nearest`: two images W_a = S M_a and W_b = S M_b of one shape S span planes that share a

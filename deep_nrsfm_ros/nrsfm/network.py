@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The network: section 3 of the paper, from the block codes to the shape and the camera.
 
 Read from the top: `forward` = `encode` (2D keypoints to block codes), `recover` (block code to code

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Normalisation: from keypoints in an image, at any place and scale, to W and back."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The options of a training besides its data: recipe, layout losses, and presets of both."""
 
 from __future__ import annotations

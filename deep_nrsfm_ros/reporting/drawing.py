@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drawings of the report: charts and skeletons as SVG, 3D shapes as data for viewer.js."""
 
 from __future__ import annotations

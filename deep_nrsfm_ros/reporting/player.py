@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pages that play recordings: 2D keypoints next to the lifted 3D skeletons, with a slider."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A live page on localhost: frames arrive as server-sent events, without a further library."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A model on its training frames: mean shape, modes of deformation, errors without labels."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A person on a floor: what several cameras saw, what was lifted, and the ground truth.
 
 Everything is in world axes, z up, in metres, with the floor at z = 0. `stage_page` makes one HTML

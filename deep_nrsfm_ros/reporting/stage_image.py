@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images of a stage, drawn with Pillow: the demo's picture and the README's animation."""
 
 from __future__ import annotations

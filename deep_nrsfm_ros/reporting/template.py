@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Self-contained HTML pages: styles, scripts and data are inside, and data is escaped."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Adam for one tensor of weights."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The best weights of a training, by a quality that needs no label."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checkpoints: named tensors in a file that is complete or does not exist.
 
 The content comes from the methods `state` of `_Loop` (loop.py), `Trainer` (trainer.py) and

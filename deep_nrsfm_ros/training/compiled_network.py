@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The network of a training as one torch operation, compiled and on several threads.
 
 Without a compiler, and for the networks that `supports` refuses, `nrsfm.network.forward` and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The configuration of a training: one frozen dataclass for all who start, record or resume one.
 
 The command line builds it with `from_arguments`, the service of the lifter with

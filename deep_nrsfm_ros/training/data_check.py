@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What looks wrong in the data of a training, by the check that `lift` and the lifter use."""
 
 from __future__ import annotations

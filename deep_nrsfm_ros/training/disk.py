@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Room on the disk of the models, and words for a folder that cannot be written to."""
 
 from __future__ import annotations

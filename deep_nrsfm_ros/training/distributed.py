@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Several processes that train one model, as torchrun starts them; one process alone pays nothing.
 
 Each process reads its share of bags and files, or takes its shard of frames that all of them have,

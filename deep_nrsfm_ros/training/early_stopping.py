@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When a training ends before its last step: its time is up, or its quality no longer improves."""
 
 from __future__ import annotations

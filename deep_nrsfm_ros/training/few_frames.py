@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Few frames: a network that learns the shapes on which classic factorisations agree.
 
 Below about a thousand frames a network overfits: it explains the images by shapes that are wrong in

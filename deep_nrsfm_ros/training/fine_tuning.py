@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fine-tuning: a training that starts from a trained model instead of from random weights.
 
 Architecture and normaliser stay those of the model: its weights mean nothing in others.

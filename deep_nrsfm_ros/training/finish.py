@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The last step of a training: from the trained network to a model that can be lifted with."""
 
 from __future__ import annotations

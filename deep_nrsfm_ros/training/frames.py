@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The frames of a training in memory, and batches of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training from arrays: the whole of the command `train`, from points to a model, in one call."""
 
 from __future__ import annotations

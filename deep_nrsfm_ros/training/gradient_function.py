@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The gradient of a training's loss by the weight vector."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A training run as a process of its own: started, watched, cancelled. Knows nothing of ROS."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a new model is better than the one at hand, judged without labels.
 
 Both models lift the same frames, which the training has not used (`data.held_out`). Errors of 2D

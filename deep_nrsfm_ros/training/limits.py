@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options that bound a training; `early_stopping.py` and the checks of the data apply them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The training loop: short trainings of several seeds, the best of them trained to the end.
 
 Learns from 2D keypoints alone. `finish` makes a model of the trainer that the loop returns.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mirrored frames in training: found without labels, and repaired in the network.
 
 `MirrorTest` of `nrsfm.neighbours` on the frames of a training. Its reference shapes depend on the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records of trainings: the configuration of each one that runs or was cut off.
 
 While a training runs, `.NAME.training.json` next to its checkpoint holds its configuration, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reports of a training: progress as a bar or as JSON lines, warnings, and the end."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the service ~/train is asked for: parameters of the lifter, as a `TrainingConfig`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a training that was cut off is continued, from the command line and by the service."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One training from its configuration to the model file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The schedule of the learning rate: from the steps taken to the rate of the next step."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The training of one initialisation: its steps, its label-free errors and its saved state."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The checks of a training that need no data: the same for the command line and the service."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A database of motion capture like CMU's, made up: every subject, a few frames each."""
 
 from __future__ import annotations

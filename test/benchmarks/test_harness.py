@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trainings are kept, go on where they stopped, and are told apart by all that shapes them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The index of the benchmarks names every program, and each program explains its options."""
 
 from __future__ import annotations

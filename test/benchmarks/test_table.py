@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables: the figures that come out are those that went in, by hand-made cases."""
 
 from __future__ import annotations

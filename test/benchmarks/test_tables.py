@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each table from end to end on a tiny database, and its own arithmetic on known cases."""
 
 from __future__ import annotations

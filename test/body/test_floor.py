@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Size and place of people who stand on a floor."""
 
 from __future__ import annotations

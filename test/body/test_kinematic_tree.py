@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames and angles of known poses, and the way from angles to points and back."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """URDF text: read by another library, its forward kinematics is that of the tree."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One command for all programs; each says how it was called."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo from wheel to picture and trained model, in real processes over real DDS."""
 
 from __future__ import annotations

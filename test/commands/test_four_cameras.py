@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The table of real detections, on a made-up session."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`lift` from end to end, with the model that comes with the package."""
 
 from __future__ import annotations

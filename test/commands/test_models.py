@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The list of models: all there are, where, how good, from what; damaged ones with the reason."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What every program does, as a shell starts it."""
 
 from __future__ import annotations

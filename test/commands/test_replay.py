@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`replay` from end to end: pages of recordings with and without answers, and the live page."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The training program as others start it: a bag in, progress as JSON lines, a model out."""
 
 from __future__ import annotations

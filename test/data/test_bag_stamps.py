@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags whose stamps are not all of one clock, or go back."""
 
 from pathlib import Path

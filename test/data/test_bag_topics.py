@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags of detectors' own messages, read by the definitions that they carry."""
 
 import sqlite3

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real bags in both storages: round trips, several at once, and everything that can be wrong."""
 
 from __future__ import annotations

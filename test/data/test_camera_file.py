@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera files become intrinsics; what is wrong with one is said with its name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cameras project and triangulate consistently, with missing and wrong views."""
 
 import numpy as np

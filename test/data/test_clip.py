@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The clip of the package: what it holds, and that it is what the wheel of Pose2Sim holds."""
 
 from __future__ import annotations

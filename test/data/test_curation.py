@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Curation finds what was spoiled on purpose, keeps what is sound, and counts all of it."""
 
 from __future__ import annotations

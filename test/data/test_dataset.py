@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dataset refuses what does not fit together, and keeps what does."""
 
 from __future__ import annotations

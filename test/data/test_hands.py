@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hands of both sides become right hands."""
 
 from __future__ import annotations

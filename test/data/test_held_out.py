@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames that the judge gets: the ends of blocks, so that no near-duplicate is trained on."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints come from files of every kind alike, and what is wrong with one is said by name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion capture: forward kinematics against a slow recursion, and the paper's frame counts."""
 
 from __future__ import annotations

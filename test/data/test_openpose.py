@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """OpenPose JSON becomes observations; the subject is the largest person."""
 
 import json

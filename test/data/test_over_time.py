@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings over time: no lag in the image, identities, unrelated images, gravity."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo session is read as it is: from a small one made here, and from the wheel if at hand."""
 
 import os

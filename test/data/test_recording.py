@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What was lifted is written, read back and looked at as the lifter answered it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What each of several processes reads: together all of it, once, each some of every part."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether NRSfM can work is told from 2D alone, with the figure and the mend."""
 
 from __future__ import annotations

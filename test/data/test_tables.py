@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of DeepLabCut, MediaPipe and Sports2D are read, with the names that they give."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Virtual people: both sides alike, joints where they are drawn, poses kept."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a file says of itself is used; an odd entry is left out and named, and the rest is read."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The examples with stand-ins for MediaPipe and OpenCV, which the environment need not have."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The live demo from videos to its table, in real processes over real DDS, with stand-ins."""
 
 from __future__ import annotations

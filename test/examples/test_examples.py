@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The examples run as they are: files, the notebook, and a publisher and a subscriber live."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The detector turns images of every source into keypoints, with stand-ins for its libraries."""
 
 from __future__ import annotations

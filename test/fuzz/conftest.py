@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What spoils valid input in numbered ways, and what gives thousands of them to a reader.
 
 `make fuzz` gives each class 100000 inputs and prints what became of them; the suite gives 200. An

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of every kind are read or refused."""
 
 from __future__ import annotations

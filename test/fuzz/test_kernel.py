@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Direct calls of the compiled kernel are computed or refused: no call ends the process.
 
 Arguments are valid ones, spoilt: other numbers, lengths, item types, objects and capsules. Arrays

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages of every kind are lifted or refused, and what comes after is lifted as before."""
 
 from __future__ import annotations

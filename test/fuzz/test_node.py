@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What others set and say: parameters are accepted or refused, a training is understood or not."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The kernel as an optional part: what happens where there is no C compiler."""
 
 from __future__ import annotations

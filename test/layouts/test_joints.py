@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kinematic trees in layout files: what they may say, and what is refused by name."""
 
 from __future__ import annotations

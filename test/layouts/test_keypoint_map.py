@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints go from one layout to another by name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Layouts are consistent: they name only keypoints that they have."""
 
 from __future__ import annotations

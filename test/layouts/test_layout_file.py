@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Layout files say what a layout is; whatever else they hold is refused by name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Presets are what they were written from, in the order that detectors publish."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled kernel against the same sums in NumPy."""
 
 from __future__ import annotations

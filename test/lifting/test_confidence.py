@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Confidence: a probability, and less of it wherever less is known."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The correction against the Gaussian formula written out, and the covariance against truth."""
 
 from __future__ import annotations

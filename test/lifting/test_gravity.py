@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gravity sets an object upright that is nearly upright, and leaves one that lies."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is remembered is bounded, found by identity, and forgotten."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lenses are undone as OpenCV defines them, and no ray is made up."""
 
 from __future__ import annotations

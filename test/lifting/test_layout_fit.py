@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The layout that fits is found among those of the same number of keypoints."""
 
 from __future__ import annotations

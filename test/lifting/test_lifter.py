@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lifting: what goes in comes out by scale and translation, and nothing else matters."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Smoothing before the correction: steady, by time constants of the stamps, and on SO(3)."""
 
 from __future__ import annotations

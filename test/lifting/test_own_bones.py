@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bones of a made person are learned, and forgotten when another one takes the identity."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Objects come out at their position, turned as the camera sees them, wherever they stand."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Values that look wrong are found, and sound ones are not."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Smoother: what rests is held still, what moves is followed, what is gone stays for a while."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Objects keep their identities while they are seen."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A score is a weight: what the detector guesses pulls little."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """CameraInfo becomes intrinsics; what is wrong with it is said."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Any message of a known type becomes an observation or a MessageError, live or from a bag."""
 
 from array import array

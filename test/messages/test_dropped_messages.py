@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What never came is counted while it is clear whose numbers they are."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages of any detector, told by names of fields."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rotations between frames, as tf2 gives them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Field mappings as people write them."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A pipeline says why it lifts nobody, and counts what the detector saw."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The short way and the long way to read a serialised message end alike, to the last bit."""
 
 from __future__ import annotations

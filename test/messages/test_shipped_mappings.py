@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The field mappings in config/mappings read messages and bags of their detectors' definitions."""
 
 from pathlib import Path

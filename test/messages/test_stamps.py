@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each message of a topic has a time on the topic's clock, whatever its stamp."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Names of topics with a wildcard."""
 
 from deep_nrsfm_ros.messages.topics import match

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options that cannot have an effect are warned of."""
 
 from __future__ import annotations

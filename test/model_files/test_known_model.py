@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The model that a training starts from: one whose keypoints have the names of the object's."""
 
 from __future__ import annotations

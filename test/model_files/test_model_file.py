@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Model files keep everything, are written whole or not at all, and damaged ones are refused."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nobody but the owner makes the lifter read or write outside of the owner's folders."""
 
 from __future__ import annotations

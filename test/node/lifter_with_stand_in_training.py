@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifter, whose trainings are played by stand_in_training.py."""
 
 import functools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifter, and the training that it starts, which saves itself several times a second.
 
 Started without --ros-args it is the training.

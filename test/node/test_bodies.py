@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joints on the wire: messages from poses, and topics of a lifter over DDS."""
 
 from __future__ import annotations

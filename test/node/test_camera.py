@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """With CameraInfo, what the lifter answers is at its place."""
 
 from __future__ import annotations

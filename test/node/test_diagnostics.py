@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifter's own diagnosis, by its stated rules."""
 
 from __future__ import annotations

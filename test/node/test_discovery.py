@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The profile by which a node that was there before is found at once, as all tests have it."""
 
 from __future__ import annotations

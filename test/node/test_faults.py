@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifter through what goes wrong around it: signals, kills, files, clocks, other nodes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The direction of gravity, from a parameter or an IMU."""
 
 from __future__ import annotations

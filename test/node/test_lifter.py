@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lifter as a user meets it: a process of its own, over real DDS."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The client joins the keypoints and the points of a lifter, over DDS."""
 
 from __future__ import annotations

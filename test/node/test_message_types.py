@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message classes are imported when they are asked for."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Names of nodes, frames and parameters, of a lifter that is one of several."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The running lifter looks at its input: layout, unit, options under their documented names."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The doctor's lifter answers over DDS, or says why not."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Any detector in: types, topics and identities, over real DDS."""
 
 from __future__ import annotations

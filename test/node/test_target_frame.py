@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Objects in a fixed frame."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real trainings that go wrong in all ways, while the lifter goes on lifting."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training through the services of a lifter that goes on lifting."""
 
 from __future__ import annotations

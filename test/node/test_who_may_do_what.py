@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whoever sets parameters of a running lifter reaches the owner's folders and no others."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lengths of bones as observations: their derivatives, the formula, and what they are for."""
 
 from __future__ import annotations

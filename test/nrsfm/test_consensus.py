@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Factorisations of few frames: their consensus is better than each, and chosen without truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cameras and alignment against NumPy's and SciPy's own, and their invariants."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which way round shapes are, by the votes of one or more tetrahedra."""
 
 from __future__ import annotations

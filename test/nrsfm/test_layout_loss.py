@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bones that keep their lengths and fronts in front, against a slow form and in a training."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The training loss against explicit loops over frames and visible points."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors of known perturbations, what must not change them, and which way round a shape is."""
 
 from __future__ import annotations

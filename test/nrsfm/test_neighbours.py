@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mirrored frames are found without labels, a good model is left alone, gaps are bridged."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The network against the paper's equations, written out with Kronecker products and loops."""
 
 from __future__ import annotations

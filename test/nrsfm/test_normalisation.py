@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Normalisation: there and back, and blind to what must not matter."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A real browser without a screen, spoken to over a pipe by its DevTools protocol."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The report stands alone, shows what there is, and takes nothing from data for HTML."""
 
 from __future__ import annotations

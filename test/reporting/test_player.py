@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings in a real browser: they are drawn, they move, and nothing is complained of."""
 
 from __future__ import annotations

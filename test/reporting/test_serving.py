@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page on localhost shows frames as they come, and those that came before."""
 
 from __future__ import annotations

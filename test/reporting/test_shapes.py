@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shapes and label-free errors of a model, from the frames it lifts."""
 
 from __future__ import annotations

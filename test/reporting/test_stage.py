@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo's page in a real browser, and its picture: the person stands on the floor, in view."""
 
 from __future__ import annotations

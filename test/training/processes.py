@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What each process of test_distributed.py does; writes what it found to `rank.safetensors`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stands in for the training command: speaks its protocol and behaves as its model is named.
 
 Its model is a copy of the one beside the first bag.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The best state is kept, a standstill ends a training, and looking is cheap."""
 
 from __future__ import annotations

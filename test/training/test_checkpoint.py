@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A checkpoint is whole, or the old one stays."""
 
 from __future__ import annotations

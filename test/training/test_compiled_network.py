@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled network against torch's autograd through `network.py`, in float64."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One configuration for the command line, the service and the record on disk."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data that looks wrong is said before a training, by the check that `lift` uses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two processes that torchrun has started train what one process trains."""
 
 from __future__ import annotations

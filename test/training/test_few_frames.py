@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Few frames: the network learns what factorisations agree on, and lifts new frames like any."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A training that starts from a model starts as good as it, and ends better on new data."""
 
 from __future__ import annotations

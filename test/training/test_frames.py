@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tests of the frames that a training draws from."""
 
 from __future__ import annotations

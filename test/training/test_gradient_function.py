@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The gradient function for networks that torch computes, and the weight vector."""
 
 from __future__ import annotations

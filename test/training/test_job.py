@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A training as a process of its own: whatever it does, its end is reported once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The judge: a worse model is doubted with its reason, a better one is not; no label is used."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Training learns a non-rigid object from 2D alone, and stops, goes on and fails as it should."""
 
 from __future__ import annotations

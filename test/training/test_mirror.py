@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mirrored frames of a training: counted without labels, unknown where frames cannot tell."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The data of a training is curated and assessed before the training starts."""
 
 from __future__ import annotations

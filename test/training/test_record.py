@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a training leaves behind when it is cut off, and what is said of it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The parameters of the lifter become the configuration of a training."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A training that is cut off goes on as it was asked for and leaves no half-written model."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One step of training: what the whitening is taken from, and how far each step goes."""
 
 from __future__ import annotations

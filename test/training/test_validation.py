@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is refused before data are read, in the words of the command line and of the service."""
 
 from __future__ import annotations

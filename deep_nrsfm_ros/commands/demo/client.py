@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Client of the demo: start the lifter, play keypoints to it over DDS, and record its messages."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compare the points in a recorded bag with the ground truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lift a real person, seen by four cameras one at a time, and write a page that shows it.
 
 The clip is part of the package: 2D keypoints of a detector, images, and ground truth to compare

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo as on a robot: keypoints over DDS to the lifter, and a training on the recording.
 
 Detections in a bag are played to the lifter, a process of its own, and what it publishes is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arrays of NumPy: .npz with named arrays, .npy with the keypoints alone."""
 
 from __future__ import annotations

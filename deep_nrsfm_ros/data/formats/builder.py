@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gathers the objects of a file, one by one, into detections."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Numbers of frames in the names of files and images."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """JSON of detectors: COCO, OpenPose, MMPose, AlphaPose, MediaPipe and PoseNet.
 
 They differ in what holds the frames, and in the names of the same few fields of an object. One

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A JSON document element by element, in memory that does not grow with the document."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Names of keypoints in files, in the spelling of the layouts."""
 
 from __future__ import annotations

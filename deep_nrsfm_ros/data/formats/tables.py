@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of keypoints: CSV of DeepLabCut and MediaPipe, H5 of DeepLabCut, TRC of Sports2D."""
 
 from __future__ import annotations

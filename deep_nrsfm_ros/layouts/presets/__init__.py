@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The keypoint layouts that come with the package, each a layout file in this folder.
 
 A file is read when its layout is first used: `preset("coco17")`, `LAYOUTS["coco17"]` and

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Classic factorisations of images of one object into cameras and shapes, without a network."""

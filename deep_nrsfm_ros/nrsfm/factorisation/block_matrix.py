@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The block-matrix method of Dai, Li and He, with the weighted nuclear norm of Kumar."""
 
 from __future__ import annotations

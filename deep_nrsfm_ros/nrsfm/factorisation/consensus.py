@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shapes on which several factorisations of few frames agree, chosen without ground truth.
 
 0. An object that comes closer grows in the image. Rank-9 factorisation determines the scale of each

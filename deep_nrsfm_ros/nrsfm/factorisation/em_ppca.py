@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """EM-PPCA of Torresani, Hertzmann and Bregler: EM-SfM in the paper's Table 1.
 
 Here `basis` (1 + K, 3, p) is the mean shape and the modes, and z (f, 1 + K) their coefficients,

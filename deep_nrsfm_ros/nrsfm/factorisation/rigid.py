@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rigid factorisation, and functions shared with the other factorisations."""
 
 from __future__ import annotations

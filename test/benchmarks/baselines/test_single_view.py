@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The supervised methods: exact where the pose is an atom, or a combination of few."""
 
 from __future__ import annotations

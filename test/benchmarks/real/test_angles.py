@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The figures of angles on poses whose errors are known."""
 
 from __future__ import annotations

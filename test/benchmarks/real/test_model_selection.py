@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where joints are, told of people of known proportions; a camera sees what is before it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The figures of people over time on cases whose answer is known, and the program on tiny data."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The figures tell a person from its mirror image and from a flat one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From bags to tables: real trainings, a few steps each, of little data."""
 
 from __future__ import annotations

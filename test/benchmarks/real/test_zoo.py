@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The zoo's scenes are divided by time, and its figures are those of the shapes."""
 
 from __future__ import annotations

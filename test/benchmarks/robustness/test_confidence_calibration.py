@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reliability table: errors of known size are told, and a known calibration is found."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the benchmark spoils is what it says, and perfect curation would score perfectly."""
 
 from __future__ import annotations

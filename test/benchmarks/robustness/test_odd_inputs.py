@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No odd input gives wrong values without a word; those that are read come out right."""
 
 from __future__ import annotations

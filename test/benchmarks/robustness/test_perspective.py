@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera sees what was put before it, and a perfect lifter would score perfectly."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The steadiness table: known motions give known figures."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The plain torch training: the same network, the same losses as ours, written otherwise."""
 
 from __future__ import annotations

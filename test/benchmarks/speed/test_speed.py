@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The benchmarks of speed: their tables' form and arithmetic; what they time is not looked at."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """As much of OpenCV as the detector uses, on files that NumPy saved; 50 frames a second."""
 
 from __future__ import annotations

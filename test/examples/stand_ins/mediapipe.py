@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """As much of MediaPipe as the detector uses: a person whose first landmark tells the colour seen.
 
 Nobody is in a black image.
