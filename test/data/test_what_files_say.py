@@ -181,6 +181,41 @@ def test_keypoints_of_any_form(tmp_path: Path, key: str) -> None:
         assert (found.confidence == 1).all() and len(found) == 1
 
 
+@pytest.mark.parametrize("people", [1, 2])
+def test_arrays_as_lists_are_read_as_npy_is(tmp_path: Path, people: int) -> None:
+    array = np.array([[person(10 * f + i) for i in range(people)] for f in range(3)])
+    array = array.reshape(3, people, Q, 3)
+    array = array[:, 0] if people == 1 else array
+    np.save(tmp_path / "a.npy", array)
+    expected = read_keypoints(tmp_path / "a.npy", ReadOptions(layout=COCO17))
+    flat = array.reshape(*array.shape[:-2], 3 * Q)
+    for content in (array.tolist(), flat.tolist()):
+        found = read(tmp_path / "a.json", content, layout=COCO17)
+        np.testing.assert_array_equal(found.points, expected.points)
+        np.testing.assert_array_equal(found.confidence, expected.confidence)
+        np.testing.assert_array_equal(found.frame, expected.frame)
+        assert not found.warnings
+
+
+def test_keypoints_by_name_make_the_layout(tmp_path: Path) -> None:
+    triples = np.reshape(person(), (Q, 3)).tolist()
+    named = dict(zip(COCO17.keypoints, triples, strict=True))
+    fields = {name: {"x": x, "y": y, "confidence": s} for name, (x, y, s) in named.items()}
+    reordered = dict(reversed(fields.items()))
+    for content in ([named] * 2, [fields] * 2, [reordered] * 2, [[{"keypoints": fields}]] * 2):
+        found = read(tmp_path / "a.json", content)
+        assert found.layout is not None and found.frame.tolist() == [0, 1]
+        order = [found.layout.keypoints.index(name) for name in COCO17.keypoints]
+        np.testing.assert_allclose(found.points[1, order], np.array(triples)[:, :2], rtol=1e-6)
+        np.testing.assert_allclose(found.confidence, 0.9)
+
+
+def test_a_list_of_a_few_numbers_is_no_object(tmp_path: Path) -> None:
+    for content in ([[1, 2]], [[[1, 2], [3, 4]]], [{"a": 1, "b": 2, "c": 3}]):
+        with pytest.raises(KeypointFileError):
+            read(tmp_path / "a.json", content, layout=COCO17)
+
+
 def test_null_and_nan_are_missing(tmp_path: Path) -> None:
     values = person()
     values[3:6], values[6:9] = [None, None, 0], [float("nan"), 1, 1]  # type: ignore[list-item]

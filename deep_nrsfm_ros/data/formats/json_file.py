@@ -3,7 +3,8 @@
 
 They differ in what holds the frames, and in the names of the same few fields of an object. One
 reader takes them all, so that a mixture (COCO results with nested keypoints, identities of
-AlphaPose) is read as well.
+AlphaPose) is read as well; and arrays written as lists, and keypoints by name, as scripts write
+them.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ _FRAME = ("image_id", "frame_id", "frame", "frame_number", "frame_index", "image
 _SCORES = ("keypoint_scores", "keypoints_scores", "keypoint_score", "scores", "confidence")
 _IDENTITY = ("person_id", "track_id", "idx", "instance_id")
 _SCORE = ("score", "bbox_score", "confidence")
+_FEWEST = 3  # keypoints of an object without a field that names them
 _CONFIDENCE = ("visibility", "score", "confidence", "presence", "likelihood")
 
 
@@ -123,6 +125,9 @@ class JsonReader:
 
     def _element(self, value: Any, frame: DefaultFrame, key: str | None) -> bool:
         """Read an object, a frame, or the list of the objects of a frame."""
+        if isinstance(value, list) and _are_numbers(value):
+            self._person({"keypoints": value}, self._frame_of({}, frame))
+            return True
         if isinstance(value, list):  # a list of instances inside `predictions`
             self._frame_of({}, frame)
             known = [self._element(each, frame, key) for each in value]
@@ -137,6 +142,9 @@ class JsonReader:
             return True
         if any(name in value for name in _OBJECTS):
             self._frame(value, frame)
+            return True
+        if points := _named_points(value):
+            self._person({"keypoints": points}, self._frame_of({}, frame))
             return True
         if not any(name in value for name in _KEYPOINTS):
             # Annotations of COCO are boxes of cars, too.
@@ -199,14 +207,15 @@ class JsonReader:
         """Add an object, or count what is wrong with it."""
         try:
             field = next((name for name in _KEYPOINTS if name in person), "")
-            keypoints = person.get(field)
+            keypoints: Any = person.get(field)
             self._builder.is_mediapipe |= field in _LANDMARKS
             if keypoints is None:
                 raise ValueError(NO_KEYPOINTS)
             scores = next((person[n] for n in _SCORES if isinstance(person.get(n), list)), None)
             if isinstance(keypoints, dict):
-                keypoints, scores = _columns(keypoints), None
-            elif _are_points(keypoints):
+                keypoints = _named_points(keypoints) or _columns(keypoints)
+                scores = None
+            if _are_points(keypoints):
                 keypoints, scores = self._points(keypoints), None
             values = as_values(keypoints, scores, self._expected)
             self._builder.in_box(values, person.get("bbox", person.get("box")))
@@ -288,7 +297,33 @@ def _is_frame(key: str | None, value: Any) -> bool:
     if key in ("frames", "results"):
         return isinstance(value, (dict, list))
     is_people = isinstance(value, dict) and any(isinstance(value.get(n), list) for n in _OBJECTS)
-    return key is None and (is_people or isinstance(value, list))
+    is_person = isinstance(value, dict) and bool(_named_points(value))
+    return key is None and (is_people or is_person or isinstance(value, list))
+
+
+def _are_numbers(value: list[Any]) -> bool:
+    """Return whether a list is an object as an array: [[x, y, s], ...] or [x, y, s, ...]."""
+    if value and all(isinstance(point, list) and 2 <= len(point) <= 4 for point in value):
+        value = [number for point in value for number in point]
+    return len(value) >= 2 * _FEWEST and _are_coordinates(value)
+
+
+def _named_points(value: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return points with their names, of {name: {x, y, ...}} or {name: [x, y, s]}; else []."""
+    points: list[dict[str, Any]] = []
+    for name, point in value.items():
+        if isinstance(point, dict) and "x" in point and "y" in point:
+            points.append({**point, "name": name})
+        elif isinstance(point, list) and len(point) in (2, 3) and _are_coordinates(point):
+            points.append({"name": name, **dict(zip(("x", "y", "score"), point, strict=False))})
+        else:
+            return []
+    return points if len(points) >= _FEWEST else []
+
+
+def _are_coordinates(values: list[Any]) -> bool:
+    """Return whether all values are numbers, or null for a missing one."""
+    return all(value is None or isinstance(value, (int, float)) for value in values)
 
 
 def _columns(keypoints: Mapping[str, Any]) -> list[list[Any]]:
