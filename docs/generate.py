@@ -25,6 +25,7 @@ from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.node.bodies import BodyOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
 from deep_nrsfm_ros.node.gravity import GravitySources
+from deep_nrsfm_ros.node.lifter import NodeOptions
 from deep_nrsfm_ros.node.parameter_bridge import parameter_name
 from deep_nrsfm_ros.node.target_frame import TargetOptions
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
@@ -45,6 +46,7 @@ _GROUPS: tuple[tuple[str, type, str], ...] = (
     ("Gravity: sources", GravitySources, "gravity."),
     ("Smoothing", SmoothingOptions, "smoothing."),
     ("Joints", BodyOptions, "body."),
+    ("Lifecycle", NodeOptions, ""),
     ("Training: data and result", TrainingOptions, "train."),
     ("Training: recipe", Recipe, "train."),
     ("Training: losses of the layout", LayoutLossWeights, "train."),

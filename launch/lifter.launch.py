@@ -60,6 +60,12 @@ def generate_launch_description() -> LaunchDescription:
                 "to mid-hip of an adult; 0 = as the model's layout says.",
             ),
             DeclareLaunchArgument(
+                "managed",
+                default_value="false",
+                description="Whether the lifter is a managed node, which waits for the transitions "
+                "configure and activate.",
+            ),
+            DeclareLaunchArgument(
                 "config",
                 default_value=PathJoinSubstitution([share, "config", "lifter.yaml"]),
                 description="Parameter file of the lifter; what it sets wins over the arguments.",
@@ -78,6 +84,7 @@ def generate_launch_description() -> LaunchDescription:
                         "reference_length": ParameterValue(
                             LaunchConfiguration("reference_length"), value_type=float
                         ),
+                        "managed": ParameterValue(LaunchConfiguration("managed"), value_type=bool),
                     },
                     LaunchConfiguration("config"),
                 ],

@@ -78,3 +78,7 @@ class FloorScale:
             if identity in self._scales or len(self._scales) < _MAX_IDENTITIES:
                 self._scales[identity] = mean, weight, seconds
         return scales
+
+    def forget(self) -> None:
+        """Forget all identities."""
+        self._scales.clear()

@@ -129,6 +129,11 @@ class Pipeline:
         self._smoothers.pop(topic, None)
         self._memories.pop(topic, None)
 
+    def forget(self) -> None:
+        """Forget all identities of all topics."""
+        self._smoothers.clear()
+        self._memories.clear()
+
     def learned_bones(self, most: int = 8) -> dict[str, str]:
         """Return the bone lengths that are learned of each identity, as text for diagnostics.
 

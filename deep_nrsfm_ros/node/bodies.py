@@ -328,6 +328,11 @@ class BodyPublishers:
         prefixes += [f"{HUMANS}/{topic_name(name)}"] if self._options.humans else []
         return [*map(partial(_Body, self._node), prefixes)]
 
+    def forget(self) -> None:
+        """Forget all objects and destroy their topics."""
+        self._motions.clear()
+        self._forget([*self._bodies])
+
     def _forget(self, lost: Sequence[str]) -> None:
         """Destroy the topics of identities that are lost."""
         for name in lost:

@@ -15,6 +15,8 @@ For every message on `keypoints` the node publishes, with the header of that mes
   angles and states of tracking; only with a subscriber. See `node/bodies.py` for more of them.
 - /tf: a frame for each object; only with the parameter tf_prefix.
 
+With the parameter managed, it is a managed node (lifecycle); see `node/lifecycle.py`.
+
 The node does not import torch: lifting needs NumPy only, and training is a process of its own.
 """
 
@@ -25,11 +27,14 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import QuaternionStamped
 from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
@@ -43,6 +48,7 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.body.floor import FloorScale
+from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -64,6 +70,7 @@ from deep_nrsfm_ros.node import parameter_bridge, publishing
 from deep_nrsfm_ros.node.bodies import BodyOptions, BodyPublishers, Scene
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
+from deep_nrsfm_ros.node.entities import Entities
 from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
@@ -81,6 +88,9 @@ from deep_nrsfm_ros.training.request import (
     training_request,
 )
 
+if TYPE_CHECKING:
+    from deep_nrsfm_ros.node.lifecycle import Lifecycle
+
 _SMOOTHING = "smoothing."
 _HISTORY = "history."
 _GRAVITY = "gravity."
@@ -95,36 +105,110 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _TRAINING_GRACE = 1.0  # seconds in which a training may save its model when the node ends
 
 
+@dataclass(frozen=True)
+class NodeOptions:
+    """Node."""
+
+    managed: bool = option(
+        False,
+        "whether the node is a managed one (lifecycle): it does nothing before the transitions "
+        "configure (loads the model, creates the topics) and activate (receives keypoints), which "
+        "a launch file, nav2's lifecycle manager or `ros2 lifecycle set` asks for; needs "
+        "lifecycle_msgs",
+        read_only=True,
+    )
+
+
+class Stage(Enum):
+    """How far the node is; the values are the names of the lifecycle's states."""
+
+    UNCONFIGURED = "unconfigured"
+    INACTIVE = "inactive"
+    ACTIVE = "active"
+
+
 class LifterNode(Node):
-    """Lifts every message on `keypoints` with the model that the parameters name."""
+    """Lifts every message on `keypoints` with the model that the parameters name.
+
+    A node that is not managed is configured and activated at its start.
+    """
 
     def __init__(self) -> None:
-        """Declare parameters, load the model and subscribe.
+        """Declare the parameters; configure and activate the node unless it is managed.
 
         Raises:
             ValueError: a parameter or the model is not usable.
             ParameterException: rclpy refuses the value of a parameter.
         """
         super().__init__("lifter")
-        self._inputs = parameter_bridge.declare(self, InputOptions)
+        managed = parameter_bridge.declare(self, NodeOptions).managed
+        inputs = parameter_bridge.declare(self, InputOptions)
         parameter_bridge.declare(self, LiftingOptions)
-        camera = parameter_bridge.declare(self, CameraOptions)
-        target = parameter_bridge.declare(self, TargetOptions)
+        self._camera_options = parameter_bridge.declare(self, CameraOptions)
+        self._target_options = parameter_bridge.declare(self, TargetOptions)
         parameter_bridge.declare(self, HistoryOptions, _HISTORY)
         parameter_bridge.declare(self, SmoothingOptions, _SMOOTHING)
-        self._up = parameter_bridge.declare(self, GravityOptions, _GRAVITY).direction
-        sources = parameter_bridge.declare(self, GravitySources, _GRAVITY)
-        body = parameter_bridge.declare(self, BodyOptions, _BODY)
+        parameter_bridge.declare(self, GravityOptions, _GRAVITY)
+        self._gravity_sources = parameter_bridge.declare(self, GravitySources, _GRAVITY)
+        self._body_options = parameter_bridge.declare(self, BodyOptions, _BODY)
         training = parameter_bridge.declare(self, TrainingOptions, _TRAIN)
         parameter_bridge.declare(self, Recipe, _TRAIN)
         parameter_bridge.declare(self, LayoutLossWeights, _TRAIN)
         parameter_bridge.declare(self, Limits, _TRAIN)
         parameter_bridge.declare(self, Curation, _TRAIN)
         self._sandbox = PathSandbox(
-            Path(self._inputs.models_dir).expanduser(),
-            Path(self._inputs.bags_dir).expanduser(),
-            (self._inputs.model, self._inputs.keypoint_layout, *paths_of(training)),
+            Path(inputs.models_dir).expanduser(),
+            Path(inputs.bags_dir).expanduser(),
+            (inputs.model, inputs.keypoint_layout, *paths_of(training)),
         )
+        self._stage = Stage.UNCONFIGURED
+        self._lifecycle = self._manage() if managed else None
+        if not managed:
+            self.configure()
+        self._diagnostics_publisher = self._quiet_publisher(DiagnosticArray, "/diagnostics")
+        # A steady clock: in ROS time, a paused simulation would stop the reports.
+        self.create_timer(
+            _REPORT_PERIOD, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+        self.add_on_set_parameters_callback(self._validate_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        if not managed:
+            self.activate()
+        self._name_check = NameCheck(self)
+
+    def _manage(self) -> Lifecycle:
+        """Return the state machine of a managed node; raise ValueError if its package is missing.
+
+        It is imported here because only a managed node needs it.
+        """
+        try:
+            from deep_nrsfm_ros.node.lifecycle import Lifecycle
+        except ImportError as error:
+            raise ValueError(
+                f"managed is true, and rclpy's lifecycle or lifecycle_msgs is missing ({error}): "
+                "install it (apt install ros-jazzy-lifecycle-msgs), or set managed to false"
+            ) from None
+        return Lifecycle(self, self, _error_text)
+
+    def configure(self) -> None:
+        """Load the model and create everything but the input.
+
+        Raises:
+            ValueError: a parameter or the model is not usable; nothing has been created.
+        """
+        self._entities = Entities(self)
+        try:
+            self._configure()
+        except Exception:
+            self._entities.destroy()
+            raise
+        self._stage = Stage.INACTIVE
+
+    def _configure(self) -> None:
+        """Do what `configure` does, up to the error."""
+        camera = self._camera_options
+        self._inputs = parameter_bridge.read(self, InputOptions)
+        self._up = parameter_bridge.read(self, GravityOptions, _GRAVITY).direction
         self._auto = self._inputs.keypoint_layout == AUTO
         self._chosen: Choice | None = None
         self._pipeline = self._proposed = self._build_pipeline(())
@@ -136,27 +220,27 @@ class LifterNode(Node):
 
         self._frame_id, self._last_frame = camera.frame_id, ""
         self._camera = CameraInfoSubscription(self, camera)
-        self._gravity = GravityDirection(self, sources)
+        self._gravity = GravityDirection(self, self._gravity_sources)
         self._floor = FloorScale(camera.camera_height) if camera.camera_height else None
-        self._target = TargetFrame(self, target, positioned=self._camera.enabled)
+        self._target = TargetFrame(self, self._target_options, positioned=self._camera.enabled)
         self._tf = TransformBroadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
-        self._lifter_diagnostics = LifterDiagnostics()
         self._points = self._quiet_publisher(PointCloud2, "~/points")
         self._rotation = self._quiet_publisher(QuaternionStamped, "~/camera_rotation")
         self._objects = self._quiet_publisher(MultiDOFJointState, "~/objects")
         self._markers = self._quiet_publisher(MarkerArray, "~/markers")
-        self._bodies = BodyPublishers(self, body, camera.tf_prefix)
+        self._bodies = BodyPublishers(self, self._body_options, camera.tf_prefix)
         self._bodies.describe(self._pipeline.model.layout)
-        self._diagnostics_publisher = self._quiet_publisher(DiagnosticArray, "/diagnostics")
         self._training = TrainingService(
-            *(self, self._training_request, self._activate, self._sandbox.models_dir)
+            *(self, self._training_request, self._switch_model, self._sandbox.models_dir)
         )
-        # A steady clock: in ROS time, a paused simulation would stop the reports.
-        self.create_timer(
-            _REPORT_PERIOD, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
-        self.add_on_set_parameters_callback(self._validate_parameters)
-        self.add_post_set_parameters_callback(self._apply_parameters)
+
+    def activate(self) -> None:
+        """Subscribe to the keypoints, with nothing remembered of any object.
+
+        Raises:
+            ValueError: a parameter of the input is not usable; there is no subscription.
+        """
+        self._lifter_diagnostics = LifterDiagnostics()
         self.get_logger().info(
             f"lifting with model {self._pipeline.model.name!r} "
             + (
@@ -179,9 +263,25 @@ class LifterNode(Node):
             on_problem=self._lifter_diagnostics.publisher_problem,
             on_dropped=self._lifter_diagnostics.dropped,
         )
-        self._name_check = NameCheck(self)
         for warning in (*parameter_bridge.undeclared(self), *self._unused_options()):
             self.get_logger().warning(warning)
+        self._stage = Stage.ACTIVE
+
+    def deactivate(self) -> None:
+        """Unsubscribe from the keypoints and forget all objects; the model stays loaded."""
+        self._keypoint_topics.close()
+        self._pipeline.forget()
+        self._bodies.forget()
+        if self._floor:
+            self._floor.forget()
+        self._stage = Stage.INACTIVE
+
+    def clean_up(self) -> None:
+        """Release the model, the topics and the services, and end a running training."""
+        self._training.close(_TRAINING_GRACE)
+        self._entities.destroy()
+        del self._pipeline, self._proposed, self._stream, self._bodies
+        self._stage = Stage.UNCONFIGURED
 
     def _log_unit(self) -> None:
         """Log the unit of the output, if it is the layout's own."""
@@ -201,7 +301,8 @@ class LifterNode(Node):
 
     def close(self) -> None:
         """End a running training."""
-        self._training.close(_TRAINING_GRACE)
+        if self._stage is not Stage.UNCONFIGURED:
+            self._training.close(_TRAINING_GRACE)
 
     def _lift(self, source: KeypointTopic, raw: bytes) -> None:
         """Lift one serialised message and publish the result; this is the hot path."""
@@ -371,6 +472,25 @@ class LifterNode(Node):
             return
         if warning := self._name_check():
             self.get_logger().warning(warning)
+        is_active = self._stage is Stage.ACTIVE
+        statuses = [self._lifting_status() if is_active else self._waiting_status()]
+        if self._stage is not Stage.UNCONFIGURED:
+            statuses.append(self._training.status)
+        self._diagnostics_publisher.publish(
+            DiagnosticArray(header=publishing.to_header(self._now()), status=statuses)
+        )
+
+    def _waiting_status(self) -> DiagnosticStatus:
+        """Return the state of a managed node that is not active, for diagnostics."""
+        assert self._lifecycle
+        problem, state = self._lifecycle.problem, self._lifecycle.state
+        node = self.get_fully_qualified_name()
+        message = problem or f"{state}: waits for a transition (ros2 lifecycle set {node})"
+        values = {"state": state, "model": self.get_parameter("model").value}
+        return status(f"{node}: lifting", ERROR if problem else OK, message, values, node)
+
+    def _lifting_status(self) -> DiagnosticStatus:
+        """Return how the lifting goes, for diagnostics; look at the input."""
         idle = self._lifter_diagnostics.idle
         self._keypoint_topics.update(idle=idle)
         residual = self._lifter_diagnostics.residual
@@ -390,12 +510,7 @@ class LifterNode(Node):
             values[f"bones of {identity}"] = bones
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
         node = self.get_fully_qualified_name()
-        lifting = status(f"{node}: lifting", level, message, values, node)
-        self._diagnostics_publisher.publish(
-            DiagnosticArray(
-                header=publishing.to_header(self._now()), status=[lifting, self._training.status]
-            )
-        )
+        return status(f"{node}: lifting", level, message, values, node)
 
     def _layout_status(self) -> str:
         """Return the layout of the keypoints as text, for diagnostics."""
@@ -495,16 +610,30 @@ class LifterNode(Node):
             return None
         return self._chosen.layout
 
+    def _check_parameters(self, changes: Sequence[Parameter]) -> None:
+        """Raise ValueError for a value that no model could have; the rest is for `configure`."""
+        parameter_bridge.read(self, InputOptions, changes=changes)
+        parameter_bridge.read(self, LiftingOptions, changes=changes)
+        parameter_bridge.read(self, SmoothingOptions, _SMOOTHING, changes)
+        parameter_bridge.read(self, HistoryOptions, _HISTORY, changes)
+        parameter_bridge.read(self, GravityOptions, _GRAVITY, changes)
+        self._training_parameters(changes)
+
     def _validate_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         """Build a pipeline for changed parameters, or refuse them with the reason."""
         try:
-            self._proposed = self._build_pipeline(changes)
+            if self._stage is Stage.UNCONFIGURED:
+                self._check_parameters(changes)
+            else:
+                self._proposed = self._build_pipeline(changes)
         except Exception as problem:  # a bad parameter must not end the node
             return SetParametersResult(successful=False, reason=_error_text(problem))
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, changes: list[Parameter]) -> None:
         """Swap in the pipeline of the accepted parameters."""
+        if self._stage is Stage.UNCONFIGURED:
+            return
         if self._proposed.model is not self._pipeline.model:
             self.get_logger().info(f"lifting with model {self._proposed.model.name!r}")
         search = parameter_bridge.read(self, InputOptions).keypoint_layout == AUTO
@@ -540,6 +669,11 @@ class LifterNode(Node):
 
     def _training_request(self) -> TrainingRequest:
         """Return the training that the present parameters ask for."""
+        if self._stage is not Stage.ACTIVE:
+            raise ValueError(
+                f"the lifter is {self._stage.value}, so it has no keypoint topic to train on: "
+                "activate it first"
+            )
         inputs, topics = parameter_bridge.read(self, InputOptions), self._keypoint_topics.topics
         layout = inputs.keypoint_layout
         if layout == AUTO:
@@ -566,7 +700,7 @@ class LifterNode(Node):
             parameter_bridge.read(self, Curation, _TRAIN, changes),
         )
 
-    def _activate(self, path: str) -> None:
+    def _switch_model(self, path: str) -> None:
         """Lift with the model in a file of the models folder; raise ValueError if refused."""
         (result,) = self.set_parameters([Parameter("model", value=Path(path).stem)])
         if not result.successful:

@@ -146,6 +146,13 @@ class KeypointSubscriptions:
             for topic, _ in list(self._subscribed.values()):
                 self._check_types(topic)
 
+    def close(self) -> None:
+        """Unsubscribe from all topics."""
+        self._node.destroy_timer(self._waiting)
+        for _, subscription in self._subscribed.values():
+            self._node.destroy_subscription(subscription)
+        self._subscribed.clear()
+
     def _wait(self) -> None:
         """Subscribe to the topics whose type the first publisher shows, soon after it appears."""
         if self._subscribed:

@@ -45,6 +45,7 @@ class TrainingService:
         self._node, self._request, self._activate = node, request, activate
         self._folder = folder
         self._job: TrainingJob | None = None
+        self._closed = False
         self._name, self._activate_when = "", "if_better"
         self._state, self._last_failure = "idle", "none"
         self._progress: SimpleQueue[JobStatus] = SimpleQueue()
@@ -60,7 +61,8 @@ class TrainingService:
         self._report_records()
 
     def close(self, timeout: float) -> None:
-        """End a training that runs, by force after `timeout` seconds."""
+        """End a training that runs, by force after `timeout` seconds; report nothing any more."""
+        self._closed = True
         if self._job:
             self._job.close(timeout)
 
@@ -114,6 +116,8 @@ class TrainingService:
 
     def _enqueue(self, progress: JobStatus) -> None:
         """Pass progress from the job's thread to the executor's."""
+        if self._closed:
+            return
         self._progress.put(progress)
         self._wake.trigger()
 
