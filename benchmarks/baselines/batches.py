@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.baselines.methods import BASELINES, BATCH, Baseline, Setting, shuffled_batches
+from benchmarks.baselines.methods import BASELINES, BATCH, Setting, shuffled_batches
 from benchmarks.harness import Session
+from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import figures
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.nrsfm.metrics import ShapeErrors, shape_errors
@@ -29,6 +30,8 @@ LEGEND = {
     "which favours them",
 } | {name: baseline.legend for name, baseline in BASELINES.items() if baseline.legend}
 SPENT = {
+    "CPU min": "CPU time on this machine of the training, or of the baseline on the frames of the "
+    "row with the search for its settings",
     "frames": "that the row is measured on; of baselines a random sample, see --batches",
     "ms": "CPU time of a frame in ms, without the search for the settings",
 }
@@ -44,6 +47,7 @@ class Solved(NamedTuple):
         setting: the chosen one.
         frames: that were solved.
         cpu_seconds: without the search for the setting.
+        search_seconds: CPU time of that search.
         by_neighbours: each frame was solved with frames like it.
     """
 
@@ -52,13 +56,15 @@ class Solved(NamedTuple):
     setting: Setting
     frames: int
     cpu_seconds: float
+    search_seconds: float
     by_neighbours: bool
 
     @property
     def label(self) -> str:
         """The row's name: the method and its setting."""
-        words = (f"{key} = {value}" for key, value in self.setting.items() if value is not False)
-        return ", ".join([self.name, *words]).replace("weighted = True", "weighted")
+        settings = self.setting.items()
+        words = [k if v is True else f"{k} = {v}" for k, v in settings if v is not False]
+        return ", ".join([self.name, *words])
 
     @property
     def figures(self) -> dict[str, float]:
@@ -67,7 +73,11 @@ class Solved(NamedTuple):
         if self.by_neighbours:
             # Each frame has a reflection of its own.
             shown = {name: shown[name] for name in ("shape %", "point cm")}
-        return shown | {"frames": self.frames, "ms": 1000 * self.cpu_seconds / self.frames}
+        return shown | {
+            "CPU min": (self.cpu_seconds + self.search_seconds) / 60,
+            "frames": self.frames,
+            "ms": 1000 * self.cpu_seconds / self.frames,
+        }
 
 
 def chosen(session: Session) -> list[str]:
@@ -76,45 +86,72 @@ def chosen(session: Session) -> list[str]:
     return [name for name in BASELINES if words is None or any(word in name for word in words)]
 
 
-def solve(session: Session, name: str, dataset: Dataset) -> Solved:
-    """Return a baseline's errors on a dataset with ground truth, kept in the output folder."""
+def add_total(table: Table) -> None:
+    """Add the CPU time of all baselines of the table to its legend."""
+    minutes = [row.figures["CPU min"] for row in table.rows if "ms" in row.figures]
+    if minutes:
+        table.legend = {
+            **table.legend,
+            "all baselines of this table together": f"{sum(minutes):.1f} CPU min on this machine",
+        }
+
+
+def solve(session: Session, name: str, dataset: Dataset, known: Dataset | None = None) -> Solved:
+    """Return a baseline's errors on a dataset with ground truth, kept in the output folder.
+
+    Args:
+        session: data, output folder and sizes of the samples.
+        name: of the baseline.
+        dataset: to be solved.
+        known: frames in which like ones are looked for; None: the dataset itself.
+    """
     baseline = BASELINES[name]
-    key = f"{name} {baseline.settings} {session.batches} {BATCH} {QUERIES} {POOL}"
+    settings = f"{baseline.settings} {session.batches} {BATCH} {QUERIES} {POOL}"
+    data = dataset.points.tobytes() + (b"" if known is None else known.points.tobytes())
     result = session.kept(
-        key, dataset.points.tobytes(), lambda: _solve(name, baseline, dataset, session.batches)
+        f"{name} {settings} {Solved._fields}",
+        data,
+        lambda: _solve(name, dataset, known, session.batches),
     )
     _, errors, *others = result
     return Solved(name, ShapeErrors(*errors), *others)
 
 
-def _solve(name: str, baseline: Baseline, dataset: Dataset, count: int) -> Solved:
-    truth, rng = true_shapes(dataset), np.random.default_rng(0)
+def _solve(name: str, dataset: Dataset, known: Dataset | None, count: int) -> Solved:
+    baseline, truth, rng = BASELINES[name], true_shapes(dataset), np.random.default_rng(0)
     parts: list[NDArray[np.int64]]
+    extra: tuple[Floats, ...] = ()
     if baseline.whole:
         parts = [np.arange(len(dataset))]
     elif baseline.by_neighbours:
-        pool = rng.permutation(len(dataset))[:POOL]
-        parts = [np.array([frame]) for frame in pool[:QUERIES]]
+        order = rng.permutation(len(dataset))
+        parts = [np.array([frame]) for frame in order[:QUERIES]]
+        if known is None:
+            extra = (dataset.points[order[:POOL]],)
+        else:
+            extra = (known.points[rng.permutation(len(known))[:POOL]],)
     else:
         parts = shuffled_batches(len(dataset), rng)[: count or None]
 
     def run(frames: NDArray[np.int64], setting: Setting) -> ShapeErrors:
-        W = dataset.points[frames]
-        extra = (dataset.points[pool],) if baseline.by_neighbours else ()
-        return lowest_errors(baseline.method(W, *extra, **setting), truth[frames])
+        S = baseline.method(dataset.points[frames], *extra, **setting)
+        return lowest_errors(S, truth[frames])
 
     first = parts[: QUERIES // 4] if baseline.by_neighbours else parts[:1]
-    setting = baseline.settings[0]
+    setting, began = baseline.settings[0], time.process_time()
     if len(baseline.settings) > 1:
         found = {
             i: _mean((frames, run(frames, setting)) for frames in first).shape
             for i, setting in enumerate(tqdm(baseline.settings, f"{name}, settings", leave=False))
         }
         setting = baseline.settings[min(found, key=found.__getitem__)]
-    began = time.process_time()
+    searched = time.process_time()
     errors = _mean((frames, run(frames, setting)) for frames in tqdm(parts, name))
-    spent = time.process_time() - began
-    return Solved(name, errors, setting, sum(map(len, parts)), spent, baseline.by_neighbours)
+    spent = time.process_time() - searched
+    return Solved(
+        *(name, errors, setting, sum(map(len, parts)), spent, searched - began),
+        baseline.by_neighbours,
+    )
 
 
 def lowest_errors(S: Floats, truth: Floats) -> ShapeErrors:

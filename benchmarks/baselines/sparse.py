@@ -28,6 +28,10 @@ EIGENVALUE_FLOOR = 0.05
 0, 0.001, 0.01, 0.05 and 0.2 the best on a batch of CMU 127, by the truth."""
 POINT_NORM = 4.0
 """Norm of each point over all images during the factorisation."""
+FOCUSS_RIDGE, FOCUSS_DECAY, FOCUSS_FLOOR = 6e-3, 0.9, 1e-15
+"""Tikhonov weight of block FOCUSS in the first round, its factor a round, and its least value."""
+FOCUSS_STEPS, FOCUSS_MORE = 10, 60
+"""Iterations of block FOCUSS, and those at most until few enough blocks are active."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +86,11 @@ def sparse(
     active: int,
     *,
     repaired: bool = True,
+    focuss: bool = False,
     effort: Effort = Effort(),
     seed: int = 0,
 ) -> Floats:
     """Return the shapes (f, p, 3) of a block-sparse factorisation.
-
-    The coding is block orthogonal matching pursuit; the authors' program for motion capture has
-    block FOCUSS instead.
 
     Args:
         W: (f, p, 2) images.
@@ -97,17 +99,27 @@ def sparse(
         repaired: positive Gram matrices, rotations between atoms from all frames that they share,
             cameras from all atoms, and shapes moved onto the images. Otherwise as the authors'
             program does: absolute eigenvalues, two random frames, the first camera.
+        focuss: code by block FOCUSS, as the authors' program does for motion capture, otherwise by
+            block orthogonal matching pursuit, as it does for synthetic data.
         effort: iterations.
         seed: of the start.
     """
     rng = np.random.default_rng(seed)
     size = np.maximum(np.linalg.norm(W, axis=(0, 2)), 1e-12) / POINT_NORM
-    D, d = factorise(W / size[:, None], K, active, effort, rng)
+    D, d = factorise(W / size[:, None], K, active, effort, rng, focuss=focuss)
     return recover(Factors(D * size[:, None], d), W, rng, repaired=repaired)
 
 
-def factorise(W: Floats, K: int, active: int, effort: Effort, rng: np.random.Generator) -> Factors:
-    """Return a factorisation with `active` blocks a frame; W (f, p, 2)."""
+def factorise(
+    W: Floats,
+    K: int,
+    active: int,
+    effort: Effort,
+    rng: np.random.Generator,
+    *,
+    focuss: bool = False,
+) -> Factors:
+    """Return a factorisation with at most `active` blocks a frame; W (f, p, 2)."""
     f, p, _ = W.shape
     Y = W.astype(np.float64).transpose(1, 0, 2).reshape(p, 2 * f)
     D: Floats = _start(Y, K, effort, rng).reshape(p, K, 3)
@@ -115,7 +127,11 @@ def factorise(W: Floats, K: int, active: int, effort: Effort, rng: np.random.Gen
     X: Floats = np.zeros((K, 3, f, 2))
     best, lowest, escaped = (D, X), np.inf, 0
     for i in range(effort.ksvd):
-        X = _block_omp(Y, D, active)
+        if focuss:
+            ridge = max(FOCUSS_RIDGE * FOCUSS_DECAY**i, FOCUSS_FLOOR)
+            X = _block_focuss(Y, D, active, _blurred(X, rng), ridge)
+        else:
+            X = _block_omp(Y, D, active)
         D, X = _update_atoms(Y, D.copy(), X.copy())
         cost = float(np.linalg.norm(Y - _product(D, X)))
         fell = lowest - cost
@@ -181,6 +197,53 @@ def _block_omp(Y: Floats, D: Floats, active: int) -> Floats:
         X = flat_X.reshape(K, 3, f, 2)
         left = Y - _product(D, X)
     return X
+
+
+def _blurred(X: Floats, rng: np.random.Generator) -> Floats:
+    """Return X (K, 3, f, 2) plus noise of its own size, or noise alone if it is zero."""
+    size = float(np.sqrt((X**2).mean())) or 1.0
+    blurred: Floats = X + size * rng.standard_normal(X.shape)
+    return blurred
+
+
+def _block_focuss(Y: Floats, D: Floats, active: int, X: Floats, ridge: float) -> Floats:
+    """Return X (K, 3, f, 2) with at most `active` blocks a frame, by block FOCUSS.
+
+    x <- W A^T (A W A^T + ridge)^-1 y with the weights W = (|x_k| / max|D_k|)^2 of the blocks:
+    small blocks vanish. The ridge of a frame grows by half while too many of its blocks are active.
+
+    Args:
+        Y: (p, 2f) images.
+        D: (p, K, 3) dictionary.
+        active: blocks of a frame at most.
+        X: (K, 3, f, 2) start.
+        ridge: Tikhonov weight at the start.
+    """
+    p, K, _ = D.shape
+    y, atoms = Y.reshape(p, -1, 2).swapaxes(0, 1), D.transpose(1, 0, 2)
+    products = (atoms @ atoms.swapaxes(1, 2)).reshape(K, -1)
+    scale = 1 / np.maximum(np.abs(atoms).max((1, 2)), 1e-12)
+    x = X.transpose(2, 0, 1, 3).copy()
+    ridges, crowded = np.full(len(x), ridge), np.arange(len(x))
+    for i in range(FOCUSS_STEPS + FOCUSS_MORE):
+        norm = np.sqrt((x[crowded] ** 2).sum((2, 3)))
+        norm = np.where(norm < 1e-5 * norm.max(1, keepdims=True), 0, norm)
+        if i >= FOCUSS_STEPS:
+            left = (norm > 0).sum(1) > active
+            crowded, norm = crowded[left], norm[left]
+            if not len(crowded):
+                break
+            ridges[crowded] *= 1.5
+        weight = (scale * norm) ** 2
+        system = (weight @ products).reshape(-1, p, p)
+        system += ridges[crowded, None, None] * np.eye(p)
+        z = np.linalg.solve(system, y[crowded])
+        x[crowded] = weight[:, :, None, None] * (atoms.swapaxes(1, 2) @ z[:, None])
+    norm = (x**2).sum((2, 3))
+    beyond = np.argsort(-norm, axis=1)[:, active:]
+    np.put_along_axis(x, beyond[:, :, None, None], 0.0, 1)
+    coded: Floats = x.transpose(1, 2, 0, 3)
+    return coded
 
 
 def _update_atoms(Y: Floats, D: Floats, X: Floats) -> tuple[Floats, Floats]:

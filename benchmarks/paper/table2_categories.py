@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.baselines.batches import SPENT, chosen, solve
+from benchmarks.baselines.batches import SPENT, add_total, chosen, solve
 from benchmarks.data.mat_files import observed, read_category
 from benchmarks.data.synthetic_furniture import CATEGORIES
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
@@ -106,11 +106,14 @@ def benchmark(session: Session) -> Table:
             model = session.trained(title, dataset, session.preset("default", seed))
             for lifting, options in LIFTING.items():
                 labels = (category, f"default recipe, {lifting}")
-                table.add(labels, _shown(evaluate(model, dataset, options)), seed)
+                row = _shown(evaluate(model, dataset, options)) | {"frames": len(dataset)}
+                row["CPU min"] = model.provenance["cpu_seconds"] / 60
+                table.add(labels, row, seed)
         for name in chosen(session):
             solved = solve(session, name, dataset)
             shown = {figure: x for figure, x in solved.figures.items() if figure in table.figures}
             table.add((category, solved.label), shown)
+    add_total(table)
     return table
 
 

@@ -4,7 +4,8 @@
 The paper follows Zhou et al. (CVPR 2015): learned on subject 86, tested on 13, 14 and 15, of which
 14 is at hand. PMP, Alternate and Convex learn a dictionary of 3D poses, the network learns from 2D
 keypoints. The part "15-joints" has them all on the same images; the others are ours alone, with all
-31 joints. `--subjects` chooses parts.
+31 joints, but for Simple on frames that look alike, which looks for them in the frames that the
+network was trained on. `--subjects` chooses parts.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.baselines.batches import true_shapes
+from benchmarks.baselines.batches import chosen, solve, true_shapes
+from benchmarks.baselines.methods import BASELINES
 from benchmarks.baselines.pose_dictionary import (
     JOINTS15,
     LIMBS15,
@@ -139,6 +141,14 @@ def _compare(
             for lifting, options in LIFTING.items():
                 labels = (name, tested_on, "31", "random", f"default recipe, {lifting}")
                 table.add(labels, errors(model, test, options), seed)
+    for method in chosen(session):
+        if not BASELINES[method].by_neighbours:
+            continue
+        for tested_on, test in tests.items():
+            solved = solve(session, method, test, dataset)
+            row = {k: solved.figures[k] for k in ("shape %", "point cm", "ms")}
+            label = f"{solved.label} ({solved.frames} frames)"
+            table.add((name, tested_on, "31", "random", label), row)
 
 
 def _single_view(session: Session, table: Table) -> None:

@@ -195,6 +195,35 @@ def test_frames_that_look_alike_have_no_proper_error(session: Session, dataset: 
     assert found.figures["shape %"] < 1e-3 and "proper %" not in found.figures
 
 
+def test_frames_that_look_alike_are_looked_for_among_other_frames(
+    session: Session, dataset: Dataset
+) -> None:
+    S, others = known(dataset), session.mocap(["86"], "all")
+
+    def by_neighbours(W: Any, frames: Any) -> Any:
+        assert sorted(frames.sum((1, 2))) == sorted(others.points.sum((1, 2)))
+        return S[W[0].tobytes()][None]
+
+    baseline = Baseline(by_neighbours, by_neighbours=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(BASELINES, "of others", baseline)
+        found = batches.solve(session, "of others", dataset, others)
+    assert found.frames == len(dataset) and found.errors.shape < 1e-5
+
+
+def test_time_of_all_baselines_stands_below_the_table(session: Session, dataset: Dataset) -> None:
+    row = solved(session, dataset, Baseline(lambda W, K: W @ np.eye(2, 3), ({"K": 1}, {"K": 2})))
+    assert row.search_seconds > 0
+    minutes = (row.cpu_seconds + row.search_seconds) / 60
+    assert row.figures["CPU min"] == pytest.approx(minutes)
+    table = Table("t", "T", ("method",), ("CPU min", "ms"), {}, lambda table, figure: None)
+    table.add(("network",), {"CPU min": 90.0})
+    for i, spent in enumerate((1.5, 2.25)):
+        table.add((f"baseline {i}",), {"CPU min": spent, "ms": 1.0})
+    batches.add_total(table)
+    assert "together: 3.8 CPU min" in table.markdown()
+
+
 def test_baselines_are_solved_once(
     session: Session, dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,8 @@ ANNEALING = 60.0
 """Factor of the noise variance at the start, less one, in the authors' program."""
 MIRROR_EVERY = 25
 """Iterations between two mirror tests."""
+RESTART_ANGLE = 0.5
+"""Standard deviation, in rad, of the rotation vectors that disturb the cameras of a restart."""
 
 
 @dataclass(frozen=True)
@@ -75,23 +77,42 @@ def em_ppca(
     return _shapes(model, _posterior(Y, model))
 
 
-def em_ppca_by_likelihood(W: Floats, K: int, *, iterations: int = 300) -> Floats:
-    """Return the shapes of the run of highest likelihood: annealed or not, with the mirror test."""
-    Y = W.astype(np.float64).swapaxes(1, 2)
+def em_ppca_by_likelihood(
+    W: Floats, K: int, *, iterations: int = 300, starts: int = 1, seed: int = 0
+) -> Floats:
+    """Return the shapes of the run of highest likelihood: annealed or not, with the mirror test.
+
+    Args:
+        W: (f, p, 2) images.
+        K: number of modes.
+        iterations: of EM, in each run.
+        starts: rigid factorisation, and starts with its cameras disturbed at random.
+        seed: of the disturbances.
+    """
+    Y, rng = W.astype(np.float64).swapaxes(1, 2), np.random.default_rng(seed)
     best: tuple[float, Floats] | None = None
-    for annealed in (False, True):
-        model = _fit(Y, K, annealed=annealed, mirror_test=True, iterations=iterations)
-        posterior = _posterior(Y, model)
-        likelihood = float(posterior.log_likelihood.sum())
-        if best is None or likelihood > best[0]:
-            best = likelihood, _shapes(model, posterior)
+    for i in range(starts):
+        start = _start(Y, K, rng if i else None)
+        for annealed in (False, True):
+            model = _iterate(Y, start, annealed=annealed, mirror_test=True, iterations=iterations)
+            posterior = _posterior(Y, model)
+            likelihood = float(posterior.log_likelihood.sum())
+            if best is None or likelihood > best[0]:
+                best = likelihood, _shapes(model, posterior)
     assert best is not None
     return best[1]
 
 
 def _fit(Y: Floats, K: int, *, annealed: bool, mirror_test: bool, iterations: int) -> LinearModel:
+    """Return the model that EM finds from rigid factorisation."""
+    start = _start(Y, K)
+    return _iterate(Y, start, annealed=annealed, mirror_test=mirror_test, iterations=iterations)
+
+
+def _iterate(
+    Y: Floats, model: LinearModel, *, annealed: bool, mirror_test: bool, iterations: int
+) -> LinearModel:
     """Return the model after `iterations` of EM."""
-    model = _start(Y, K)
     for i in range(iterations):
         if mirror_test and i % MIRROR_EVERY == MIRROR_EVERY - 1:
             model = _mirror_test(Y, model)
@@ -104,10 +125,15 @@ def _fit(Y: Floats, K: int, *, annealed: bool, mirror_test: bool, iterations: in
     return model
 
 
-def _start(Y: Floats, K: int) -> LinearModel:
-    """Return rigid factorisation with the principal modes of its residual."""
+def _start(Y: Floats, K: int, rng: np.random.Generator | None = None) -> LinearModel:
+    """Return rigid factorisation with the principal modes of its residual.
+
+    With `rng` the rotations are disturbed at random, see `RESTART_ANGLE`.
+    """
     W = Y.swapaxes(1, 2)
     Q = rotation_from_camera(rigid_rotations(W).swapaxes(1, 2))
+    if rng is not None:
+        Q = _rotation(RESTART_ANGLE * rng.standard_normal((len(Y), 3))) @ Q
     mean = rigid_shape(W, Q[:, :2])
     residual = Y - Q[:, :2] @ mean.T
     lifted = (Q[:, :2].swapaxes(1, 2) @ residual).reshape(len(Y), -1)

@@ -147,3 +147,33 @@ def test_mirror_test_turns_frames_that_are_mirrored_and_no_others(deforming: See
 def test_the_likelier_run_counts(deforming: Seen) -> None:
     S = em_ppca_by_likelihood(deforming.points, MODES, iterations=60)
     assert shape_errors(S, deforming.shapes).unscaled < 0.01
+
+
+def test_a_restart_counts_if_it_is_likelier(
+    deforming: Seen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = em_module._start
+
+    def badly_first(
+        Y: np.ndarray, K: int, rng: np.random.Generator | None = None
+    ) -> em_module.LinearModel:
+        model = start(Y, K)
+        # Without a generator, the cameras of other frames.
+        return model if rng is not None else replace(model, Q=model.Q[::-1])
+
+    monkeypatch.setattr(em_module, "_start", badly_first)
+    errors = [
+        shape_errors(
+            em_ppca_by_likelihood(deforming.points, MODES, iterations=3, starts=starts),
+            deforming.shapes,
+        ).shape
+        for starts in (1, 2)
+    ]
+    assert errors[1] < 0.05 < errors[0]
+
+
+def test_a_restart_disturbs_the_cameras(deforming: Seen) -> None:
+    Y = deforming.points.swapaxes(1, 2)
+    first, again = (em_module._start(Y, MODES, rng) for rng in (None, np.random.default_rng(0)))
+    cosine = (np.trace(first.Q @ again.Q.swapaxes(1, 2), axis1=1, axis2=2) - 1) / 2
+    assert 0.3 < np.arccos(np.clip(cosine, -1, 1)).mean() < 1.3

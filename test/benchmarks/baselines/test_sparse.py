@@ -4,7 +4,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.baselines.sparse import Effort, Factors, factorise, recover, sparse
+from benchmarks.baselines.sparse import (
+    Effort,
+    Factors,
+    _block_focuss,
+    factorise,
+    recover,
+    sparse,
+)
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 
@@ -54,12 +61,29 @@ def test_factorisation_finds_the_blocks(problem: Problem) -> None:
     assert np.linalg.norm(found.images() - problem.points) < 1e-2
 
 
-@pytest.mark.parametrize("repaired", [True, False])
+@pytest.mark.parametrize(
+    ("repaired", "focuss"), [(True, False), (False, False), (False, True), (True, True)]
+)
 def test_whole_method_is_exact_on_the_problem_that_it_is_made_for(
-    problem: Problem, repaired: bool
+    problem: Problem, repaired: bool, focuss: bool
 ) -> None:
-    S = sparse(problem.points, K, ACTIVE, repaired=repaired, effort=Effort(admm=300, ksvd=40))
+    effort = Effort(admm=300, ksvd=20 if focuss else 40)
+    S = sparse(problem.points, K, ACTIVE, repaired=repaired, focuss=focuss, effort=effort)
     assert shape_errors(S, problem.shapes).shape < 0.01
+
+
+def test_focuss_finds_codes_that_exist_and_leaves_no_more_blocks_than_asked(
+    problem: Problem,
+) -> None:
+    rng = np.random.default_rng(0)
+    Y = problem.points.transpose(1, 0, 2).reshape(POINTS, -1)
+    D = np.linalg.qr(problem.atoms)[0].transpose(1, 0, 2)
+    start = rng.standard_normal((K, 3, FRAMES, 2))
+    for active in (ACTIVE, 1):
+        X = _block_focuss(Y, D, active, start, ridge=1e-9)
+        assert ((X != 0).any((1, 3)).sum(0) == active).all()
+        left = np.linalg.norm(Y - D.reshape(POINTS, -1) @ X.reshape(3 * K, -1))
+        assert (left < 1e-3 * np.linalg.norm(Y)) == (active == ACTIVE)
 
 
 def test_repair_bears_noise_that_two_random_frames_do_not(problem: Problem) -> None:
