@@ -2,8 +2,10 @@
 """Show the angle of each person's left elbow, live: ros2 run deep_nrsfm_ros lifter, then this."""
 
 import math
+from contextlib import suppress
 
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -18,4 +20,5 @@ def show(message: JointState) -> None:
 rclpy.init()
 node = Node("elbow_angle")
 node.create_subscription(JointState, "lifter/joint_states", show, 10)
-rclpy.spin(node)
+with suppress(KeyboardInterrupt, ExternalShutdownException):
+    rclpy.spin(node)

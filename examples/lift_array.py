@@ -13,8 +13,5 @@ lifter = Lifter(load_model("human"), layout="body25b")
 lifted = lifter(points, confidence)
 
 np.savez("lifted.npz", shapes=lifted.shapes, confidence=lifted.confidence)
-print(
-    f"{len(lifted.shapes)} frames of {lifted.shapes.shape[1]} keypoints, mean confidence ", end=""
-)
 frames, keypoints, _ = lifted.shapes.shape
 print(f"{frames} frames of {keypoints} keypoints, mean confidence {lifted.confidence.mean():.2f}")

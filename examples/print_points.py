@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print where the nose of each lifted person is: a subscriber to copy."""
 
+from contextlib import suppress
+
 import numpy as np
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2
 
-NOSE = 14  # of human17, the layout of the model human
+from deep_nrsfm_ros import load_model
+
+NOSE = load_model("human").layout.keypoints.index("nose")
 
 
 def show(message: PointCloud2) -> None:
@@ -20,4 +25,5 @@ def show(message: PointCloud2) -> None:
 rclpy.init()
 node = Node("reader")
 node.create_subscription(PointCloud2, "lifter/points", show, qos_profile_sensor_data)
-rclpy.spin(node)
+with suppress(KeyboardInterrupt, ExternalShutdownException):
+    rclpy.spin(node)

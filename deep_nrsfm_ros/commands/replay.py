@@ -213,7 +213,7 @@ def watch(args: argparse.Namespace, model: Model, layout: KeypointLayout | None)
 
         rclpy.init()
         try:
-            topic = args.topic or "/keypoints"
+            topic = override(ReadOptions(), args).topic
             layouts = (source, model.layout)
             limits = (inputs.min_confidence, inputs.image_size)
             topics = LifterTopics(lifter, topic, *layouts, *limits)

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
@@ -80,7 +80,7 @@ class LifterTopics:
 
     Attributes:
         lifter: name of the node.
-        keypoints: topic of the keypoints.
+        keypoints: topic of the keypoints; "" = the one that the lifter receives.
         source: layout of the keypoints.
         target: layout of the lifted points.
         min_confidence: in [0, 1]; a keypoint with less is missing.
@@ -120,8 +120,9 @@ class LifterClient(Node):
         # By stamp; 0 for messages without a header.
         self._observations: OrderedDict[int, Observation] = OrderedDict()
         self._waiting: LiftedMessage | None = None
-        self._keypoints = self.resolve_topic_name(topics.keypoints)
+        self._keypoints = topics.keypoints and self.resolve_topic_name(topics.keypoints)
         lifter = topics.lifter.rstrip("/")
+        self._lifter = self.resolve_topic_name(lifter)  # a node's full name follows the same rules
         self.create_subscription(PointCloud2, f"{lifter}/points", self._receive_points, 10)
         self.create_subscription(
             QuaternionStamped, f"{lifter}/camera_rotation", self._receive_rotation, 10
@@ -130,13 +131,23 @@ class LifterClient(Node):
 
     def _find_keypoints(self) -> None:
         """Subscribe to the keypoints once they are published with a type that can be read."""
-        for name, types in self.get_topic_names_and_types():
+        for name, types in self._received_topics():
             for kind in (kind.replace("/msg/", "/") for kind in types):
-                if name == self._keypoints and kind in INPUT_TYPES:
+                if self._keypoints in ("", name) and kind in INPUT_TYPES:
                     self.create_subscription(message_class(kind), name, self._receiver(kind), _QOS)
                     self.get_logger().info(f"subscribed to {name} ({kind})")
                     self._search.cancel()
                     return
+
+    def _received_topics(self) -> list[tuple[str, list[str]]]:
+        """Return names and types of the topics among which the keypoints are."""
+        if self._keypoints:
+            return self.get_topic_names_and_types()
+        namespace, _, name = self._lifter.rpartition("/")
+        try:
+            return self.get_subscriber_names_and_types_by_node(name, namespace or "/")
+        except NodeNameNonExistentError:  # not discovered yet
+            return []
 
     def _receiver(self, kind: str) -> Callable[[Any], None]:
         """Return the callback that keeps the observation of a message of type `kind`."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
 import time
@@ -29,7 +31,7 @@ def test_arrays_are_lifted(tmp_path: Path) -> None:
 
 
 def test_examples_are_short() -> None:
-    for name in ("lift_array", "publish_keypoints", "print_points"):
+    for name in ("lift_array", "publish_keypoints", "print_points", "elbow_angle"):
         lines = (EXAMPLES / f"{name}.py").read_text("utf-8").splitlines()
         assert len([line for line in lines if line.strip()]) <= 32
 
@@ -50,20 +52,29 @@ def test_a_published_person_is_printed(tmp_path: Path) -> None:
         "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
     }
     commands = (
-        ["-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-p", "keypoint_layout:=coco17"],
+        ["-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-p", "keypoint_layout:=body25b"],
         [str(EXAMPLES / "publish_keypoints.py")],
         [str(EXAMPLES / "print_points.py")],
     )
+    logs = [tmp_path / f"{number}.log" for number in range(len(commands))]
     running = []
-    for number, words in enumerate(commands):
-        with (tmp_path / f"{number}.log").open("w") as log:
-            running.append(subprocess.Popen([sys.executable, *words], env=live, stdout=log))
+    for words, path in zip(commands, logs, strict=True):
+        with path.open("w") as log:
+            command = [sys.executable, *words]
+            running.append(subprocess.Popen(command, env=live, stdout=log, stderr=log))
     try:
         deadline = time.monotonic() + 150
-        while "confidence" not in (tmp_path / "2.log").read_text():
+        while "confidence" not in logs[2].read_text():
             assert time.monotonic() < deadline and all(p.poll() is None for p in running)
             time.sleep(0.2)
+        for process in running:
+            process.send_signal(signal.SIGINT)
+        assert [process.wait(30) for process in running] == [0, 0, 0]
     finally:
         for process in running:
             process.kill()
             process.wait()
+    assert not any("Traceback" in path.read_text() for path in logs)
+    x, y, z, confidence = re.findall(r"-?\d+\.\d+", logs[2].read_text().splitlines()[0])
+    assert np.linalg.norm(np.array([x, y, z], float)) < 2  # metres from the middle of the person
+    assert float(confidence) > 0.3
