@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.baselines.batches import add_total, true_shapes
 from benchmarks.baselines.methods import block_matrix, em_ppca, rigid
-from benchmarks.data.mat_files import read_sequence
+from benchmarks.data import mat_files
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, figures
@@ -42,6 +44,14 @@ PAPER = {
     "pickup": {"Simple (Dai et al.)": 0.1731, "Simple, weighted (Kumar)": 0.0198},
 }
 AGREED = "factorisations that agree (no truth used)"
+WITHOUT_RANK: dict[str, Any] = {
+    AGREED: lambda W: consensus(W).shapes,
+    "rigid factorisation (Tomasi-Kanade)": rigid,
+}
+_SPENT = {
+    "CPU min": "CPU time on this machine of the training, or of the method with all K",
+    "ms": "CPU time of a frame in ms, for one K",
+}
 _SHOWN = ("shape %", "proper %", "mirrored %")
 ERRORS = {
     "e3D": "mean distance of points over the mean standard deviation of the true coordinates "
@@ -83,25 +93,40 @@ def lift_in_object_axes(model: Model, dataset: Dataset, options: LiftingOptions)
     return np.nan_to_num(lifted.scale[:, None, None] * lifted.shapes @ lifted.rotations)
 
 
-def best_rank(name: str, dataset: Dataset) -> tuple[int, Floats]:
-    """Return the rank of a baseline with the lowest error against the truth, and its shapes."""
-    solved = ((K, BASELINES[name](dataset.points, K)) for K in tqdm(RANKS, name, leave=False))
-    return min(solved, key=lambda errors: shape_errors(errors[1], _truth(dataset)).shape)
+def factorised(
+    session: Session, name: str, sequence: mat_files.Sequence
+) -> tuple[str, dict[str, float]]:
+    """Return label and figures of a classic method, kept in the output folder.
+
+    Of its ranks the one with the lowest error against the truth.
+    """
+    W, ranks = sequence.dataset.points, RANKS if name in BASELINES else (0,)
+
+    def solve() -> tuple[int, dict[str, float]]:
+        began = time.process_time()
+        found = {}
+        for K in tqdm(ranks, name, leave=False):
+            S = BASELINES[name](W, K) if K else WITHOUT_RANK[name](W)
+            found[K] = errors_of(S, sequence)
+        spent = time.process_time() - began
+        best = min(found, key=lambda K: found[K]["shape %"])
+        times = {"CPU min": spent / 60, "ms": 1000 * spent / len(ranks) / len(W)}
+        return best, found[best] | times
+
+    K, row = session.kept(f"{name} {ranks}", W.tobytes(), solve)
+    return (f"{name}, K = {K}" if K else name), row
 
 
-def reconstructions(
-    session: Session, name: str, dataset: Dataset
-) -> Iterator[tuple[str, int | None, Floats]]:
-    """Yield method, seed and shapes in object axes (f, p, 3) for all methods."""
-    for seed in session.seeds:
-        model = session.trained(f"{name} seed {seed}", dataset, session.preset("default", seed))
-        for lifting, options in LIFTING.items():
-            yield f"default recipe, {lifting}", seed, lift_in_object_axes(model, dataset, options)
-    yield AGREED, None, consensus(dataset.points).shapes
-    yield "rigid factorisation (Tomasi-Kanade)", None, rigid(dataset.points)
-    for baseline in BASELINES:
-        rank, S = best_rank(baseline, dataset)
-        yield f"{baseline}, K = {rank}", None, S
+def errors_of(S: Floats, sequence: mat_files.Sequence) -> dict[str, float]:
+    """Return the errors of shapes (f, p, 3) in object axes."""
+    truth = true_shapes(sequence.dataset)
+    shown = figures(shape_errors(S, truth))
+    placed = in_camera_axes(S, sequence.dataset.points) if sequence.in_camera_axes else S
+    return {
+        "e3D": normalised_error(placed, truth),
+        "e3D by frame": normalised_error(S, truth, by_frame=True),
+        **{figure: shown[figure] for figure in _SHOWN},
+    }
 
 
 def benchmark(session: Session) -> Table:
@@ -111,32 +136,32 @@ def benchmark(session: Session) -> Table:
         "classic_sequences",
         "Classic sequences, in-sample",
         ("sequence", "frames", "method"),
-        (*ERRORS, *_SHOWN),
-        ERRORS | errors | _LEGEND | LIFTING_LEGEND,
+        (*ERRORS, *_SHOWN, *_SPENT),
+        ERRORS | errors | _SPENT | _LEGEND | LIFTING_LEGEND,
         bars(*ERRORS),
     )
+    table.digits |= {"e3D": 3, "e3D by frame": 3}
     for name in session.subjects:
-        sequence = read_sequence(session.data / "nrsfm" / f"{name}.mat")
+        sequence = mat_files.read_sequence(session.data / "nrsfm" / f"{name}.mat")
         dataset = sequence.dataset[slice(None, None, session.stride)]
-        truth = _truth(dataset)
+        sequence = sequence._replace(dataset=dataset)
+        labels = name, str(len(dataset))
         for method, printed in PAPER.get(name, {}).items():
-            table.add((name, str(len(dataset)), f"paper: {method}"), {"e3D": printed})
-        for method, seed, S in reconstructions(session, name, dataset):
-            shown = figures(shape_errors(S, truth))
-            placed = in_camera_axes(S, dataset.points) if sequence.in_camera_axes else S
-            row = {
-                "e3D": normalised_error(placed, truth),
-                "e3D by frame": normalised_error(S, truth, by_frame=True),
-                **{figure: shown[figure] for figure in _SHOWN},
-            }
-            table.add((name, str(len(dataset)), method), row, seed)
+            table.add((*labels, f"paper: {method}"), {"e3D": printed})
+        for seed in session.seeds:
+            title, preset = f"{name} seed {seed}", session.preset("default", seed)
+            model = session.trained(title, dataset, preset)
+            for lifting, options in LIFTING.items():
+                S = lift_in_object_axes(model, dataset, options)
+                minutes = {"CPU min": model.provenance["cpu_seconds"] / 60}
+                row = errors_of(S, sequence) | minutes
+                table.add((*labels, f"default recipe, {lifting}"), row, seed)
+        for method in (*WITHOUT_RANK, *BASELINES):
+            if session.baselines is None or any(word in method for word in session.baselines):
+                label, row = factorised(session, method, sequence)
+                table.add((*labels, label), row)
+    add_total(table)
     return table
-
-
-def _truth(dataset: Dataset) -> Floats:
-    if dataset.shapes is None:
-        raise ValueError(f"{dataset.source} has no ground truth to compare with")
-    return dataset.shapes
 
 
 def main(argv: Sequence[str] | None = None) -> None:
