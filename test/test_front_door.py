@@ -14,7 +14,7 @@ import pytest
 import deep_nrsfm_ros
 from deep_nrsfm_ros import KeypointLayout, Lifted, Lifter, Model, Recipe, load_model, train
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
-from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
 from deep_nrsfm_ros.model_files.model_file import ModelFileError, save_model
 
 ROOT = Path(__file__).parents[1]
@@ -64,31 +64,31 @@ def test_the_lines_of_the_readme_run() -> None:
 
 
 def test_one_object_and_many_in_any_dtype(human: Model) -> None:
-    lifter, points = Lifter(human), pixels(100, 17)
+    lifter, points = Lifter(human), pixels(100, 25)
     many = lifter(points)
-    assert many.shapes.shape == (100, 17, 3) and np.isfinite(many.shapes).all()
+    assert many.shapes.shape == (100, 25, 3) and np.isfinite(many.shapes).all()
     same(lifter(points.astype(np.float32)), many)
-    same(lifter(points.tolist(), np.ones((100, 17), bool)), many)
+    same(lifter(points.tolist(), np.ones((100, 25), bool)), many)
     np.testing.assert_allclose(lifter(points[3]).shapes[0], many.shapes[3], atol=1e-4)
-    assert lifter(points[3], np.ones(17)).rotations.shape == (1, 3, 3)
-    assert lifter(np.zeros((0, 17, 2))).shapes.shape == (0, 17, 3)
+    assert lifter(points[3], np.ones(25)).rotations.shape == (1, 3, 3)
+    assert lifter(np.zeros((0, 25, 2))).shapes.shape == (0, 25, 3)
 
 
 def test_missing_keypoints_are_missing_however_they_are_marked(human: Model) -> None:
-    points, confidence = pixels(5, 17), np.ones((5, 17))
+    points, confidence = pixels(5, 25), np.ones((5, 25))
     confidence[:, 3] = 0
     expected = Lifter(human)(points, confidence)
     for mark in (np.nan, 0.0, np.inf):
         points[:, 3] = mark
         same(Lifter(human)(points), expected)
-        same(Lifter(human)(points.astype(np.float32), np.ones((5, 17), np.float32)), expected)
+        same(Lifter(human)(points.astype(np.float32), np.ones((5, 25), np.float32)), expected)
     confidence[:, 3] = np.nan
     same(Lifter(human)(points, confidence), expected)
 
 
 def test_a_detectors_layout_is_mapped_by_name(human: Model) -> None:
     points = pixels(4, 17)
-    mapped = KeypointMap(COCO17, HUMAN17)(points.astype(np.float32), np.ones((4, 17), np.float32))
+    mapped = KeypointMap(COCO17, HUMAN25)(points.astype(np.float32), np.ones((4, 17), np.float32))
     expected = Lifter(human).lift(*mapped)
     same(Lifter(human, layout="coco17")(points), expected)
     same(Lifter(human, layout=COCO17)(points), expected)
@@ -99,12 +99,12 @@ def test_a_detectors_layout_is_mapped_by_name(human: Model) -> None:
 @pytest.mark.parametrize(
     ("points", "confidence", "complaint"),
     [
-        (np.ones((2, 16, 2)), None, r"'human17' needs numbers of shape \(n, 17, 2\) or \(17, 2\)"),
-        (np.ones((2, 17, 3)), None, r"points are \(2, 17, 3\)"),
-        (np.ones(17), None, r"points are \(17,\)"),
-        (np.full((17, 2), "x"), None, "needs numbers"),
-        (np.ones((2, 17, 2)), np.ones(17), r"confidence is \(17,\) .* need .* \(2, 17\)"),
-        (np.ones((17, 2)), np.ones((1, 17)), r"confidence is \(1, 17\)"),
+        (np.ones((2, 24, 2)), None, r"'human25' needs numbers of shape \(n, 25, 2\) or \(25, 2\)"),
+        (np.ones((2, 25, 3)), None, r"points are \(2, 25, 3\)"),
+        (np.ones(25), None, r"points are \(25,\)"),
+        (np.full((25, 2), "x"), None, "needs numbers"),
+        (np.ones((2, 25, 2)), np.ones(25), r"confidence is \(25,\) .* need .* \(2, 25\)"),
+        (np.ones((25, 2)), np.ones((1, 25)), r"confidence is \(1, 25\)"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(
@@ -152,11 +152,11 @@ def test_an_array_becomes_a_model_that_lifts() -> None:
 def test_a_model_of_people_is_judged_beside_the_one_at_hand(human: Model) -> None:
     rng = np.random.default_rng(0)
     rotations = np.linalg.qr(rng.standard_normal((220, 3, 3)))[0]
-    shapes = rng.standard_normal((17, 3)) + 0.1 * rng.standard_normal((220, 17, 3))
+    shapes = rng.standard_normal((25, 3)) + 0.1 * rng.standard_normal((220, 25, 3))
     points = 100 * (shapes @ rotations)[..., :2] + 300  # no person
     recipe = Recipe(steps=1, learning_rate=0.1, batch=4)
     with pytest.warns(UserWarning, match="the new model is doubtful: .* would help"):
-        model = train(points, layout=HUMAN17, recipe=recipe)
+        model = train(points, layout=HUMAN25, recipe=recipe)
     judgement = model.provenance["judgement"]
     assert judgement["rival"] == "human" and model.provenance["from"]["model"] == "human"
     assert judgement["doubtful"] and "would help" in judgement["reason"]

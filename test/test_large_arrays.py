@@ -119,8 +119,8 @@ def test_memory_for_each_person_is_bounded(tmp_path: Path, monkeypatch: pytest.M
         for n in (few, few, many)  # the first one loads modules
     ]
     growth = (peaks[2] - peaks[1]) / (many - few)
-    # 850 here, of which 204 are the keypoints; with a copy of them all, or of the shapes, 1900.
-    assert growth < 1200, f"{growth:.0f} bytes a person"
+    # 1214 here, of which 204 are the keypoints; a copy of all shapes adds 300.
+    assert growth < 1450, f"{growth:.0f} bytes a person"
 
 
 def test_an_interrupted_file_leaves_the_old_one(

@@ -34,7 +34,7 @@ from deep_nrsfm_ros.data.pose2sim import JOINTS, read_session
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import read_layout
-from deep_nrsfm_ros.layouts.presets import BODY25B, HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25B, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
@@ -58,7 +58,7 @@ ORDER = "order of the judge"
 EXCAVATOR = Path(__file__).parents[2] / "config/layouts/excavator.yaml"
 _EXCAVATOR_FRAMES = 1500
 _MARGIN = 0.05  # by which an error must differ for a decision to count as wrong
-_LIMBS = [HUMAN17.index(joint) for joint in JOINTS]
+_LIMBS = [HUMAN25.index(joint) for joint in JOINTS]
 _HELP = LayoutLossWeights(bone_length_weight=3.0, handedness_weight=1.0, depth_penalty=0.1)
 
 
@@ -112,13 +112,13 @@ def clip(data: Path) -> Scene:
     points = np.concatenate([view.points for view in views])
     confidence = np.concatenate([view.confidence for view in views])
     truth = np.concatenate([view.truth for view in views])
-    points, confidence = KeypointMap(BODY25B, HUMAN17)(points, confidence)
-    return _curated(HUMAN17, points, confidence > 0.1, truth, _LIMBS)
+    points, confidence = KeypointMap(BODY25B, HUMAN25)(points, confidence)
+    return _curated(HUMAN25, points, confidence > 0.1, truth, _LIMBS)
 
 
 def _mocap(subject: str, most: int, yaw: float, data: Path) -> Scene:
     """Return a subject before simulated cameras that stand within `yaw` degrees of the front."""
-    shapes = read_shapes(trials(data / "cmu", subject), HUMAN17)
+    shapes = read_shapes(trials(data / "cmu", subject), HUMAN25)
     seen = simulate_camera(shapes, np.random.default_rng(1))
     left, right = (seen.truth[:, JOINTS.index(f"{side}_shoulder")] for side in ("left", "right"))
     across = left - right
@@ -126,7 +126,7 @@ def _mocap(subject: str, most: int, yaw: float, data: Path) -> Scene:
     chosen = np.flatnonzero(facing)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(most, len(chosen))).astype(int)]
     visible = seen.confidence[chosen] > 0
-    return _curated(HUMAN17, seen.points[chosen], visible, seen.truth[chosen], _LIMBS)
+    return _curated(HUMAN25, seen.points[chosen], visible, seen.truth[chosen], _LIMBS)
 
 
 def _excavator(span: float, data: Path) -> Scene:

@@ -2,7 +2,7 @@
 """Figures for the choice of a model of people, without the pose2sim clip.
 
 Proportions of detectors' joints and of motion capture, and errors of models on both. The model
-`human` was chosen by them; `benchmarks.real.mediapipe_comparison` tests it on the clip.
+`human17` was chosen by them; `benchmarks.real.mediapipe_comparison` tests it on the clip.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip", "nose")
 _CMU_TRUNK = ("lclavicle", "rclavicle", "lhipjoint", "rhipjoint")
 LEGEND = f"""hips, shoulders: distance of left and right in torso lengths, 90th percentile over the
     frames; nose: its height above the neck along the torso, median; CMU: the first trials of the
-    nine subjects that `human` was trained on
+    nine subjects that `human17` was trained on
 residual: of the network on the video's detections, relative, median; no label is needed
 the others: CMU {" and ".join(HELD_OUT)}, not used in training, in front of a perspective
     camera 3 to 5 m away that looks down by 12 +- 10 degrees and rolls by 8, {NOISE:.0%} noise,
@@ -175,7 +175,7 @@ def benchmark(lifters: Mapping[str, Lifter], data: Path) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("models", nargs="*", default=["human"], help="models of `human17`")
+    parser.add_argument("models", nargs="*", default=["human17"], help="models of `human17`")
     parser.add_argument("--data", type=Path, required=True, help="holds cmu/ and detections/")
     add_arguments(parser, LiftingOptions)
     args = parser.parse_args(argv)

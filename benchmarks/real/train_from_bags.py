@@ -35,7 +35,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.openpose import read_people
 from deep_nrsfm_ros.data.read_options import ReadOptions
-from deep_nrsfm_ros.layouts.presets import BODY25, CMU31, HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25, CMU31, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.model_files.find_layout import find_layout
@@ -118,7 +118,7 @@ def video(session: Session) -> Table:
     """Train on the detections of a real video, with and without the shipped model's knowledge."""
     bag = session.bag("video_bag", partial(_people, session.data / VIDEO))
     arguments = ("--bag", str(bag), "--keypoint-layout", BODY25.name)
-    alone = (*arguments, "--object", HUMAN17.name, "--from", "none")
+    alone = (*arguments, "--object", HUMAN25.name, "--from", "none")
     shipped = load_model(find_model("human", model_folders(session.models)))
     models = {
         "this video alone": session.trained("video", "video", *alone),
@@ -129,7 +129,7 @@ def video(session: Session) -> Table:
         "human, fine-tuned": session.trained("tuned", "tuned", *arguments, "--from", "human"),
         "human": shipped,
     }
-    dataset = read_bags([bag], BODY25, HUMAN17, ReadOptions(TOPIC, min_confidence=0.1)).dataset
+    dataset = read_bags([bag], BODY25, HUMAN25, ReadOptions(TOPIC, min_confidence=0.1)).dataset
     lifted = {
         name: lift_all(Lifter(model).lift, dataset.points, dataset.visible.astype(np.float32))
         for name, model in models.items()

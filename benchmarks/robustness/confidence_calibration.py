@@ -24,7 +24,7 @@ from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.pose2sim import JOINTS, WHEEL, read_session
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, COCO17, HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, COCO17
 from deep_nrsfm_ros.lifting.confidence import (
     CALIBRATED,
     CORRECT_DISTANCE,
@@ -49,7 +49,7 @@ Lift = Callable[[Float32, Float32], Lifted]
 
 SUBJECTS = ("131", "03")
 """The calibration is fitted to the first, tested on the others; none was used in training."""
-MODELS = ("human", "cmu31")
+MODELS = ("human", "human17", "cmu31")
 STRIDE = 8
 SCENE_STRIDE = 30  # of humaneva's 60 frames a second
 NOISE = (0.0, 0.02, 0.05, 0.1, 0.2)
@@ -67,7 +67,7 @@ _LOWER = {
     "at the waist": ("root", "hip", "hipjoint"),
     "at the hips": ("knee", "femur"),
     "at the knees": ("ankle", "tibia"),
-    "at the ankles": ("toe", "toes", "foot"),
+    "at the ankles": ("toe", "toes", "heel", "foot"),
 }
 CUTS = (GAPS, *_LOWER, ONE_SIDE)
 """Cuts of which the table tells."""
@@ -169,10 +169,10 @@ def benchmark(session: Session) -> Table:
         lifter = Lifter(model)
         for subject in others:
             _add(table, model, f"CMU {subject}", on_mocap(session, lifter, subject))
-            if model.layout.name == HUMAN17.name:
+            if _of_people(model.layout):
                 as_coco = on_mocap(session, lifter, subject, COCO17)
                 _add(table, model, f"CMU {subject} as coco17", as_coco)
-        if model.layout.name == HUMAN17.name:
+        if _of_people(model.layout):
             for name, detections in scenes(lifter, session.data / "scenes"):
                 _add(table, model, name, on_detections(detections, model.layout))
     return table
@@ -184,7 +184,7 @@ def fit_shipped(session: Session) -> Calibration:
     parts: list[tuple[Floats, Predictions]] = []
     for model in _models():
         lifter = RecordingLifter(model)
-        detectors = (None, COCO17) if model.layout.name == HUMAN17.name else (None,)
+        detectors = (None, COCO17) if _of_people(model.layout) else (None,)
         for detector in detectors:
             views = mocap_views(session, lifter, session.subjects[0], FITTED_CUTS, detector)
             for _, detections in views:
@@ -198,11 +198,16 @@ def _models() -> list[Model]:
     return [load_model(find_model(name, folders)) for name in MODELS]
 
 
+def _of_people(layout: KeypointLayout) -> bool:
+    """Return whether a layout has the joints that detectors of people share."""
+    return set(JOINTS) <= set(layout.keypoints)
+
+
 def hidden(layout: KeypointLayout, cut: str) -> list[Mask]:
     """Return masks (p,) of the points that a cut hides; each frame takes one of them.
 
     Args:
-        layout: HUMAN17 or CMU31.
+        layout: of people.
         cut: any of `FITTED_CUTS` but the random ones.
     """
     names = layout.keypoints

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import Session, run_program
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
+from deep_nrsfm_ros.data.mocap import human25, read_amc, read_asf, trials
 from deep_nrsfm_ros.data.openpose import largest, read_people
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, WHEEL, read_session
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
-from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
@@ -92,7 +92,7 @@ def clips(session: Session) -> dict[str, Clip]:
         )
     wheel, video = CACHE / WHEEL, session.data / VIDEO
     if wheel.exists():
-        to_model = KeypointMap(BODY25B, HUMAN17)
+        to_model = KeypointMap(BODY25B, HUMAN25)
         for view in read_session(wheel).views:
             clip = Clip(*to_model(view.points, view.confidence), RATE, view.truth)
             result[f"pose2sim {view.camera.name}, {RATE:.0f} Hz"] = clip
@@ -104,21 +104,21 @@ def clips(session: Session) -> dict[str, Clip]:
 
 
 def walking_motion(session: Session, subject: str) -> Floats:
-    """Return the first trial of a subject (f, 17, 3) in mm, seen from 20 degrees above."""
+    """Return the first trial of a subject (f, 25, 3) in mm, seen from 20 degrees above."""
     folder = session.data / "cmu"
     skeleton = read_asf(folder / subject / f"{subject}.asf")
-    S = 1000 * human17(read_amc(trials(folder, subject)[0], skeleton))[:LENGTH]
+    S = 1000 * human25(read_amc(trials(folder, subject)[0], skeleton))[:LENGTH]
     S = centre(S.astype(float)) * [1, -1, -1]  # y down, z away
     c, s = np.cos(np.radians(20)), np.sin(np.radians(20))
     return np.asarray(S @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]]))
 
 
 def simulate_clip(S: Floats, rate: float, noise: float = NOISE) -> Clip:
-    """Return the simulated detections of a motion S (f, 17, 3)."""
+    """Return the simulated detections of a motion S (f, 25, 3)."""
     rng = np.random.default_rng(0)
     size = np.sqrt((S * S).sum(2).mean())
     W = S[..., :2] + noise * size * rng.standard_normal((*S.shape[:2], 2)) / np.sqrt(2)
-    limbs = [HUMAN17.index(joint) for joint in JOINTS]
+    limbs = [HUMAN25.index(joint) for joint in JOINTS]
     return Clip(
         W.astype(np.float32), np.ones(S.shape[:2], np.float32), rate, S[:, limbs], noise > 0
     )
@@ -134,7 +134,7 @@ def video_clip(video: Path) -> Clip:
             if i is not None:
                 points.append(people.points[i])
                 confidence.append(people.confidence[i])
-    to_model = KeypointMap(BODY25, HUMAN17)
+    to_model = KeypointMap(BODY25, HUMAN25)
     return Clip(*to_model(np.array(points), np.array(confidence)), VIDEO_RATE)
 
 
@@ -166,8 +166,8 @@ def figures(lifted: Lifted, smoothed_frames: Lifted, clip: Clip) -> dict[str, fl
 
 
 def errors(shapes: Floats, truth: Floats) -> Mapping[str, float]:
-    """Return the errors of shapes (f, 17, 3) against the truth (f, 12, 3) in mm."""
-    limbs = [HUMAN17.index(joint) for joint in JOINTS]
+    """Return the errors of shapes (f, 25, 3) against the truth (f, 12, 3) in mm."""
+    limbs = [HUMAN25.index(joint) for joint in JOINTS]
     valid = np.isfinite(truth).all((1, 2)) & np.isfinite(shapes).all((1, 2))
     S, T = centre(shapes[valid][:, limbs].astype(float)), centre(truth[valid])
     scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))

@@ -30,7 +30,7 @@ from benchmarks.speed.timing import (
     speed_parser,
 )
 from benchmarks.table import Table, bars
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.node import lifter
 from deep_nrsfm_ros.node.bodies import BodyPublishers
 
@@ -104,7 +104,7 @@ class Lifter:
         k = [600.0, 0.0, 320.0, 0.0, 600.0, 240.0, 0.0, 0.0, 1.0]
         self.node._camera._receive(CameraInfo(k=k, d=[0.0] * 5, distortion_model="plumb_bob"))
         ((self._source, _),) = self.node._keypoint_topics._subscribed.values()
-        self._raw = serialised_keypoints(PEOPLE, len(HUMAN17))
+        self._raw = serialised_keypoints(PEOPLE, len(HUMAN25))
         self._number = 30
 
     def lift(self, calls: int) -> float:

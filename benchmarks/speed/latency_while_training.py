@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.speed.timing import random_domain
 from deep_nrsfm_ros.commands.demo.client import Client, DemoError, Played, lifter
 from deep_nrsfm_ros.data.bags import frames, write_bag
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training.job import ENDED
 
@@ -27,7 +27,7 @@ PERCENTILES = (50.0, 99.0)
 def write_keypoints(bag: Path, rate: float, seconds: float) -> None:
     """Write keypoints of a randomly deforming object; the values do not change the time."""
     rng = np.random.default_rng(0)
-    f, p = round(rate * seconds), len(HUMAN17)
+    f, p = round(rate * seconds), len(HUMAN25)
     shapes = centre(rng.standard_normal((p, 3)) + 0.3 * rng.standard_normal((f, p, 3)))
     points = 100 * (shapes @ random_cameras(f, rng)) + [320, 240]
     write_bag(bag, "/keypoints", frames(points, np.ones((f, p)), rate, CAMERA))

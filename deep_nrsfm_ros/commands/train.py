@@ -88,7 +88,7 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         "--object",
         help="the model's layout: a preset, a layout file (.yaml), a model file, or 'numbered' "
-        "for points without names (default: that of --from, or human17)",
+        "for points without names (default: that of --from, or human25)",
     )
     result.add_argument("--name", help="name of the model (default: trained)")
     result.add_argument(

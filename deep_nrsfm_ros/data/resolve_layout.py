@@ -7,7 +7,13 @@ from typing import NamedTuple
 
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.layout_fit import LayoutFit, ambiguity, choose_layout, fit_layouts
+from deep_nrsfm_ros.lifting.layout_fit import (
+    LayoutFit,
+    ambiguity,
+    candidate_layouts,
+    choose_layout,
+    fit_layouts,
+)
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.model_files.model_file import Model
 
@@ -45,6 +51,8 @@ def resolve_layout(detections: Detections, model: Model) -> ResolvedLayout:
         rivals = ambiguity(detections.points, detections.confidence, model, fits, chosen)
         poor = "taken although no layout fits well; " * (chosen.residual >= POOR_RESIDUAL)
         return ResolvedLayout(chosen.layout, poor + _ranking(chosen, fits), rivals)
+    for layout in candidate_layouts(q, model):
+        return ResolvedLayout(layout, f"{q} keypoints; no object has enough of them to try it")
     if q == len(model.layout):
         return ResolvedLayout(model.layout, f"the order of the model, {q} keypoints")
     raise ValueError(

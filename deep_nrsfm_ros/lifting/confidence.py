@@ -77,8 +77,8 @@ class Calibration(NamedTuple):
 
 
 CALIBRATED = Calibration(
-    visible=Coefficients(-3.16, -1.24, -1.67, 0.67, -1.02, -1.62, 0.00),
-    missing=Coefficients(-1.51, -1.26, -1.18, 1.66, -0.57, -0.66, -5.55),
+    visible=Coefficients(-3.40, -1.34, -1.80, 0.80, -1.44, -1.76, 0.00),
+    missing=Coefficients(-0.30, -0.90, -1.21, 1.17, -0.87, -0.75, -6.31),
 )
 """Fitted to a subject that no model was trained on.
 

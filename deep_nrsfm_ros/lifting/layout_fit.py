@@ -8,7 +8,7 @@ reprojection error of a few objects shows the right one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -67,12 +67,37 @@ def fit_layouts(
         confidence = np.where((points == sentinel[0]).all(-1), np.float32(0), confidence)
     lifter = Lifter(model, _FAST_OPTIONS)
     fits = []
-    for layout in _candidates(confidence.shape[1], model, layouts):
+    for layout in candidate_layouts(confidence.shape[1], model, layouts):
         mapped = KeypointMap(layout, model.layout)(points, confidence)
         residual = lift_all(lifter.lift, *mapped).residual
         if not np.isnan(residual).all():
             fits.append(LayoutFit(layout, float(np.nanmedian(residual))))
     return sorted(fits, key=lambda fit: fit.residual)
+
+
+def candidate_layouts(
+    q: int, model: Model, layouts: Iterable[KeypointLayout] = ()
+) -> Iterator[KeypointLayout]:
+    """Yield the different layouts of q keypoints that map to enough of the model's.
+
+    Args:
+        q: keypoints of an object.
+        model: lifts them.
+        layouts: come first; the model's own and the presets follow.
+    """
+    seen: set[tuple[str, ...]] = set()
+    for layout in (*layouts, model.layout, *LAYOUTS.values()):
+        if len(layout) != q or layout.keypoints in seen:
+            continue
+        seen.add(layout.keypoints)
+        try:
+            mapping = KeypointMap(layout, model.layout)
+        except ValueError:  # it shares too few keypoints with the model
+            continue
+        ones = np.ones((1, q), np.float32)
+        _, mapped = mapping(np.ones((1, q, 2), np.float32), ones)
+        if (mapped > 0).sum() >= min(_MIN_MAPPED, len(model.layout) / 2):
+            yield layout
 
 
 def choose_layout(fits: list[LayoutFit], preferred: KeypointLayout) -> LayoutFit | None:
@@ -102,8 +127,8 @@ def ambiguity(
     """Return the finding that another layout may be meant as well as the chosen one.
 
     Another one may be meant if the chosen one does not fit clearly better, or if too few keypoints
-    are visible to try it. A layout that gives the model the same keypoints is no other one: coco17
-    and posetrack18_17 differ in the face only.
+    are visible to try it. A layout that gives the model the same keypoints, or some of them, is no
+    other one: posetrack18_17 is coco17 without the eyes.
 
     Args:
         points: as in `fit_layouts`.
@@ -113,11 +138,13 @@ def ambiguity(
         chosen: one of them.
     """
     visible = np.asarray((confidence > 0).any(0))
-    own = _mapped_places(chosen.layout, model, visible)
+    own = _sources(chosen.layout, model, visible)
     residuals = {fit.layout.keypoints: fit.residual for fit in fits}
     rivals = []
-    for layout in _candidates(confidence.shape[1], model, [fit.layout for fit in fits]):
-        if _mapped_places(layout, model, visible) == own:
+    for layout in candidate_layouts(confidence.shape[1], model, [fit.layout for fit in fits]):
+        sources = _sources(layout, model, visible)
+        taken = sources[:, 0] > 0
+        if (sources[taken] == own[taken]).all():
             continue
         residual = residuals.get(layout.keypoints)
         if residual is None:
@@ -133,13 +160,18 @@ def ambiguity(
     )
 
 
-def _mapped_places(layout: KeypointLayout, model: Model, visible: NDArray[np.bool_]) -> bytes:
-    """Return which visible keypoints of a layout become which keypoints of the model."""
-    q = len(layout)
-    numbers = np.arange(1, q + 1, dtype=np.float32)
+def _sources(
+    layout: KeypointLayout, model: Model, visible: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Return from which visible keypoint of a layout each keypoint of the model is taken, (p, 2).
+
+    Its number from 1 and the square of that, which tell pairs of the same middle apart: a keypoint
+    between two others has their means. 0 where it is missing.
+    """
+    numbers = np.arange(1, len(layout) + 1, dtype=np.float32)
     pairs = np.stack([numbers, numbers**2], -1)[None]
     mapped, confidence = KeypointMap(layout, model.layout)(pairs, visible[None].astype(np.float32))
-    return mapped.tobytes() + confidence.tobytes()
+    return np.where(confidence[0, :, None] > 0, mapped[0], np.float32(0))
 
 
 def better_layout(
@@ -167,25 +199,6 @@ def better_layout(
 def _is_clearly_better(fit: LayoutFit, residual: float) -> bool:
     """Return whether a fit is sound and clearly better than another residual."""
     return fit.residual < POOR_RESIDUAL and fit.residual < _CLEAR_RATIO * residual
-
-
-def _candidates(
-    q: int, model: Model, layouts: Iterable[KeypointLayout]
-) -> Iterable[KeypointLayout]:
-    """Yield the different layouts of q keypoints that map to enough of the model's."""
-    seen: set[tuple[str, ...]] = set()
-    for layout in (*layouts, model.layout, *LAYOUTS.values()):
-        if len(layout) != q or layout.keypoints in seen:
-            continue
-        seen.add(layout.keypoints)
-        try:
-            mapping = KeypointMap(layout, model.layout)
-        except ValueError:  # it shares too few keypoints with the model
-            continue
-        ones = np.ones((1, q), np.float32)
-        _, mapped = mapping(np.ones((1, q, 2), np.float32), ones)
-        if (mapped > 0).sum() >= min(_MIN_MAPPED, len(model.layout) / 2):
-            yield layout
 
 
 def _sample(confidence: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -75,7 +75,7 @@ class LiftingOptions:
         0.0,
         "length in the output of the layout's reference pair (of people: neck to mid-hip), or of "
         "the RMS radius if the layout has no pair; 0 = that of person_height, or the length in "
-        "metres from the model's layout, 0.5 of people (human17), or 1 if it has none",
+        "metres from the model's layout, 0.5 of people (human25), or 1 if it has none",
         low=0.0,
         high=1e6,
     )

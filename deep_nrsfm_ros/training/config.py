@@ -20,7 +20,7 @@ from typing import Any
 
 from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
@@ -102,7 +102,7 @@ class TrainingConfig:
     Attributes:
         data: where the frames come from.
         object: layout of the model, as `find_layout` takes it, or "numbered"; "" is the layout of
-            `start`, or human17.
+            `start`, or human25.
         start: model file to start from; "" starts from random weights.
         rival: model file that the new model is compared with, or ""; see `judge`.
         architecture, normaliser, recipe: the parts of a preset.
@@ -161,7 +161,7 @@ class TrainingConfig:
         config = base.with_options(values)
         if (has_base and not start) or not (config.data.bags or config.data.inputs):
             return dataclasses.replace(config, start="") if start else config
-        known = str(known_model(config.object or HUMAN17.name) or "")
+        known = str(known_model(config.object or HUMAN25.name) or "")
         config = dataclasses.replace(config, start="", rival=known)
         if known and not start and not network_options & values.keys():
             return config.with_start(Path(known))

@@ -87,7 +87,7 @@ def find_layouts(
                 f"leave out {names('keypoint_layout')}, or name an object"
             )
         return _NUMBERED_LAYOUT, _NUMBERED_LAYOUT
-    target = find_layout(names("object"), config.object or config.start or HUMAN17.name)
+    target = find_layout(names("object"), config.object or config.start or HUMAN25.name)
     named = config.data.keypoint_layout
     return find_layout(names("keypoint_layout"), named) if named else target, target
 

@@ -21,7 +21,7 @@ from deep_nrsfm_ros.commands.replay import live_layout, main
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.detections import Detections, stamps_at
 from deep_nrsfm_ros.data.lifted_bags import write_lifted_bag
-from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras
@@ -29,8 +29,8 @@ from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 
 @pytest.fixture
 def points() -> np.ndarray:
-    """Return (5, 17, 2) of something that a camera goes round."""
-    shape = np.random.default_rng(0).standard_normal((17, 3))
+    """Return (5, 25, 2) of something that a camera goes round."""
+    shape = np.random.default_rng(0).standard_normal((25, 3))
     views = 100 * shape @ random_cameras(5, np.random.default_rng(1)) + 400
     return views.astype(np.float32)
 
@@ -38,17 +38,17 @@ def points() -> np.ndarray:
 @pytest.fixture
 def keypoints(tmp_path: Path, points: np.ndarray) -> Path:
     """Return a bag of keypoints alone."""
-    write_bag(tmp_path / "keypoints", "/keypoints", frames(points, np.ones((5, 17)), 10))
+    write_bag(tmp_path / "keypoints", "/keypoints", frames(points, np.ones((5, 25)), 10))
     return tmp_path / "keypoints"
 
 
 @pytest.fixture
 def answered(tmp_path: Path, points: np.ndarray) -> Path:
     """Return a bag with answers that no model gives: every point at its place in the image."""
-    shapes = np.concatenate([points, np.zeros((5, 17, 1))], -1).astype(np.float32) / 1000
+    shapes = np.concatenate([points, np.zeros((5, 25, 1))], -1).astype(np.float32) / 1000
     ones, places = np.ones(5, np.float32), np.zeros((5, 2), np.float32)
     rotations = np.tile(np.eye(3, dtype=np.float32), (5, 1, 1))
-    sure = np.full((5, 17), 0.5, np.float32)
+    sure = np.full((5, 25), 0.5, np.float32)
     order = np.arange(5)
     seen = Detections(points, 2 * sure, order, np.array(["0"] * 5), stamps_at(10, 5) + 10**18)
     write_lifted_bag(
@@ -67,7 +67,7 @@ def test_keypoints_are_lifted(keypoints: Path, tmp_path: Path) -> None:
     main([str(keypoints), "--html", str(tmp_path / "page.html")])
     objects = shown(tmp_path / "page.html")
     assert len(objects) == 5
-    assert all(len(one["shape"]) == 3 * len(HUMAN17) and one["rotation"] for one in objects)
+    assert all(len(one["shape"]) == 3 * len(HUMAN25) and one["rotation"] for one in objects)
     assert "lifted with model human" in (tmp_path / "page.html").read_text()
 
 
@@ -77,9 +77,9 @@ def test_answers_are_shown_as_they_were_recorded(
     main([str(answered), "--html", str(tmp_path / "page.html")])
     objects = shown(tmp_path / "page.html")
     for one, expected in zip(objects, points / 1000, strict=True):
-        found = np.reshape(one["shape"], (17, 3))
+        found = np.reshape(one["shape"], (25, 3))
         np.testing.assert_allclose(found[:, :2], expected - expected.mean(0), atol=1e-3)
-        assert one["rotation"] == [1, 0, 0, 0, 1, 0, 0, 0, 1] and one["confidence"] == [0.5] * 17
+        assert one["rotation"] == [1, 0, 0, 0, 1, 0, 0, 0, 1] and one["confidence"] == [0.5] * 25
     main([str(answered), "--lift-again", "--html", str(tmp_path / "again.html")])
     assert shown(tmp_path / "again.html")[0]["shape"] != objects[0]["shape"]
 
@@ -93,9 +93,9 @@ def test_answers_are_shown_as_they_were_recorded(
         (["--serve", "--objects", "largest"], "--objects has no effect here: it needs a rec"),
         (["nowhere", "--html", "page.html"], "nowhere does not exist"),
         (["keypoints", "--html", "no/page.html"], "no/page.html"),
-        (["keypoints", "--html", "page.html", "--model", "cmu31"], "has 17 keypoints"),
+        (["keypoints", "--html", "page.html", "--model", "cmu31"], "has 25 keypoints"),
         (
-            ["answered", "--html", "page.html", "--model", "cmu31", "--keypoint-layout", "human17"],
+            ["answered", "--html", "page.html", "--model", "cmu31", "--keypoint-layout", "human25"],
             "name the model that lifted",
         ),
     ],

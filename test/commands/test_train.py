@@ -23,7 +23,7 @@ from deep_nrsfm_ros.commands import train
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout_file import read_layout
-from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
@@ -160,12 +160,12 @@ def test_from_bag_to_model(
     assert (progress[-1]["step"], progress[-1]["steps"]) == (30, 30)
     for field in ("loss", "cycle_error", "coherence", "seconds_left"):
         assert isinstance(progress[-1][field], float)
-    assert any("60 frames of 17 keypoints (bags bag)" in line.get("message", "") for line in lines)
+    assert any("60 frames of 25 keypoints (bags bag)" in line.get("message", "") for line in lines)
     path = models / "mine.safetensors"
     assert lines[-1]["model"] == str(path) and str(path) in lines[-1]["message"]
     assert lines[-1]["report"] == str(models / "mine.html")
     model = assert_lifts(path)
-    assert (model.name, model.layout) == ("mine", HUMAN17)
+    assert (model.name, model.layout) == ("mine", HUMAN25)
     assert model.network.architecture.widths == (8, 4)
     assert model.provenance["recipe"]["steps"] == 30 and model.provenance["step"] == 30
     assert lines[-1]["cycle_error"] == model.quality["cycle_error"]
@@ -445,7 +445,7 @@ def test_it_goes_on_from_another_model(
     slow = ("--steps", "1", "--learning-rate", "1e-7", "--output", str(models))
     assert in_process(*still, *slow, "--name", "same") == 0
     same = load_model(models / "same.safetensors")
-    assert same.layout == first.layout == HUMAN17
+    assert same.layout == first.layout == HUMAN25
     assert same.provenance["from"]["model"] == "mine"
     for (name, a), (_, b) in zip(
         same.network.named_weights(), first.network.named_weights(), strict=True

@@ -26,7 +26,7 @@ def environment() -> dict[str, str]:
 def test_arrays_are_lifted(tmp_path: Path) -> None:
     command = [sys.executable, str(EXAMPLES / "lift_array.py")]
     said = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True)
-    assert said.returncode == 0 and "100 frames of 17 keypoints" in said.stdout, said.stderr
+    assert said.returncode == 0 and "100 frames of 25 keypoints" in said.stdout, said.stderr
     assert np.isfinite(np.load(tmp_path / "lifted.npz")["shapes"]).all()
 
 
@@ -42,7 +42,7 @@ def test_the_notebook_lifts_draws_and_trains() -> None:
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code":
             exec("".join(cell["source"]), variables)
-    assert variables["lifted"].shapes.shape == (100, 17, 3)
+    assert variables["lifted"].shapes.shape == (100, 25, 3)
     assert variables["mine"].name == "mine"
 
 

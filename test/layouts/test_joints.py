@@ -14,7 +14,7 @@ import pytest
 from deep_nrsfm_ros.body.kinematic_tree import KinematicTree
 from deep_nrsfm_ros.layouts.joints import direction_vector, joints_from_json
 from deep_nrsfm_ros.layouts.layout_file import LayoutFileError, read_layout
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.model_files.model_file import load_model
 
 HAND = Path(__file__).parents[2] / "config" / "layouts" / "hand.yaml"
@@ -70,8 +70,8 @@ def test_joints_survive_the_header_of_a_model() -> None:
             return {key: tuples(item) for key, item in value.items()}
         return tuple(map(tuples, value)) if isinstance(value, list) else value
 
-    stored = json.loads(json.dumps([dataclasses.asdict(joint) for joint in HUMAN17.joints]))
-    assert joints_from_json(tuples(stored)) == HUMAN17.joints == load_model("human").layout.joints
+    stored = json.loads(json.dumps([dataclasses.asdict(joint) for joint in HUMAN25.joints]))
+    assert joints_from_json(tuples(stored)) == HUMAN25.joints == load_model("human").layout.joints
     stored[0]["name"] = 3
     with pytest.raises(ValueError, match="no texts"):
         joints_from_json(tuples(stored))

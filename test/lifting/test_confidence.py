@@ -165,17 +165,20 @@ def test_what_is_shipped_was_fitted() -> None:
     assert CALIBRATED.missing.gap < 0 == CALIBRATED.visible.gap
 
 
+_BELOW_THE_HIPS = ("knee", "ankle", "heel", "big_toe", "small_toe")
+
+
 def test_legs_out_of_the_picture_have_little_confidence() -> None:
     """The model `human`: the farther from the visible points, the less; the trunk keeps its own."""
     model = load_model(find_model("human", model_folders(default_models_dir())))
-    at, visible = model.layout.index, np.ones((1, 17), bool)
+    at, visible = model.layout.index, np.ones((1, len(model.layout)), bool)
     for side in ("left", "right"):
-        visible[:, [at(f"{side}_{part}") for part in ("knee", "ankle", "big_toe")]] = False
+        visible[:, [at(f"{side}_{part}") for part in _BELOW_THE_HIPS]] = False
     gap = gaps(visible, point_precision(model.network))[0]
     for side in ("left", "right"):
         knee, ankle, toe = (gap[at(f"{side}_{part}")] for part in ("knee", "ankle", "big_toe"))
         assert 0.2 < knee < ankle < toe < 2
-    alone = np.ones((1, 17), bool)
+    alone = np.ones((1, len(model.layout)), bool)
     alone[0, at("left_knee")] = False
     assert (
         gaps(alone, point_precision(model.network))[0, at("left_knee")] < 0.8 * gap[at("left_knee")]

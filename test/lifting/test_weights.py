@@ -19,7 +19,7 @@ from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import load_model
 
-HUMAN = load_model("human")
+HUMAN = load_model("human17")
 LEGS = [
     i
     for i, name in enumerate(HUMAN17.keypoints)

@@ -41,7 +41,7 @@ def people(source: str, *shown: str) -> tuple[np.ndarray, np.ndarray]:
     [
         ("coco17", ("nose", "left_shoulder", "right_shoulder"), 3),
         ("body25", ("nose", "neck", "left_shoulder", "right_shoulder"), 3),
-        ("coco17", ("left_hip", "right_hip", "left_knee", "left_eye", "left_ear"), 3),
+        ("coco17", ("left_hip", "right_hip", "left_knee"), 3),
         ("coco17", ("left_hip", "right_hip", "left_knee", "right_wrist"), 4),
     ],
 )

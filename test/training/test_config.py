@@ -67,10 +67,11 @@ def test_every_option_comes_back_from_json() -> None:
 
 
 def test_a_training_of_people_starts_from_the_model_of_people_unless_told_otherwise() -> None:
-    bag, human = ("--bag", "a"), str(known_model("human17"))
+    bag, human = ("--bag", "a"), str(known_model("human25"))
     assert Path(human).stem == "human"
     assert (parsed(*bag).start, parsed(*bag).rival) == (human, human)
     assert parsed(*bag, "--object", "coco17").start == human
+    assert Path(parsed(*bag, "--object", "human17").start).stem == "human17"
     for words in (("--from", "none"), ("--widths", "8", "4"), ("--preset", "paper")):
         config = parsed(*bag, *words)
         assert (config.start, config.rival) == ("", human)

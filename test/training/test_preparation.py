@@ -140,10 +140,12 @@ def test_one_bad_file_is_left_out_and_named(
         for pair in (("--input", "bad.json"), ("--input", "a.npz"), ("--bag", "empty"))
         for word in (pair[0], f"{tmp_path}/{pair[1]}")
     ]
+    words += ["--object", "human17"]
     assert len(read(*words)) == 6
     said = capsys.readouterr().err
     assert "warning: left out: " in said and "bad.json" in said and "no message on /keypo" in said
     with pytest.raises(ValueError, match=r"bad\.json"):
         read("--input", f"{tmp_path}/bad.json")
+    both = ("--input", f"{tmp_path}/a.npz", "--bag", f"{tmp_path}/bag", "--object", "human17")
     with pytest.raises(ValueError, match="have 12 frames; at most 10"):
-        read("--input", f"{tmp_path}/a.npz", "--bag", f"{tmp_path}/bag", "--max-frames", "10")
+        read(*both, "--max-frames", "10")

@@ -30,8 +30,9 @@ def test_from_end_to_end(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     confidence_calibration.main(["--data", str(data), "--output", str(tmp_path)])
     rows = list(csv.DictReader((tmp_path / "confidence_calibration.csv").open()))
     whole = [row for row in rows if row["confidence"] == ALL]
-    # Of the model `human` as coco17 sees it, too.
-    assert [row["model"] for row in whole] == ["human"] * 14 + ["cmu31"] * 7
+    # Of the models of people as coco17 sees them, too.
+    people = ["human"] * 14 + ["human17"] * 14
+    assert [row["model"] for row in whole] == [*people, *["cmu31"] * 7]
     assert [row["cut"] for row in whole[:7]] == [*CUTS, EVERY]
     # Its motion capture is nonsense, of which no model knows anything.
     assert all(float(row["seen near %"]) < 60 for row in whole if row["cut"] == GAPS)

@@ -65,6 +65,6 @@ def test_only_the_largest_person_of_a_video_is_followed(tmp_path: Path) -> None:
         for people in (crowd, [], crowd[::-1]):
             file.write(json.dumps({"people": people}) + "\n")
     clip = smoothing.video_clip(tmp_path / "video.jsonl.gz")
-    assert clip.points.shape == (2, 17, 2)
+    assert clip.points.shape == (2, 25, 2)
     np.testing.assert_array_equal(*clip.points)
     assert np.ptp(clip.points[0]) > 5
