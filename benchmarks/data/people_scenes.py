@@ -208,12 +208,18 @@ def clip_track(scene: Scene) -> Track:
     )
 
 
-def held_out_motions(folder: Path) -> Iterator[Floats]:
-    """Yield the trials (f, 17, 3) of the held-out subjects in m, y up, at `CMU_RATE`."""
+def held_out_trials(folder: Path) -> Iterator[tuple[Path, Floats]]:
+    """Yield the file of each held-out trial, and its motion as `held_out_motions` has it."""
     for subject in HELD_OUT:
         skeleton = read_asf(folder / subject / f"{subject}.asf")
         for trial in trials(folder, subject):
-            yield human17(read_amc(trial, skeleton))[::CMU_STRIDE].astype(float)
+            yield trial, human17(read_amc(trial, skeleton))[::CMU_STRIDE].astype(float)
+
+
+def held_out_motions(folder: Path) -> Iterator[Floats]:
+    """Yield the trials (f, 17, 3) of the held-out subjects in m, y up, at `CMU_RATE`."""
+    for _, motion in held_out_trials(folder):
+        yield motion
 
 
 def filmed(motion: Floats, azimuth: float, seed: int) -> Track:

@@ -2,6 +2,7 @@
 """Joint angles of lifted people against those of the truth by the same formulas, and their closure.
 
 The angles of both follow from the 12 limb joints, so that the table shows what lifting costs.
+Elbows and knees also against the angles in CMU's AMC files, which have them as hinges.
 Closure: forward kinematics of the angles with a person's mean bone lengths, against the points.
 """
 
@@ -16,11 +17,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.data.people_scenes import CMU, HELD_OUT, HUMANEVA, people_scenes
+from benchmarks.data.people_scenes import (
+    AZIMUTHS,
+    CMU,
+    CMU_STRIDE,
+    HELD_OUT,
+    HUMANEVA,
+    filmed,
+    held_out_trials,
+    noisy,
+    people_scenes,
+)
 from benchmarks.real.people import SYSTEMS, lift_track
 from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.body.kinematic_tree import KinematicTree
-from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
+from deep_nrsfm_ros.data.mocap import human17, read_amc, read_amc_angles, read_asf, trials
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.joints import fitting_joints
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -40,6 +51,8 @@ HEIGHT = 3.5
 """A person's height in lengths of the trunk, from mid-hip to neck: 1.75 m with 0.5 m."""
 _LEVELLED = 5.0
 """Degrees: a hanging arm within this angle has no y_shoulder and r_shoulder of its own."""
+HINGES = {"elbow": ("radius", 1.0), "knee": ("tibia", -1.0)}
+"""Angle -> the bone of AMC files that it turns, and the sign of its angle there."""
 FIGURES = {
     "median deg": "of the absolute error",
     "mean deg": "of the absolute error",
@@ -51,6 +64,15 @@ CLOSURE = {
     "RMS %": "distance of forward kinematics from the points, RMS, of the height (3.5 trunks)",
     "p99 %": "99th percentile of that distance",
     "REP-155 alone %": "the RMS without r_waist and y_waist, which REP-155 does not have",
+}
+AMC_FIGURES = {
+    "truth deg": "median absolute difference of the true 3D's angle by our formulas from AMC's",
+    "truth max deg": "the largest of them",
+    "lifted deg": "median absolute difference of the lifted angle from AMC's",
+    "lifted p90 deg": "90th percentile of it",
+    "bias deg": "median of lifted - AMC's; above 0: lifted more bent",
+    "fixed deg": "median absolute difference of a constant, the median of AMC's",
+    "frames": "frames of all cameras",
 }
 
 
@@ -132,6 +154,61 @@ def angle_errors(
         )
 
 
+def amc_table(lifter: Lifter, data: Path, stride: int) -> Table:
+    """Return the table of hinges against the angles that CMU's AMC files carry.
+
+    Other joints of AMC have three angles about axes of their own, which ours are not. A hinge has
+    the same axis in both; the files' angles are those of an optimisation of the whole skeleton.
+
+    Args:
+        lifter: a model with its options.
+        data: folder that holds cmu/.
+        stride: every n-th trial only.
+    """
+    tree = KinematicTree(LIMBS)
+    table = Table(
+        *("amc", "Elbows and knees against the angles of AMC files", ("angle",)),
+        *(tuple(AMC_FIGURES), AMC_FIGURES, bars("truth deg", "lifted deg", "fixed deg")),
+    )
+    table.digits["frames"] = 0
+    limbs = [lifter.model.layout.index(joint) for joint in JOINTS]
+    hinges = [(side, angle) for angle in HINGES for side in ("left", "right")]
+    bones = [side[0] + HINGES[angle][0] for side, angle in hinges]
+    columns = [tree.angle_names.index(f"{side[0]}_{angle}") for side, angle in hinges]
+    signs = np.array([HINGES[angle][1] for _, angle in hinges])
+    parts = []
+    for seed, (trial, motion) in enumerate([*held_out_trials(data / "cmu")][::stride]):
+        amc = read_amc_angles(trial, bones)[::CMU_STRIDE]
+        for azimuth in AZIMUTHS:
+            track = noisy(filmed(motion, azimuth, seed), seed)
+            S = lift_track(lifter, track, SYSTEMS[SYSTEM], intrinsics=True).shapes[:, limbs]
+            known = np.isfinite(S).all((1, 2))
+            ours = [
+                signs * np.degrees(tree(X[known].astype(float)).angles[:, columns])
+                for X in (track.truth, S)
+            ]
+            parts.append((amc[known], *ours))
+    amc, truth, lifted = (np.concatenate(part) for part in zip(*parts, strict=True))
+    for column, (side, angle) in enumerate(hinges):
+        row = amc_errors(amc[:, column], truth[:, column], lifted[:, column])
+        table.add((f"{side} {angle}",), row)
+    return table
+
+
+def amc_errors(amc: Floats, truth: Floats, lifted: Floats) -> dict[str, float]:
+    """Return the `AMC_FIGURES` of one hinge, from angles (n,) in degrees, above 0 where bent."""
+    of_truth, of_lifted = np.abs(truth - amc), np.abs(lifted - amc)
+    return {
+        "truth deg": float(np.median(of_truth)),
+        "truth max deg": float(of_truth.max()),
+        "lifted deg": float(np.median(of_lifted)),
+        "lifted p90 deg": float(np.percentile(of_lifted, 90)),
+        "bias deg": float(np.median(lifted - amc)),
+        "fixed deg": float(np.median(np.abs(amc - np.median(amc)))),
+        "frames": len(amc),
+    }
+
+
 def _locked(tree: KinematicTree, angles: Floats) -> NDArray[np.bool_]:
     """Return which angles (n, a) a hanging arm leaves undetermined: the shoulder's y and r."""
     locked = np.zeros(angles.shape, bool)
@@ -199,7 +276,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     def tables() -> list[Table]:
         lifter = Lifter(load_model(args.model))
         closure = closure_table(args.data, args.frames)
-        return [closure, scene_angles(lifter, args.data, args.output, args.stride, args.scenes)]
+        amc = amc_table(lifter, args.data, args.stride)
+        scenes = scene_angles(lifter, args.data, args.output, args.stride, args.scenes)
+        return [closure, amc, scenes]
 
     print_tables(tables, args.output)
 

@@ -16,14 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.body.mean_scale import RANGE, MeanScale
+
 Floats = NDArray[Any]
 
 CLEARANCE = 0.04
 """Metres from the floor to the lowest keypoint of a person who stands: a toe, or an ankle less."""
-SCALE_TIME = 3.0
-"""Time constant in s of an identity's mean scale."""
-_RANGE = (0.4, 2.5)  # of a scale that is believed
-_MAX_IDENTITIES = 1000
 
 
 def floor_scale(shapes: Floats, up: Floats, height: float) -> Floats:
@@ -39,7 +37,7 @@ def floor_scale(shapes: Floats, up: Floats, height: float) -> Floats:
     """
     lowest = (-(shapes @ up)).max(1)
     scale = (height - CLEARANCE) / np.where(lowest > 0, lowest, np.nan)
-    believed = (scale >= _RANGE[0]) & (scale <= _RANGE[1])
+    believed = (scale >= RANGE[0]) & (scale <= RANGE[1])
     return np.where(believed, scale, np.nan)
 
 
@@ -49,7 +47,7 @@ class FloorScale:
     def __init__(self, height: float) -> None:
         """Start without identities; `height` is that of the camera in metres."""
         self._height = height
-        self._scales: dict[str, tuple[float, float, float]] = {}
+        self._mean = MeanScale()
 
     def __call__(
         self, identities: Sequence[str], shapes: Floats, up: Floats, seconds: float
@@ -63,22 +61,12 @@ class FloorScale:
             seconds: time of the message.
         """
         found = floor_scale(shapes.astype(np.float64), up, self._height)
-        scales = np.where(np.isnan(found), 1.0, found)
-        for i, identity in enumerate(identities):
-            if not identity:
-                continue
-            mean, weight, last = self._scales.get(identity, (1.0, 0.0, seconds))
-            passed = max(seconds - last, 0.0)
-            weight *= float(np.exp(-passed / SCALE_TIME))
-            if not np.isnan(found[i]):
-                mean += (float(found[i]) - mean) / (weight + 1)
-                weight += 1
-            if weight:
-                scales[i] = mean
-            if identity in self._scales or len(self._scales) < _MAX_IDENTITIES:
-                self._scales[identity] = mean, weight, seconds
-        return scales
+        for identity, scale in zip(identities, found.tolist(), strict=True):
+            self._mean.update(identity, scale, seconds)
+        means = np.array([self._mean(identity) for identity in identities])
+        means = np.where(np.isnan(means), found, means)
+        return np.where(np.isnan(means), 1.0, means)
 
     def forget(self) -> None:
         """Forget all identities."""
-        self._scales.clear()
+        self._mean = MeanScale()

@@ -130,15 +130,38 @@ def read_amc(path: Path, skeleton: Skeleton) -> Motion:
     Raises:
         ValueError: the file is no AMC motion of this skeleton.
     """
+    try:
+        return _pose(skeleton, _read_columns(path))
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path} is no AMC motion of this skeleton: {error}") from error
+
+
+def read_amc_angles(path: Path, bones: Sequence[str]) -> NDArray[np.float64]:
+    """Return the angles (f, len(bones)) in degrees that an AMC file has for hinges.
+
+    Args:
+        path: AMC file.
+        bones: names of bones with one degree of freedom, as "ltibia", which the knee moves.
+
+    Raises:
+        ValueError: the file is no AMC motion, or one of the bones has no single angle.
+    """
+    columns = _read_columns(path)
+    try:
+        angles = [np.array(columns[bone], float).reshape(-1) for bone in bones]
+        return np.stack(angles, 1)
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path} has no single angle of {', '.join(bones)}: {error}") from error
+
+
+def _read_columns(path: Path) -> dict[str, list[list[str]]]:
+    """Return bone -> words of each frame of an AMC file."""
     columns: dict[str, list[list[str]]] = {}
     for line in path.read_text(errors="replace").splitlines():
         name, *values = line.split() or [""]
         if values:
             columns.setdefault(name, []).append(values)
-    try:
-        return _pose(skeleton, columns)
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path} is no AMC motion of this skeleton: {error}") from error
+    return columns
 
 
 def _pose(skeleton: Skeleton, columns: dict[str, list[list[str]]]) -> Motion:

@@ -117,6 +117,11 @@ class Pipeline:
         return self._smoothing.enabled or self.remembers
 
     @property
+    def reference_length(self) -> float:
+        """The reference length of the shapes."""
+        return float(self._lifter.constants.reference_length)
+
+    @property
     def history_status(self) -> str:
         """What is remembered from message to message, as text for diagnostics."""
         if not self.remembers:

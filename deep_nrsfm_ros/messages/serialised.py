@@ -18,6 +18,7 @@ from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.lifting.observation import (
     MAX_COORDINATE,
     MIN_POSITIVE,
+    MessageError,
     Observation,
     to_observation,
 )
@@ -199,6 +200,20 @@ class MessageReader:
             new = SerialisedFormat(len(raw), start, end, bits, head, raw[end], frame_id, cloud)
             self._formats.insert(0, new)
             del self._formats[_MAX_FORMATS:]
+
+
+def read_stamp(raw: bytes) -> int:
+    """Return the stamp in ns of a serialised message that begins with a std_msgs/Header.
+
+    Raises:
+        MessageError: the message is too short.
+    """
+    order = "<" if raw[:2] == _LITTLE_ENDIAN else ">"
+    try:
+        sec, nanosec = struct.unpack_from(order + "iI", raw, _STAMP_OFFSET)
+    except struct.error:
+        raise MessageError(f"{len(raw)} bytes, too few for a header") from None
+    return int(sec) * 1_000_000_000 + int(nanosec)
 
 
 def read_header(message: Any) -> Header | None:

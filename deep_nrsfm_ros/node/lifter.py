@@ -69,6 +69,7 @@ from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameter_bridge, publishing
 from deep_nrsfm_ros.node.bodies import BodyOptions, BodyPublishers, Scene
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
+from deep_nrsfm_ros.node.depth import DepthOptions, DepthSubscription
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.entities import Entities
 from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
@@ -94,6 +95,7 @@ if TYPE_CHECKING:
 _SMOOTHING = "smoothing."
 _HISTORY = "history."
 _GRAVITY = "gravity."
+_DEPTH = "depth."
 _BODY = "body."
 _TRAIN = "train."
 _REPORT_PERIOD = 1.0  # seconds
@@ -150,6 +152,7 @@ class LifterNode(Node):
         parameter_bridge.declare(self, SmoothingOptions, _SMOOTHING)
         parameter_bridge.declare(self, GravityOptions, _GRAVITY)
         self._gravity_sources = parameter_bridge.declare(self, GravitySources, _GRAVITY)
+        self._depth_options = parameter_bridge.declare(self, DepthOptions, _DEPTH)
         self._body_options = parameter_bridge.declare(self, BodyOptions, _BODY)
         training = parameter_bridge.declare(self, TrainingOptions, _TRAIN)
         parameter_bridge.declare(self, Recipe, _TRAIN)
@@ -221,6 +224,8 @@ class LifterNode(Node):
         self._frame_id, self._last_frame = camera.frame_id, ""
         self._camera = CameraInfoSubscription(self, camera)
         self._gravity = GravityDirection(self, self._gravity_sources)
+        depth = self._depth_options
+        self._depth = DepthSubscription(self, depth, self._camera) if depth.topic else None
         self._floor = FloorScale(camera.camera_height) if camera.camera_height else None
         self._target = TargetFrame(self, self._target_options, positioned=self._camera.enabled)
         self._tf = TransformBroadcaster(self, camera.tf_prefix) if camera.tf_prefix else None
@@ -274,6 +279,8 @@ class LifterNode(Node):
         self._bodies.forget()
         if self._floor:
             self._floor.forget()
+        if self._depth is not None:
+            self._depth.forget()
         self._stage = Stage.INACTIVE
 
     def clean_up(self) -> None:
@@ -315,7 +322,7 @@ class LifterNode(Node):
             header, observation = self._pipeline.read(raw, source.reader, self._camera.size)
             moment = self._moment(source, header.stamp if header else 0)
             has_subscriber = self._objects.get_subscription_count()
-            needed = has_subscriber or self._tf or self._bodies.wanted
+            needed = has_subscriber or self._tf or self._depth or self._bodies.wanted
             if needed or self._pipeline.needs_identities:
                 identities = source.tracker(
                     observation, moment.seconds, moment.period, self._pipeline.tolerances
@@ -333,8 +340,13 @@ class LifterNode(Node):
             lifted, identities = self._pipeline.lift(
                 observation, intrinsics, identities, source.topic, moment, up
             )
+            placed = None
+            if self._depth is not None and identities:
+                names = _names_of(source.topic, identities)
+                lifted, placed = self._depth(header, lifted, names, moment.seconds, self._pipeline)
             if self._floor and identities and up is not None:
-                lifted = self._on_floor(source.topic, lifted, identities, up, moment)
+                names = _names_of(source.topic, identities)
+                lifted = self._on_floor(names, lifted, up, moment, placed)
             if self._target.name and identities:
                 header, lifted = self._target(header, lifted)
         except Exception as problem:  # one bad message must not end the node
@@ -370,16 +382,17 @@ class LifterNode(Node):
 
     def _on_floor(
         self,
-        topic: str,
+        names: Sequence[str],
         lifted: Lifted,
-        identities: Sequence[str],
         up: NDArray[np.float64],
         moment: Moment,
+        placed: NDArray[np.bool_] | None,
     ) -> Lifted:
-        """Return objects at the size with which they stand on the floor."""
+        """Return objects at the size with which they stand on the floor; `placed` ones stay."""
         assert self._floor
-        names = [identity and f"{topic} {identity}" for identity in identities]
         scales = self._floor(names, lifted.shapes, up, moment.seconds).astype(np.float32)
+        if placed is not None:
+            scales[placed] = 1
         return lifted._replace(
             shapes=scales[:, None, None] * lifted.shapes, scale=lifted.scale / scales
         )
@@ -505,6 +518,10 @@ class LifterNode(Node):
         values |= {"model": model.name, "topic": ", ".join(self._keypoint_topics.topics)}
         values["history"] = self._pipeline.history_status
         frame = self._last_frame or self._frame_id or self._camera.frame
+        if self._depth is not None:
+            values |= self._depth.report()
+            if level == OK and self._depth.problem:
+                level, message = WARN, self._depth.problem
         values["gravity"] = self._gravity.status(self._up, frame)
         for identity, bones in self._pipeline.learned_bones().items():
             values[f"bones of {identity}"] = bones
@@ -705,6 +722,11 @@ class LifterNode(Node):
         (result,) = self.set_parameters([Parameter("model", value=Path(path).stem)])
         if not result.successful:
             raise ValueError(result.reason)
+
+
+def _names_of(topic: str, identities: Sequence[str]) -> list[str]:
+    """Return identities that are unique over all topics; "" stays."""
+    return [identity and f"{topic} {identity}" for identity in identities]
 
 
 def _error_text(problem: Exception) -> str:

@@ -18,6 +18,7 @@ from deep_nrsfm_ros.data.mocap import (
     human25,
     protocol_split,
     read_amc,
+    read_amc_angles,
     read_asf,
     read_trials,
     trials,
@@ -229,6 +230,16 @@ def test_a_bad_motion_is_named(tmp_path: Path, old: str, new: str) -> None:
     motion_file.write_text(text.replace(old, new))
     with pytest.raises(ValueError, match="07_01.amc"):
         read_amc(motion_file, skeleton)
+
+
+def test_hinges_are_read_as_the_file_has_them(tmp_path: Path) -> None:
+    frames = [{"root": [0.0] * 6, "ltibia": [10.0 * i], "lradius": [-float(i)]} for i in range(3)]
+    _, motion_file = written(tmp_path, straight(), frames)
+    angles = read_amc_angles(motion_file, ("lradius", "ltibia"))
+    np.testing.assert_array_equal(angles, [[0, 0], [-1, 10], [-2, 20]])
+    for bones in (("ltibia", "root"), ("lfemur",)):
+        with pytest.raises(ValueError, match=r"07_01.amc has no single angle of"):
+            read_amc_angles(motion_file, bones)
 
 
 def test_a_skeleton_of_another_kind_has_no_such_motion(tmp_path: Path) -> None:

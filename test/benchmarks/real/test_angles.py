@@ -48,3 +48,11 @@ def test_a_person_without_bend_and_twist_is_closed_by_rep_155_alone() -> None:
         rows.append(angles.closure(TREE, keypoints_of(TREE, pose)))
     assert rows[0]["REP-155 alone %"] > 2 and rows[1]["REP-155 alone %"] < 0.4
     assert rows[0]["RMS %"] < 0.4 and rows[0]["poses"] == 200
+
+
+def test_hinges_are_compared_with_the_angles_of_the_file() -> None:
+    amc = np.array([0.0, 10, 20, 30, 40])
+    row = angles.amc_errors(amc, amc + [0, 0, 0, 0, 2], amc - 3)
+    assert row["truth deg"] == 0 and row["truth max deg"] == 2
+    assert row["lifted deg"] == 3 and row["bias deg"] == -3
+    assert row["fixed deg"] == 10 and row["frames"] == 5
