@@ -24,6 +24,7 @@ from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.node.bodies import BodyOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
+from deep_nrsfm_ros.node.depth import DepthOptions
 from deep_nrsfm_ros.node.gravity import GravitySources
 from deep_nrsfm_ros.node.lifter import NodeOptions
 from deep_nrsfm_ros.node.parameter_bridge import parameter_name
@@ -41,6 +42,7 @@ _GROUPS: tuple[tuple[str, type, str], ...] = (
     ("Lifting", LiftingOptions, ""),
     ("Camera", CameraOptions, ""),
     ("Fixed frame", TargetOptions, ""),
+    ("Measured depth", DepthOptions, "depth."),
     ("Lifting over time", HistoryOptions, "history."),
     ("Gravity", GravityOptions, "gravity."),
     ("Gravity: sources", GravitySources, "gravity."),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Place and size of people by measured depth, against an assumed body height.
 
 Motion capture that `human` was not trained on, before simulated cameras 1.4 m high, with a
@@ -22,7 +23,13 @@ from benchmarks.data.people_scenes import Track, filmed, held_out_motions, noisy
 from benchmarks.real.floor import ASSUMED, SIZES, errors
 from benchmarks.real.people import SYSTEMS, lift_track
 from benchmarks.table import Table, bars, print_tables
-from deep_nrsfm_ros.body.depth import DepthFit, DepthScale, surface_radii
+from deep_nrsfm_ros.body.depth import (
+    AGREEMENT,
+    MIN_KEYPOINTS,
+    DepthFit,
+    DepthScale,
+    surface_radii,
+)
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
@@ -32,7 +39,6 @@ from deep_nrsfm_ros.model_files.model_file import load_model
 Floats = NDArray[Any]
 Masks = NDArray[np.bool_]
 
-AGREEMENT, MIN_KEYPOINTS = 0.15, 3
 WALL = 2.0  # m behind the person's middle
 NOISE = 0.00285  # m / m^2: standard deviation of a depth over the square of the depth
 HOLES, WINDOW_HOLES = 0.1, 0.05  # share of pixels and of keypoints without a depth

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Place and size of lifted objects from measured depth.
 
 The keypoints fix the rays on which a lifted object lies, so that its place and its size have one
@@ -42,6 +43,10 @@ They are rounded measures of an adult with a trunk of `_TRUNK`; nose and eyes ar
 """
 _TRUNK = 0.5  # m
 _BEAM_STEPS = 9  # points along a bone
+AGREEMENT = 0.2
+"""Metres between measured and lifted surface of a person up to which they agree."""
+MIN_KEYPOINTS = 3
+"""Fewest keypoints of an object that must agree."""
 MIN_CONFIDENCE = 0.3
 """Least confidence of a point that may vote on the scale."""
 _SAME_SIZE = 0.15  # log of the factor by which a scale may differ from that of its identity

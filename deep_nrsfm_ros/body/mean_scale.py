@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mean scale of each identity: an object's size does not change."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Depth of pixels from sensor_msgs/Image, PointCloud2 and Range; ROS is not imported."""
 
 from __future__ import annotations

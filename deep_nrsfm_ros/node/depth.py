@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Subscription to measured depth, which fixes place and size of lifted objects."""
 
 from __future__ import annotations
@@ -13,7 +14,14 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from deep_nrsfm_ros.body.depth import DepthFit, DepthScale, RangeScale, surface_radii
+from deep_nrsfm_ros.body.depth import (
+    AGREEMENT,
+    MIN_KEYPOINTS,
+    DepthFit,
+    DepthScale,
+    RangeScale,
+    surface_radii,
+)
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
@@ -62,15 +70,15 @@ class DepthOptions:
         read_only=True,
     )
     agreement: float = option(
-        0.15,
+        AGREEMENT,
         "difference in metres up to which a keypoint's measured and lifted depth agree; a keypoint "
-        "with something nearer in front of it counts as occluded; 0.15 typical of people",
+        "with something nearer in front of it counts as occluded; 0.2 typical of people",
         low=0.001,
         high=10.0,
         read_only=True,
     )
     min_keypoints: int = option(
-        3,
+        MIN_KEYPOINTS,
         "fewest keypoints of an object that must agree with its measured depth, else the depth is "
         "not used; of image and points; 3 typical",
         low=1,

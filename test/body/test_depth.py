@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Place and size of objects from measured depth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Depth of pixels from images, clouds and ranges, and those that cannot be used."""
 
 from __future__ import annotations

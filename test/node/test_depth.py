@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measured depth: matching by stamp, bad depth, and a lifter over DDS."""
 
 from __future__ import annotations
@@ -80,11 +81,12 @@ class Bench:
     """A subscription without DDS, and a person as lifted."""
 
     def __init__(self, type_: str = "image", *publishers: str) -> None:
-        self.node: Any = Log(*publishers)
+        self.node = Log(*publishers)
+        node: Any = self.node
         camera: Any = SimpleNamespace(
             enabled=True, intrinsics=CAMERA, size=(W, H), require_intrinsics=lambda: CAMERA
         )
-        self.depth = DepthSubscription(self.node, DepthOptions("/depth", type_), camera)
+        self.depth = DepthSubscription(node, DepthOptions("/depth", type_), camera)
 
     def receive(self, message: Any) -> None:
         self.depth._receive(serialize_message(message))
@@ -92,8 +94,9 @@ class Bench:
     def scale(self, stamp: float = 100.0, frame: str = "optical") -> float:
         """Return the factor that a message of keypoints gives the person."""
         shape = person()[None].astype(np.float32)
-        one = np.ones(1, np.float32)
-        lifted = Lifted(shape, np.eye(3)[None], one, np.zeros((1, 2)), one, np.ones((1, P)))
+        one = np.ones((1, P), np.float32)
+        R = np.eye(3, dtype=np.float32)[None]
+        lifted = Lifted(shape, R, one[:, 0], shape[:, 0, :2], one[:, 0], one)
         pipeline: Any = SimpleNamespace(model=SimpleNamespace(layout=HUMAN17), reference_length=0.5)
         at = header(stamp, frame)
         own = Header(at.stamp.sec, at.stamp.nanosec, frame)
