@@ -198,7 +198,7 @@ def test_depth_without_a_camera_is_refused() -> None:
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[tuple[LifterProcess, Client]]:
     """Start a lifter with depth."""
-    parameters = {"model": "human", "camera_info": "camera_info", "depth.topic": "depth"}
+    parameters = {"model": "human17", "camera_info": "camera_info", "depth.topic": "depth"}
     with own_domain() as number, lifters(write_models(tmp_path / "models"), tmp_path) as start:
         lifter, client = start(**parameters), Client(number)
         yield lifter, client
