@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -82,11 +82,19 @@ class _Body:
     def __init__(self, node: Node, prefix: str) -> None:
         """Create the publishers."""
         self.node = node
+        self._names: tuple[str, ...] = ()
+        self._titles: tuple[str, ...] = ()
         quiet: Any = {"event_callbacks": publishing.NO_EVENT_CALLBACKS}
         self.angles = node.create_publisher(JointState, f"{prefix}/joint_states", 10, **quiet)
         self.urdf = node.create_publisher(String, f"{prefix}/urdf", _LATCHED, **quiet)
         self.position = node.create_publisher(PointStamped, f"{prefix}/position", 10, **quiet)
         self.velocity = node.create_publisher(TwistStamped, f"{prefix}/velocity", 10, **quiet)
+
+    def titles(self, names: tuple[str, ...], rename: Callable[[str], str]) -> tuple[str, ...]:
+        """Return the names as this object's topics have them."""
+        if names is not self._names:
+            self._names, self._titles = names, tuple(map(rename, names))
+        return self._titles
 
     def close(self) -> None:
         """Destroy the publishers."""
@@ -112,11 +120,10 @@ class _Lengths:
             self.offsets = self.offsets + step / (_LENGTHS_TIME + step) * (offsets - self.offsets)
         self._seconds = seconds
         if self._published is not None:
+            if seconds < self._last + _URDF_PERIOD:
+                return False
             old, new = (np.linalg.norm(o, axis=1) for o in (self._published, self.offsets))
-            if (
-                seconds < self._last + _URDF_PERIOD
-                or (np.abs(new - old) <= _URDF_CHANGE * np.maximum(old, 1e-9)).all()
-            ):
+            if (np.abs(new - old) <= _URDF_CHANGE * np.maximum(old, 1e-9)).all():
                 return False
         self._published, self._last = self.offsets, seconds
         return True
@@ -251,7 +258,7 @@ class BodyPublishers:
         if pose is None or tree is None or not lifted.any():
             self._forget(motion.lost)
             return
-        shown = [name for name, known in zip(names, lifted, strict=True) if known]
+        shown = tuple(name for name, known in zip(names, lifted, strict=True) if known)
         pose = Pose(*(part[lifted] for part in pose))
         velocities = motion.velocities[lifted]
         if joints:
@@ -261,7 +268,9 @@ class BodyPublishers:
             titles = body_messages.joint_names(shown, tree.angle_names)
             self._angles.publish(body_messages.angles(header, titles, pose.angles))
         if self._options.frames and self._tf:
-            titles = body_messages.joint_names([self._prefix + name for name in shown], tree.names)
+            titles = body_messages.joint_names(
+                tuple(self._prefix + name for name in shown), tree.names
+            )
             self._tf.publish(self._frames(header, pose, tree.parents, titles))
         if self._options.per_object or self._options.humans:
             self._publish_bodies(scene, shown, pose, velocities if positioned else None)
@@ -296,7 +305,7 @@ class BodyPublishers:
                     text = urdf(tree, lengths.offsets, topic_name(name), rename)
                     body.urdf.publish(String(data=text))
                 if body.angles.get_subscription_count():
-                    titles = tuple(map(rename, tree.angle_names))
+                    titles = body.titles(tree.angle_names, rename)
                     body.angles.publish(body_messages.angles(header, titles, pose.angles[i]))
                 if velocities is None:
                     continue
@@ -317,9 +326,9 @@ class BodyPublishers:
             ids = [topic_name(name) for name in self._bodies]
             self._ids.publish(self._ids_message(header=publishing.to_header(header), ids=ids))
 
-    def _renames(self, name: str) -> list[Any]:
+    def _renames(self, name: str) -> list[Callable[[str], str]]:
         """Return the functions that rename joints for each prefix of an object's topics."""
-        renames: list[Any] = [str] if self._options.per_object else []
+        renames: list[Callable[[str], str]] = [str] if self._options.per_object else []
         return [*renames, rep155_name(topic_name(name))] if self._options.humans else renames
 
     def _create_bodies(self, name: str) -> list[_Body]:

@@ -12,8 +12,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import (
     PointStamped,
-    Quaternion,
-    Transform,
     TransformStamped,
     Twist,
     TwistStamped,
@@ -28,13 +26,19 @@ from deep_nrsfm_ros.body.kinematic_tree import Pose, quaternions
 from deep_nrsfm_ros.body.motion import BRIDGED, LOST, Motion
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.messages.serialised import Header
-from deep_nrsfm_ros.node import publishing
-from deep_nrsfm_ros.node.serialised_template import STAMP, SerialisedTemplate, mark
+from deep_nrsfm_ros.node.serialised_template import (
+    TRANSFORM_NUMBERS,
+    SerialisedTemplate,
+    TextTemplate,
+    mark,
+    template_header,
+    template_transform,
+    text_mark,
+)
 
 Floats = NDArray[Any]
 
 _MAX_TEMPLATES = 32  # kept of each kind of message: one per set of names
-_NUMBERS = 7  # of a transform
 _LEVELS = {BRIDGED: DiagnosticStatus.WARN, LOST: DiagnosticStatus.STALE}
 
 
@@ -57,7 +61,8 @@ def skeleton(layout: KeypointLayout) -> std_msgs.String:
     return std_msgs.String(data=json.dumps(description))
 
 
-def joint_names(identities: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+@lru_cache(_MAX_TEMPLATES)
+def joint_names(identities: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the name of each joint or angle of each object: IDENTITY/NAME."""
     return tuple(f"{identity}/{name}" for identity in identities for name in names)
 
@@ -80,10 +85,10 @@ def joints(header: Header, names: tuple[str, ...], pose: Pose, velocities: Float
 @lru_cache(_MAX_TEMPLATES)
 def _joints(frame_id: str, names: tuple[str, ...]) -> SerialisedTemplate:
     """Return the template of the joints' transforms and velocities."""
-    message = MultiDOFJointState(header=_header(frame_id), joint_names=list(names))
+    message = MultiDOFJointState(header=template_header(frame_id), joint_names=list(names))
     count = len(names)
-    message.transforms = [_transform(i) for i in range(count)]
-    start = _NUMBERS * count
+    message.transforms = [template_transform(i) for i in range(count)]
+    start = TRANSFORM_NUMBERS * count
     message.twist = [
         Twist(linear=Vector3(**{k: mark(start + 3 * i + d) for d, k in enumerate("xyz")}))
         for i in range(count)
@@ -99,7 +104,7 @@ def angles(header: Header, names: tuple[str, ...], values: Floats) -> bytes:
 @lru_cache(_MAX_TEMPLATES)
 def _angles(frame_id: str, names: tuple[str, ...]) -> SerialisedTemplate:
     """Return the template of angles."""
-    message = JointState(header=_header(frame_id), name=list(names))
+    message = JointState(header=template_header(frame_id), name=list(names))
     message.position = [mark(i) for i in range(len(names))]
     return SerialisedTemplate(message, len(names))
 
@@ -154,15 +159,18 @@ def _frames(
         parent = parents[i % j]
         above = names[i - i % j + parent] if parent >= 0 else frame_id
         transforms.append(
-            TransformStamped(header=_header(above), child_frame_id=name, transform=_transform(i))
+            TransformStamped(
+                header=template_header(above),
+                child_frame_id=name,
+                transform=template_transform(i),
+            )
         )
-    return SerialisedTemplate(kind(transforms=transforms), _NUMBERS * len(names), serialise)
+    count = TRANSFORM_NUMBERS * len(names)
+    return SerialisedTemplate(kind(transforms=transforms), count, serialise)
 
 
-def tracks(
-    header: Header, identities: Sequence[str], motion: Motion, confidence: Floats
-) -> DiagnosticArray:
-    """Return the state of tracking of each identity, and those that are lost.
+def tracks(header: Header, identities: Sequence[str], motion: Motion, confidence: Floats) -> bytes:
+    """Return the serialised state of tracking of each identity, and those that are lost.
 
     Args:
         header: of the message.
@@ -170,22 +178,27 @@ def tracks(
         motion: of them.
         confidence: (n,) of the objects.
     """
-    message = DiagnosticArray(header=publishing.to_header(header))
-    for i, (identity, state) in enumerate(zip(identities, motion.states, strict=True)):
-        values = {"age": f"{motion.ages[i]:.3f}", "confidence": f"{confidence[i]:.3f}"}
-        message.status.append(_track(identity, state, values))
-    message.status += [_track(identity, LOST, {}) for identity in motion.lost]
-    return message
+    pairs = zip(motion.ages.tolist(), confidence.tolist(), strict=True)
+    texts = [f"{value:.3f}" for pair in pairs for value in pair]
+    states = (*zip(identities, motion.states, strict=True), *((n, LOST) for n in motion.lost))
+    return _tracks(header.frame_id, states, tuple(map(len, texts)))(header, texts)
 
 
-def _track(identity: str, state: str, values: dict[str, str]) -> DiagnosticStatus:
-    """Return the state of one identity."""
-    return DiagnosticStatus(
-        level=_LEVELS.get(state, DiagnosticStatus.OK),
-        name=identity,
-        message=state,
-        values=[KeyValue(key=key, value=value) for key, value in values.items()],
-    )
+@lru_cache(_MAX_TEMPLATES)
+def _tracks(
+    frame_id: str, states: tuple[tuple[str, str], ...], lengths: tuple[int, ...]
+) -> TextTemplate:
+    """Return the template of names and states; the first of them have two texts, of two lengths."""
+    message = DiagnosticArray(header=template_header(frame_id))
+    for i, (identity, state) in enumerate(states):
+        pair = range(2 * i, min(2 * i + 2, len(lengths)))
+        texts = zip(("age", "confidence"), pair, strict=False)
+        values = [KeyValue(key=key, value=text_mark(k, lengths[k])) for key, k in texts]
+        level = _LEVELS.get(state, DiagnosticStatus.OK)
+        message.status.append(
+            DiagnosticStatus(level=level, name=identity, message=state, values=values)
+        )
+    return TextTemplate(message, lengths)
 
 
 def position(header: Header, point: Floats) -> bytes:
@@ -196,7 +209,7 @@ def position(header: Header, point: Floats) -> bytes:
 @lru_cache(_MAX_TEMPLATES)
 def _position(frame_id: str) -> SerialisedTemplate:
     """Return the template of a point."""
-    message = PointStamped(header=_header(frame_id))
+    message = PointStamped(header=template_header(frame_id))
     message.point.x, message.point.y, message.point.z = mark(0), mark(1), mark(2)
     return SerialisedTemplate(message, 3)
 
@@ -209,19 +222,7 @@ def velocity(header: Header, linear: Floats) -> bytes:
 @lru_cache(_MAX_TEMPLATES)
 def _velocity(frame_id: str) -> SerialisedTemplate:
     """Return the template of a velocity."""
-    message = TwistStamped(header=_header(frame_id))
+    message = TwistStamped(header=template_header(frame_id))
     v = message.twist.linear
     v.x, v.y, v.z = mark(0), mark(1), mark(2)
     return SerialisedTemplate(message, 3)
-
-
-def _header(frame_id: str) -> std_msgs.Header:
-    """Return a template's header."""
-    return std_msgs.Header(stamp=STAMP, frame_id=frame_id)
-
-
-def _transform(index: int) -> Transform:
-    """Return transform `index` of a template."""
-    x, y, z, *q = (mark(_NUMBERS * index + k) for k in range(_NUMBERS))
-    rotation = Quaternion(x=q[0], y=q[1], z=q[2], w=q[3])
-    return Transform(translation=Vector3(x=x, y=y, z=z), rotation=rotation)

@@ -10,10 +10,11 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
-from builtin_interfaces.msg import Duration, Time
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Transform, Vector3
 from numpy.typing import NDArray
 from rclpy.event_handler import PublisherEventCallbacks
@@ -22,10 +23,19 @@ from sensor_msgs.msg import MultiDOFJointState, PointCloud2, PointField
 from std_msgs import msg as std_msgs
 from visualization_msgs.msg import Marker, MarkerArray
 
+from deep_nrsfm_ros.body.kinematic_tree import quaternions
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
+from deep_nrsfm_ros.node.serialised_template import (
+    LIFETIME,
+    TRANSFORM_NUMBERS,
+    SerialisedTemplate,
+    mark,
+    template_header,
+    template_transform,
+)
 from deep_nrsfm_ros.nrsfm.geometry import centre, quaternion
 
 NO_EVENT_CALLBACKS = PublisherEventCallbacks(use_default_callbacks=False)
@@ -108,8 +118,8 @@ def to_header(header: Header) -> std_msgs.Header:
 
 def objects(
     header: Header, lifted: Lifted, identities: Sequence[str], *, positioned: bool = False
-) -> MultiDOFJointState:
-    """Return identity and transform of the object in each row of the point cloud.
+) -> bytes:
+    """Return the serialised identity and transform of the object in each row of the point cloud.
 
     Among the standard messages, only MultiDOFJointState has a header, a list of names and a
     transform for each: an object before a camera is a floating joint. TFMessage is in a package on
@@ -122,11 +132,22 @@ def objects(
         positioned: whether the shapes are at their positions before the camera.
 
     Returns:
-        Transforms as `transforms` gives them, NaN for objects that are not lifted.
+        A MultiDOFJointState: transforms as `transforms` gives them, NaN for objects that are not
+        lifted.
     """
-    message = MultiDOFJointState(header=to_header(header), joint_names=list(identities))
-    message.transforms = transforms(lifted, positioned=positioned)
-    return message
+    template = _objects(header.frame_id, tuple(identities))
+    shapes = lifted.shapes
+    places = shapes.mean(1) if positioned else np.zeros((len(shapes), 3))
+    turns = quaternions(lifted.rotations.astype(np.float64))
+    return template(header, np.concatenate([places, turns], -1))
+
+
+@lru_cache(_MAX_TEMPLATES)
+def _objects(frame_id: str, identities: tuple[str, ...]) -> SerialisedTemplate:
+    """Return the template of the transforms of objects."""
+    message = MultiDOFJointState(header=template_header(frame_id), joint_names=list(identities))
+    message.transforms = [template_transform(i) for i in range(len(identities))]
+    return SerialisedTemplate(message, TRANSFORM_NUMBERS * len(identities))
 
 
 def transforms(lifted: Lifted, *, positioned: bool) -> list[Transform]:
@@ -158,8 +179,8 @@ def markers(
     moment: Moment = _NO_MOMENT,
     *,
     positioned: bool = False,
-) -> MarkerArray:
-    """Return for each lifted object a list of lines (edges) and a list of spheres (keypoints).
+) -> bytes:
+    """Return the serialised MarkerArray of lifted objects: lines (edges), spheres (keypoints).
 
     Args:
         header: of the message.
@@ -170,26 +191,39 @@ def markers(
         positioned: whether the shapes are at their positions. If not, the first object is at the
             origin, as in the point cloud, and the others stand beside it as in the image.
     """
-    message, stamped = MarkerArray(), to_header(header)
-    if moment.restarted:
-        message.markers.append(Marker(header=stamped, action=Marker.DELETEALL))
-    seconds = max(_LIFETIME, _INTERVALS * moment.period)
-    lifetime = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
     lifted = Lifted(*(part[~np.isnan(lifted.residual)] for part in lifted))
-    sizes = np.sqrt((centre(lifted.shapes) ** 2).sum(-1).mean(-1)).tolist()
-    offsets = (lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]
-    positions = (np.zeros_like(offsets) if positioned else offsets).tolist()
-    for i, (shape, size, (x, y)) in enumerate(
-        zip(lifted.shapes.tolist(), sizes, positions, strict=True)
-    ):
-        points = [Point(x=px, y=py, z=pz) for px, py, pz in shape]
+    n, p, _ = lifted.shapes.shape
+    sizes = np.sqrt((centre(lifted.shapes) ** 2).sum(-1).mean(-1))[:, None]
+    places = np.zeros((n, 2))
+    if not positioned:
+        places[:] = (lifted.translation - lifted.translation[:1]) / lifted.scale[:, None]
+    ends = lifted.shapes[:, np.array(edges, int).reshape(-1)].reshape(n, -1)
+    joints, points = np.repeat(_JOINT_SIZE * sizes, 3, 1), lifted.shapes.reshape(n, 3 * p)
+    numbers = np.concatenate([ends, places, _BONE_SIZE * sizes, points, places, joints], 1)
+    template = _markers(header.frame_id, n, p, len(edges), moment.restarted)
+    return template(header, numbers, max(_LIFETIME, _INTERVALS * moment.period))
+
+
+@lru_cache(_MAX_TEMPLATES)
+def _markers(frame_id: str, n: int, p: int, edges: int, restarted: bool) -> SerialisedTemplate:
+    """Return the template of the markers of n objects with p keypoints."""
+    message, header, marks = MarkerArray(), template_header(frame_id), count()
+    if restarted:
+        message.markers.append(Marker(header=header, action=Marker.DELETEALL))
+
+    def numbers(k: int) -> list[float]:
+        return [mark(next(marks)) for _ in range(k)]
+
+    def points(k: int) -> list[Point]:
+        return [Point(x=x, y=y, z=z) for x, y, z in (numbers(3) for _ in range(k))]
+
+    for i in range(n):
         bones, joints = Marker(ns="bones", type=Marker.LINE_LIST), Marker(ns="joints")
-        joints.type, joints.points, joints.color = Marker.SPHERE_LIST, points, _JOINTS
-        bones.points, bones.color = [points[end] for edge in edges for end in edge], _BONES
-        joint, bone = _JOINT_SIZE * size, _BONE_SIZE * size
-        joints.scale, bones.scale = Vector3(x=joint, y=joint, z=joint), Vector3(x=bone)
-        for marker in (bones, joints):
-            marker.header, marker.id, marker.lifetime = stamped, i, lifetime
-            marker.pose.position = Point(x=x, y=y)
+        joints.type, joints.color, bones.color = Marker.SPHERE_LIST, _JOINTS, _BONES
+        for marker, k, sides in ((bones, 2 * edges, "x"), (joints, p, "xyz")):
+            marker.header, marker.id, marker.lifetime = header, i, LIFETIME
+            marker.points = points(k)
+            marker.pose.position = Point(**dict(zip("xy", numbers(2), strict=True)))
+            marker.scale = Vector3(**dict(zip(sides, numbers(len(sides)), strict=True)))
         message.markers += [bones, joints]
-    return message
+    return SerialisedTemplate(message, next(marks))

@@ -29,7 +29,12 @@ from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.node import body_messages
 from deep_nrsfm_ros.node.bodies import topic_name
-from deep_nrsfm_ros.node.serialised_template import SerialisedTemplate, mark
+from deep_nrsfm_ros.node.serialised_template import (
+    SerialisedTemplate,
+    TextTemplate,
+    mark,
+    text_mark,
+)
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 from test.fixtures.standing_person import (
     keypoints_of,
@@ -42,6 +47,7 @@ from test.node.test_camera import info, keypoints
 
 TREE = KinematicTree(HUMAN17)
 OFFSETS = TREE.offsets(TREE(standing_person()[None]))[0]
+CONFIDENCE = np.array([0.9, 0.2])
 STORE = get_typestore(Stores.ROS2_JAZZY)
 EXAMPLES = Path(__file__).parents[2] / "examples"
 Q = ("x", "y", "z", "w")
@@ -174,16 +180,25 @@ def test_forward_kinematics_of_the_urdf_agrees_with_the_frames_on_tf() -> None:
 
 def test_tracks_have_a_level_and_the_lost_ones() -> None:
     motion = Motion(np.zeros((2, 1, 3)), (TRACKED, BRIDGED), np.array([3.0, 1.0]), ("carl",))
-    message = body_messages.tracks(Header(), ("anna", "bert"), motion, np.array([0.9, 0.2]))
+    raw = body_messages.tracks(Header(4, 5, "camera"), ("anna", "bert"), motion, CONFIDENCE)
+    message = deserialize_message(raw, DiagnosticArray)
+    assert message.header.frame_id == "camera" and message.header.stamp.sec == 4
     found = [(s.name, s.message, s.level) for s in message.status]
     levels = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.STALE)
     assert found == [*zip(("anna", "bert", "carl"), (TRACKED, BRIDGED, LOST), levels, strict=True)]
-    assert {v.key: v.value for v in message.status[0].values}["age"] == "3.000"
+    said = [{v.key: v.value for v in s.values} for s in message.status]
+    assert said[0] == {"age": "3.000", "confidence": "0.900"} and not said[2]
+    later = Motion(np.zeros((1, 1, 3)), (TRACKED,), np.array([12.5]), ())  # a longer text
+    raw = body_messages.tracks(Header(), ("anna",), later, CONFIDENCE[:1])
+    assert deserialize_message(raw, DiagnosticArray).status[0].values[0].value == "12.500"
 
 
 def test_a_template_without_a_number_is_refused() -> None:
     with pytest.raises(ValueError, match="1 marked numbers; expected 2"):
         SerialisedTemplate(JointState(position=[mark(0), 3.0]), 2)
+    twice = JointState(name=[text_mark(0, 5)] * 2)
+    with pytest.raises(ValueError, match="text 0 of a template is missing, or is there twice"):
+        TextTemplate(twice, (5,))
 
 
 def test_identities_become_parts_of_topics() -> None:

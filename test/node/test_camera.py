@@ -19,9 +19,9 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages import serialised
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
-from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.transforms import frames
 from deep_nrsfm_ros.nrsfm.geometry import quaternion
+from test.node.test_publishing import read_markers
 
 P = len(HUMAN17)
 STREAM = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -162,7 +162,7 @@ def test_frames_lead_from_the_objects_to_the_camera() -> None:
 
 def test_markers_stand_where_the_points_are() -> None:
     lifted = placed()
-    markers = publishing.markers(serialised.Header(), lifted, [(0, 1)], positioned=True).markers
+    markers = read_markers(serialised.Header(), lifted, [(0, 1)], positioned=True)
     for marker in markers:
         position = marker.pose.position
         assert (position.x, position.y, position.z) == (0, 0, 0)
