@@ -27,7 +27,8 @@ def block_matrix(W: Floats, K: int, *, weighted: bool = False, iterations: int =
 
     `weighted`: the weighted nuclear norm of Kumar, "Non-rigid structure from motion: prior-free
     factorization method revisited", WACV 2020: large singular values are shrunk less. Its cameras
-    from several column triplets are left out.
+    from several column triplets are left out: refined, the triplets give the same cameras
+    (docs/devlog/accuracy.md).
     """
     R = block_rotations(W, K)
     return least_nuclear_norm(W, R, iterations, weighted=weighted)
