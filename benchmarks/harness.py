@@ -30,6 +30,7 @@ from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
 from deep_nrsfm_ros.training.progress import Progress
+from deep_nrsfm_ros.training.schedule import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 SNAPSHOTS = 10
@@ -70,7 +71,8 @@ class Session:
         if self.steps:
             recipe["steps"] = self.steps
         base = PRESETS[name]
-        return base._replace(recipe=dataclasses.replace(base.recipe, seed=seed, **recipe))
+        changed = dataclasses.replace(base.recipe, seed=seed, **recipe)
+        return base._replace(recipe=with_steps(changed, 0, None))
 
     def trained(self, title: str, dataset: Dataset, preset: Preset) -> Model:
         """Return the trained model, from the output folder if it exists."""

@@ -29,6 +29,7 @@ from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.loop import Callbacks, train
+from deep_nrsfm_ros.training.schedule import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 METRIC = "shape %"
@@ -142,12 +143,13 @@ def benchmark(args: Namespace) -> Iterator[Table]:
     trainings: dict[str, TimedTraining] = {}
     for name, contender in reversed(CONTENDERS.items()):
         base = PRESETS[contender.preset]
-        steps = 10 if args.quick else base.recipe.steps
+        steps = 10 if args.quick else None
         if args.steps and contender.preset == "default":
             steps = args.steps
         contender = contender._replace(interval=5) if args.quick else contender
         training = TimedTraining(contender, dataset, args.stride, 60 * args.limit_minutes)
-        recipe = dataclasses.replace(base.recipe, steps=steps)
+        recipe = dataclasses.replace(base.recipe, steps=steps) if steps else base.recipe
+        recipe = with_steps(recipe, len(dataset), None)
         training.run(base._replace(recipe=recipe), args.error)
         trainings[name] = training
     yield tabulate(trainings, args.error, args.threads)

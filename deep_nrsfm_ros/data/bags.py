@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from deep_nrsfm_ros.batched import Progress
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.dataset import Dataset, DatasetBuilder
@@ -42,8 +43,6 @@ from deep_nrsfm_ros.messages.decoding import (
 from deep_nrsfm_ros.messages.serialised import MessageReader
 
 STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
-Progress = Callable[[int, int], None]
-"""Called with the number of items done and their total number."""
 
 NO_SCORES = "gives no object a score (a field mapping can name it): leave out min_score"
 """Why `min_score` cannot act on a bag."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.batched import slices
+from deep_nrsfm_ros.batched import Progress, no_progress, slices
 from deep_nrsfm_ros.configuration import check, option
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.outliers import find_outliers
@@ -159,7 +159,9 @@ class Curated:
         return tuple(warnings)
 
 
-def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
+def curate(
+    dataset: Dataset, options: Curation | None = None, on_progress: Progress = no_progress
+) -> Curated:
     """Return a dataset without poor frames, near duplicates and outliers.
 
     Frames keep their order and their ground truth, which has no influence. Deterministic.
@@ -167,6 +169,8 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
     Args:
         dataset: is not changed.
         options: what to drop; None = defaults.
+        on_progress: called after each few thousand frames of both passes; an exception ends the
+            curation.
 
     Raises:
         ValueError: an option is out of range, or no frame has enough visible keypoints.
@@ -182,7 +186,10 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
     frames = np.flatnonzero(enough)
     candidates = dataset if enough.all() else dataset[frames]
     if options.min_change:
-        changed = changed_frames(candidates.points, candidates.visible, options.min_change)
+        changed = changed_frames(
+            *(candidates.points, candidates.visible, options.min_change),
+            lambda done, total: on_progress(done, 2 * total),
+        )
         if not changed.all():
             frames = frames[changed]
             candidates = dataset[frames]
@@ -191,7 +198,10 @@ def curate(dataset: Dataset, options: Curation | None = None) -> Curated:
     outliers[:] = False
     worst: NDArray[np.float64] = np.zeros(len(frames))
     if options.outlier_threshold:
-        outliers, worst = find_outliers(candidates.points, visible, options.outlier_threshold)
+        outliers, worst = find_outliers(
+            *(candidates.points, visible, options.outlier_threshold),
+            lambda done, total: on_progress(total + done, 2 * total),
+        )
     number = outliers.sum(1)
     keep = (number <= _MAX_OUTLIER_SHARE * visible.sum(1)) & (
         (number == 0) | (visible.sum(1) - number >= options.min_visible)
@@ -253,7 +263,12 @@ def spread_out(
     return chosen
 
 
-def changed_frames(points: NDArray[np.float32], visible: Bools, min_change: float) -> Bools:
+def changed_frames(
+    points: NDArray[np.float32],
+    visible: Bools,
+    min_change: float,
+    on_progress: Progress = no_progress,
+) -> Bools:
     """Return which frames (f,) differ from the few frames kept before them.
 
     A frame is a near duplicate if all its visible keypoints are visible in a kept frame too, and
@@ -263,6 +278,7 @@ def changed_frames(points: NDArray[np.float32], visible: Bools, min_change: floa
         points: (f, p, 2), in any unit.
         visible: (f, p).
         min_change: in RMS radii of the object, e.g. 0.02.
+        on_progress: called with the frames done and f.
     """
     kept = np.zeros(len(points), bool)
     recent: deque[_Kept] = deque(maxlen=_RECENT)
@@ -283,6 +299,7 @@ def changed_frames(points: NDArray[np.float32], visible: Bools, min_change: floa
             else:
                 kept[i] = True
                 recent.append(_Kept(i, pattern, frame))
+        on_progress(part.stop, len(points))
     return kept
 
 

@@ -16,9 +16,10 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
+from deep_nrsfm_ros.batched import Progress
 from deep_nrsfm_ros.data.bag_files import SUFFIXES, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
-from deep_nrsfm_ros.data.bags import NO_SCORES, Progress, keypoint_count
+from deep_nrsfm_ros.data.bags import NO_SCORES, keypoint_count
 from deep_nrsfm_ros.data.detections import Detections, gather
 from deep_nrsfm_ros.data.formats.arrays import read_npy, read_npz
 from deep_nrsfm_ros.data.formats.builder import (

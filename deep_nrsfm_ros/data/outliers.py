@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.batched import slices
+from deep_nrsfm_ros.batched import Progress, no_progress, slices
 from deep_nrsfm_ros.large_arrays import empty
 
 Floats = NDArray[np.float64]
@@ -172,7 +172,10 @@ class PointModel:
 
 
 def find_outliers(
-    points: NDArray[np.float32], visible: Bools, threshold: float
+    points: NDArray[np.float32],
+    visible: Bools,
+    threshold: float,
+    on_progress: Progress = no_progress,
 ) -> tuple[Bools, Floats]:
     """Return the outliers among the visible points, and the deviation of the worst.
 
@@ -183,6 +186,7 @@ def find_outliers(
         points: (f, p, 2), in any unit.
         visible: (f, p).
         threshold: Mahalanobis distance in typical distances of a point, 6 typical.
+        on_progress: called with the frames done and f.
 
     Returns:
         Outliers (f, p) bool, and the largest deviation (f,) of each frame; see
@@ -192,6 +196,7 @@ def find_outliers(
     outliers, worst = empty(visible.shape, bool), np.zeros(len(points))
     for part in slices(len(points)):
         outliers[part], worst[part] = _find_outliers(model, points[part], visible[part], threshold)
+        on_progress(part.stop, len(points))
     return outliers, worst
 
 

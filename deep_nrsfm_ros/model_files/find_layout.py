@@ -8,7 +8,7 @@ from pathlib import Path
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import LAYOUT_SUFFIXES, LayoutFileError, read_layout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS, preset
-from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, load_model
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, load_once
 
 NUMBERED = "numbered"
 """Stands for a layout of points without names, as many as the data has."""
@@ -37,7 +37,7 @@ def find_layout(option: str, name_or_path: str) -> KeypointLayout:
             )
         return layout
     if path.suffix == MODEL_SUFFIX:
-        return load_model(path).layout
+        return load_once(path).layout
     raise ValueError(
         f"{option} is {name_or_path!r}; name a preset ({', '.join(LAYOUTS)}), "
         f"a layout file ({LAYOUT_SUFFIXES[0]}) or a model file ({MODEL_SUFFIX})"

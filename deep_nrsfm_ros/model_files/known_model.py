@@ -10,7 +10,7 @@ from pathlib import Path
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
 from deep_nrsfm_ros.model_files.folders import shipped_models
-from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, ModelFileError, load_model
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, ModelFileError, load_once
 
 FROM_NONE = "none"
 """Stands for no model to start from: random weights."""
@@ -45,7 +45,7 @@ def known_model(object_layout: KeypointLayout | str, preferred: Sequence[Path] =
             with suppress(ModelFileError):
                 if path.suffix != MODEL_SUFFIX:
                     continue
-                own = load_model(path).layout
+                own = load_once(path).layout
                 if own.keypoints == layout.keypoints:
                     return path
                 if knows(own, layout):

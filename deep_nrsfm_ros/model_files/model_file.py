@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,24 @@ def load_model(model: str | Path, models_dir: Path | None = None) -> Model:
                 "not known here; install that version, or train the model anew"
             ) from e
         raise ModelFileError(f"{path} has a damaged header or weights: {e}") from e
+
+
+def load_once(path: Path) -> Model:
+    """Return `load_model(path)`; a file that has not changed since the last call is not read again.
+
+    All callers share the model: they do not change it.
+    """
+    try:
+        found = path.stat()
+    except OSError:
+        return load_model(path)  # it says what is wrong
+    return _load_version(path, found.st_ino, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=8)
+def _load_version(path: Path, inode: int, modified: int, size: int) -> Model:
+    """Return the model in a file; the other arguments tell its versions apart."""
+    return load_model(path)
 
 
 def _read(path: Path) -> bytes:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 
 from deep_nrsfm_ros.layouts.layout_file import LAYOUT_SUFFIXES
@@ -79,17 +80,18 @@ class PathSandbox:
         inside = [self._inside(option, word, d / path) for d in (self.models_dir, self.bags_dir)]
         return str(next((path for path in inside if path.exists()), inside[0]))
 
-    def bag(self, option: str, word: str) -> str:
-        """Return the path of a bag; a relative one begins in bags_dir. Raises PathSandboxError.
+    def recording(self, option: str, word: str) -> str:
+        """Return the path of a bag, a file of keypoints, or a folder of such.
 
-        One that the owner gave at the start is looked for in the working folder first. No file in
-        the folder of any other bag may be a link that leads elsewhere either.
+        A relative one begins in bags_dir. One that the owner gave at the start is looked for in the
+        working folder first. No file in any other folder, or in a folder in it, may be a link that
+        leads elsewhere either. Raises PathSandboxError.
         """
         path = _expanded(option, word)
         if word in self._owners and path.exists():
             return os.path.abspath(path)
         path = self._inside(option, word, self.bags_dir / path)
-        for file in path.iterdir() if path.is_dir() else ():
+        for file in chain(path.glob("*"), path.glob("*/*")):
             self._inside(option, f"{word}, in which {file.name}", file)
         return str(path)
 

@@ -16,7 +16,7 @@ from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, status
 from deep_nrsfm_ros.training.job import JobStatus, TrainingJob
 from deep_nrsfm_ros.training.record import find_records, read_record
-from deep_nrsfm_ros.training.request import TrainingRequest
+from deep_nrsfm_ros.training.request import TrainingRequest, data_in_words
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -91,8 +91,7 @@ class TrainingService:
             response.success, response.message = False, str(problem)
             return response
         self._name, self._activate_when = config.output.name, request.activate
-        topic = config.data.topic or "the keypoint topic"
-        data = f"{topic} of {', '.join(map(str, config.data.bags))}"
+        data = data_in_words(config.data)
         if config.resume:
             data = "the data that it began with"
         response.success = True

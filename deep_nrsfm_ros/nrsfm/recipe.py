@@ -12,16 +12,21 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
+AUTOMATIC = -1
+"""Number of steps that stands for one that follows from the start and the frames."""
+
 
 @dataclass(frozen=True)
 class Recipe:
     """Training."""
 
     steps: int = option(
-        30_000,
-        "gradient steps of the training; 0 = keep the network of the model to start from and learn "
-        "only its error covariance and bones anew",
-        low=0,
+        AUTOMATIC,
+        "gradient steps of the training; -1 = 30000 from random weights; where it starts from a "
+        "model of the same keypoints a third of the number of frames, at least 100, of other "
+        "keypoints ten times as many, at most 30000; 0 = keep the network of the model to start "
+        "from and learn only its error covariance and bones anew",
+        low=AUTOMATIC,
         high=10_000_000,
     )
     batch: int = option(64, "frames of each gradient step", low=1, high=65536)

@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
+from deep_nrsfm_ros.data.keypoint_files import recordings
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS
 from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
-from deep_nrsfm_ros.model_files.model_file import find_model, load_model
+from deep_nrsfm_ros.model_files.model_file import find_model, load_once
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Preset, Recipe
@@ -78,6 +79,10 @@ class DataConfig:
         """Return (width, height) in pixels, None where it is unknown."""
         size = (self.image_width, self.image_height)
         return size if all(size) else None
+
+    def files(self) -> list[Path]:
+        """Return the recordings that `inputs` names, also those in its folders."""
+        return [path for named in self.inputs for path in recordings(named.expanduser())]
 
 
 @dataclass(frozen=True)
@@ -178,7 +183,7 @@ class TrainingConfig:
 
         Raises ValueError for a file that is missing or damaged.
         """
-        model = load_model(path)
+        model = load_once(path)
         return dataclasses.replace(
             self,
             start=str(path),
@@ -284,7 +289,7 @@ PARAMETERS = OptionNames(
         "image_width": "image_width",
         "image_height": "image_height",
         "min_score": "min_score",
-        "data": "train.bags",
+        "data": "train.bags and train.inputs",
     },
 )
 

@@ -8,6 +8,8 @@ random cameras, are what the network must return. The model lifts new frames lik
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -30,7 +32,13 @@ MAX_SPREAD = 0.25
 _FLOOR = 1e-3  # of the whitening that fills in missing keypoints
 
 
-def factorise(frames: FrameStore, preset: Preset) -> Consensus | None:
+class _StoppedError(Exception):
+    """The training was stopped while its frames were factorised."""
+
+
+def factorise(
+    frames: FrameStore, preset: Preset, should_stop: Callable[[], bool] = lambda: False
+) -> Consensus | None:
     """Return the shapes of the frames by factorisation; None where a network learns them better.
 
     They are None for many or very few frames, short trainings, many missing keypoints, and where
@@ -39,7 +47,13 @@ def factorise(frames: FrameStore, preset: Preset) -> Consensus | None:
     Args:
         frames: all frames of the training.
         preset: its recipe says for how many frames to factorise.
+        should_stop: called before each factorisation; None is returned once it is True.
     """
+
+    def check() -> None:
+        if should_stop():
+            raise _StoppedError
+
     recipe, p = preset.recipe, frames.points.shape[1]
     if not MIN_FRAMES <= len(frames) <= recipe.few_frames or recipe.steps < MIN_STEPS:
         return None
@@ -57,7 +71,10 @@ def factorise(frames: FrameStore, preset: Preset) -> Consensus | None:
         points, _ = complete(
             net.from_named_weights(net.architecture, weights), centred * mask, mask
         )
-    found = consensus(points)
+    try:
+        found = consensus(points, check)
+    except _StoppedError:
+        return None
     return found if found.spread <= MAX_SPREAD else None
 
 

@@ -19,7 +19,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import from_arrays
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
-from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model
+from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model, load_once
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 
@@ -56,7 +56,8 @@ def train(
         name: name of the model.
         start: model to start from, its name or its file. "" is a model that comes with the package
             and has most keypoints of the layout, if there is one; "none" is random weights.
-        recipe: steps, seed and all else of the training; None stands for the defaults, 30000
+        recipe: steps, seed and all else of the training; None stands for the defaults: from a
+            model of the same keypoints a step for each three frames, from random weights 30000
             steps, which take minutes. `Recipe(steps=3000, seed=1)` is a first look.
         on_progress: called every few seconds, and at the end.
 
@@ -118,4 +119,4 @@ def _origin(start: Model | str, layout: KeypointLayout) -> Model | None:
 def _shipped(layout: KeypointLayout) -> Model | None:
     """Return the model of the package that has the keypoints of a layout, if there is one."""
     known = known_model(layout)
-    return load_model(known) if known else None
+    return load_once(known) if known else None

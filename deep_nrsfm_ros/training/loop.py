@@ -33,6 +33,7 @@ from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
 from deep_nrsfm_ros.training.progress import Clock, Progress
+from deep_nrsfm_ros.training.schedule import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
@@ -133,6 +134,10 @@ def train(
         raise ValueError("steps is 0 and there is no network to start from; it must be at least 1")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     frames, group = _frames_with_extent(points, visible), setup.group
+    count = torch.tensor(len(frames))
+    if setup.own_frames:
+        group.sum_in_place(count)
+    preset = preset._replace(recipe=with_steps(preset.recipe, int(count), setup.start))
     if group.size > min(len(frames) * (group.size if setup.own_frames else 1), preset.recipe.batch):
         raise ValueError(
             f"{group.size} processes are more than the {len(frames)} frames or the batch of "
@@ -143,7 +148,7 @@ def train(
     if group.rank:
         checkpointing = dataclasses.replace(checkpointing, file=None)
     alone = setup.start is None and group.size == 1
-    known = factorise(part, preset) if alone else None
+    known = factorise(part, preset, callbacks.should_stop) if alone else None
     loop = _Loop(part, preset, setup, callbacks, checkpointing, known)
     file = checkpointing.file
     saved = group.broadcast(read_checkpoint(file) if file is not None and file.exists() else None)

@@ -13,7 +13,7 @@ from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.bags import TooManyFramesError, keypoint_count, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
-from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints, recordings
+from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.share import Share
@@ -112,14 +112,9 @@ def _numbered(data: DataConfig, options: ReadOptions) -> KeypointLayout:
     """Return the layout of points without names, as many as the objects in the data have."""
     if data.bags:
         return KeypointLayout.numbered(keypoint_count(data.bags, options))
-    first = _paths(data)[0]
+    first = data.files()[0]
     detections = read_keypoints(first, _options_for(first, options))
     return KeypointLayout.numbered(detections.confidence.shape[1])
-
-
-def _paths(data: DataConfig) -> list[Path]:
-    """Return the files of keypoints, also those in folders of recordings."""
-    return [path for named in data.inputs for path in recordings(named.expanduser())]
 
 
 def _read_bags(
@@ -151,7 +146,7 @@ def _read_inputs(
     Each of several processes reads every n-th file; where there are fewer files than processes, it
     takes its share of the objects in each.
     """
-    paths, share = _paths(data), own_share()
+    paths, share = data.files(), own_share()
     is_only_source = len(paths) == 1 and not data.bags
     if len(paths) >= share.size:
         paths, share = paths[share.index :: share.size], Share()
@@ -193,7 +188,7 @@ def prepare(curation: Curation, dataset: Dataset, reporter: Reporter) -> Prepare
 
     Raises ValueError where no model can be learned from what is left.
     """
-    curated = curate(dataset, curation)
+    curated = curate(dataset, curation, reporter.curating)
     if curated.summary:
         reporter.say(curated.summary)
     sufficiency = assess_sufficiency(curated.dataset)

@@ -77,7 +77,7 @@ def _summary(config: TrainingConfig) -> str:
         "cmu": config.data.cmu,
         "topic": config.data.topic,
         "object": config.object,
-        "steps": config.recipe.steps,
+        "steps": max(config.recipe.steps, 0),  # not those that follow from the frames
     }
     return "; ".join(f"{name} {option_text(value)}" for name, value in values.items() if value)
 

@@ -34,7 +34,8 @@ class Reporter:
 
         Args:
             as_json: JSON lines on standard output instead of a bar.
-            should_stop: True ends reading, which may take minutes, by `CancelledError`.
+            should_stop: True ends reading and curation, which may take minutes, by
+                `CancelledError`.
         """
         self.as_json, self._should_stop = as_json, should_stop
         self._bar: tqdm[Any] | None = None
@@ -45,10 +46,18 @@ class Reporter:
 
     def reading(self, done: int, total: int) -> None:
         """Report that `done` of `total` messages or trials are read."""
+        self._count("reading", done, total)
+
+    def curating(self, done: int, total: int) -> None:
+        """Report that `done` of `total` frames are curated, each of them counted in each pass."""
+        self._count("curating", done, total)
+
+    def _count(self, state: str, done: int, total: int) -> None:
+        """Report a state from time to time, and at its end; raise CancelledError to end it."""
         if self._should_stop():
             raise CancelledError
         if done == total or time.monotonic() - self._last > 0.2:
-            self._show("reading", done, total, {})
+            self._show(state, done, total, {})
         if done == total:
             self._close_bar()
 

@@ -13,6 +13,7 @@ from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.data.bag_files import open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.data.keypoint_files import is_bag
 from deep_nrsfm_ros.messages.options import MODEL_ORDER
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
 from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
@@ -31,6 +32,11 @@ class TrainingOptions:
     """Data and result of the service ~/train: the parameters `train.*` that no other part has."""
 
     bags: tuple[str, ...] = option((), "rosbag2 folders or files to train on")
+    inputs: tuple[str, ...] = option(
+        (),
+        "files of keypoints to train on beside the bags, of any kind that `lift` reads, or folders "
+        "of such recordings",
+    )
     topic: str = option(
         "",
         "topic in the bags; empty = the topic that the lifter listens to, or where a bag lacks it, "
@@ -148,11 +154,14 @@ def training_request(
     """
     options = sandboxed(parameters.options, sandbox)
     source, target = choose_layouts(options, lifter)
-    bags = tuple(Path(bag) for bag in options.bags)
+    named = (tuple(map(Path, words)) for words in (options.bags, options.inputs))
+    data = DataConfig(*named)
+    bags = [*data.bags, *filter(is_bag, data.files())]
+    has_topic = bags or not data.inputs  # a resumed training names no data
     config = TrainingConfig(
-        data=DataConfig(
-            bags=bags,
-            topic=options.topic or choose_topic(bags, lifter),
+        data=dataclasses.replace(
+            data,
+            topic=options.topic or (choose_topic(bags, lifter) if has_topic else ""),
             keypoint_layout=source,
             min_confidence=lifter.min_confidence,
             mapping=lifter.mapping,
@@ -199,6 +208,14 @@ def choose_topic(bags: Sequence[Path], lifter: LifterInput) -> str:
     return topics.pop() if len(topics) == 1 else ""
 
 
+def data_in_words(data: DataConfig) -> str:
+    """Return the data of a training, e.g. "/keypoints of bag_1, bag_2 and hands.npz"."""
+    bags, inputs = (", ".join(map(str, named)) for named in (data.bags, data.inputs))
+    if not bags:
+        return inputs
+    return f"{data.topic or 'the keypoint topic'} of {bags}" + (f" and {inputs}" if inputs else "")
+
+
 def choose_layouts(options: TrainingOptions, lifter: LifterInput) -> tuple[str, str]:
     """Return the layouts of the bags and of the new model, each as `find_layout` takes it.
 
@@ -217,7 +234,7 @@ def choose_layouts(options: TrainingOptions, lifter: LifterInput) -> tuple[str, 
 def paths_of(options: TrainingOptions) -> tuple[str, ...]:
     """Return the values of all options that may be paths."""
     start = "" if options.from_ == FROM_NONE else options.from_
-    return (*options.bags, options.object, options.keypoint_layout, start)
+    return (*options.bags, *options.inputs, options.object, options.keypoint_layout, start)
 
 
 def sandboxed(options: TrainingOptions, sandbox: PathSandbox) -> TrainingOptions:
@@ -229,7 +246,8 @@ def sandboxed(options: TrainingOptions, sandbox: PathSandbox) -> TrainingOptions
     sandbox.outputs("train.name", (*results, *traces))
     return dataclasses.replace(
         options,
-        bags=tuple(sandbox.bag("train.bags", bag) for bag in options.bags),
+        bags=tuple(sandbox.recording("train.bags", word) for word in options.bags),
+        inputs=tuple(sandbox.recording("train.inputs", word) for word in options.inputs),
         object=sandbox.layout("train.object", options.object),
         keypoint_layout=sandbox.layout("train.keypoint_layout", options.keypoint_layout),
         from_=(

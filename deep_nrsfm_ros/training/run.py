@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.held_out import Split, split
-from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
 from deep_nrsfm_ros.training.data_check import check_dataset
@@ -105,7 +105,7 @@ def _train_and_save(
     should_stop: Callable[[], bool],
 ) -> TrainingResult | None:
     """Train on the prepared data; the first process saves the model and returns the result."""
-    start, rival = (load_model(Path(f)) if f else None for f in (config.start, config.rival))
+    start, rival = (load_once(Path(f)) if f else None for f in (config.start, config.rival))
     _describe(prepared, reporter, start)
     share = config.curation.held_out if rival else 0.0
     frames = split(prepared.dataset, share)
@@ -171,7 +171,7 @@ def _train(
 ) -> Trainer:
     """Return the trainer after the training loop; this process has left its group then."""
     weights = config.layout_loss
-    start = start_from(load_model(Path(config.start)), dataset.layout) if config.start else None
+    start = start_from(load_once(Path(config.start)), dataset.layout) if config.start else None
     weights.check(dataset.layout, COMMAND_LINE)
     import torch  # takes seconds; a wrong configuration is refused without it
 

@@ -1,11 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The schedule of the learning rate: from the steps taken to the rate of the next step."""
+"""The schedule of a training: its number of steps, and the learning rate of each."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
-from deep_nrsfm_ros.nrsfm.recipe import Recipe
+import numpy as np
+
+from deep_nrsfm_ros.nrsfm.network import Network
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Recipe
+
+FROM_RANDOM = 30_000
+"""Steps of a training from random weights, and the most of one that starts from a model."""
+_FRAMES_A_STEP = 3  # of a training that starts from a model: each frame is seen 21 times
+_FEWEST = 100
+_OTHER_KEYPOINTS = 10  # times as many steps, as new keypoints are learned from nothing
+
+
+def with_steps(recipe: Recipe, frames: int, start: Network | None) -> Recipe:
+    """Return the recipe with the number of its steps in place of `AUTOMATIC`.
+
+    A trained network has learned what shapes there are, so that a few passes over the new frames
+    suffice; with more it fits their noise. `benchmarks/real/fine_tuning.py` compares numbers.
+
+    Args:
+        recipe: whose steps may be `AUTOMATIC`.
+        frames: of all processes.
+        start: the network that the training starts from; not whitened where it has other keypoints
+            than its model. None: random weights.
+    """
+    if recipe.steps != AUTOMATIC:
+        return recipe
+    wanted = FROM_RANDOM
+    if start is not None:
+        wanted = max(frames // _FRAMES_A_STEP, _FEWEST)
+        if np.array_equal(start.L, np.eye(start.p)):
+            wanted *= _OTHER_KEYPOINTS
+    return dataclasses.replace(recipe, steps=min(wanted, FROM_RANDOM))
 
 
 def learning_rate(recipe: Recipe, step: float, time_fraction: float = 0.0) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
-from deep_nrsfm_ros.data.keypoint_files import is_bag, recordings
+from deep_nrsfm_ros.data.keypoint_files import is_bag
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -18,7 +18,7 @@ from deep_nrsfm_ros.layouts.presets import HUMAN17, HUMAN25
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
-from deep_nrsfm_ros.model_files.model_file import check_name, load_model
+from deep_nrsfm_ros.model_files.model_file import check_name, load_once
 from deep_nrsfm_ros.training.config import DataConfig, OptionNames, TrainingConfig
 from deep_nrsfm_ros.training.disk import check_room
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
@@ -62,7 +62,7 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
     if not config.recipe.steps and not config.start:
         raise ValueError(f"{names('steps')} is 0: name the model to keep with {names('start')}")
     if config.start:
-        start = load_model(Path(config.start))
+        start = load_once(Path(config.start))
         if target != _NUMBERED_LAYOUT:
             start_from(start, target)
         check_fixed_options(start, config.preset, names)
@@ -131,7 +131,7 @@ def _check_data(config: TrainingConfig, names: OptionNames) -> None:
         for path in getattr(data, field):
             if not path.expanduser().exists():
                 raise ValueError(f"{names(field)} names {path}, which does not exist")
-    files = [path for named in data.inputs for path in recordings(named.expanduser())]
+    files = data.files()
     if data.category and not any(not is_bag(path) for path in files):
         raise ValueError(f"{names('category')} has no effect on bags: leave it out")
     if data.topic and not (data.bags or data.cmu or any(map(is_bag, files))):

@@ -152,7 +152,7 @@ def test_from_bag_to_model(
     assert in_process(*words) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     states = [line["state"] for line in lines]
-    order = ["reading", "training", "finished"]
+    order = ["reading", "curating", "training", "finished"]
     assert states[-1] == "finished" and [*dict.fromkeys(states)] == [
         s for s in order if s in states
     ]
@@ -193,8 +193,10 @@ def test_cancelling_keeps_what_was_learned(
 
 
 def stop_after(steps: int) -> Callable[[], Callable[[], bool]]:
+    """Stop after so many steps, or in the curation (-1)."""
     calls = iter(range(10**6))
-    return lambda: lambda: next(calls) >= steps
+    before = 1 + 2  # once after reading, and once in each pass of the curation
+    return lambda: lambda: next(calls) >= before + steps
 
 
 def test_resume_goes_on_where_it_was_cancelled(
@@ -207,7 +209,7 @@ def test_resume_goes_on_where_it_was_cancelled(
     assert in_process(*words) == 0
     whole = dict(load_model(models / "mine.safetensors").network.named_weights())
     with monkeypatch.context() as cancelled:
-        cancelled.setattr(train, "stop_on_signals", stop_after(1 + 5))  # once after reading
+        cancelled.setattr(train, "stop_on_signals", stop_after(5))
         assert in_process(*words) == 0
     assert load_model(models / "mine.safetensors").provenance["step"] == 5
     taken: list[int] = []
@@ -220,6 +222,19 @@ def test_resume_goes_on_where_it_was_cancelled(
     assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
 
 
+def test_the_curation_can_be_stopped(
+    arguments: list[str],
+    models: Path,
+    in_process: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(train, "stop_on_signals", stop_after(-1))
+    assert in_process(*arguments) == 0
+    assert "cancelled before anything was learned" in capsys.readouterr().out
+    assert not list(models.glob("*"))
+
+
 def test_without_resume_it_begins_anew(
     arguments: list[str],
     models: Path,
@@ -227,7 +242,7 @@ def test_without_resume_it_begins_anew(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with monkeypatch.context() as cancelled:
-        cancelled.setattr(train, "stop_on_signals", stop_after(5))
+        cancelled.setattr(train, "stop_on_signals", stop_after(4))
         assert in_process(*arguments, "--steps", "12") == 0
     # A checkpoint of another architecture would be refused, were it read.
     assert in_process(*arguments, "--steps", "3", "--widths", "6", "3") == 0
@@ -262,7 +277,7 @@ def test_a_cancelled_screening_keeps_a_model_and_goes_on(
     whole = load_model(models / "mine.safetensors")
     capsys.readouterr()
     with monkeypatch.context() as cancelled:
-        cancelled.setattr(train, "stop_on_signals", stop_after(7))
+        cancelled.setattr(train, "stop_on_signals", stop_after(6))
         assert in_process(*words) == 0
     assert "--resume goes on" in capsys.readouterr().out
     assert assert_lifts(models / "mine.safetensors").provenance["step"] == 5
@@ -469,7 +484,7 @@ def test_it_does_not_resume_what_started_elsewhere(
     assert in_process(*arguments, "--steps", "3") == 0
     start = (*arguments[: -len(QUICK)], "--name", "next", "--steps", "12", "--batch", "8")
     with monkeypatch.context() as cancelled:
-        cancelled.setattr(train, "stop_on_signals", stop_after(5))
+        cancelled.setattr(train, "stop_on_signals", stop_after(4))
         assert in_process(*start, "--from", "mine") == 0
     # The same data, but the whitening of another training.
     path = models / "mine.safetensors"

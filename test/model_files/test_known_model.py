@@ -10,8 +10,15 @@ import pytest
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17, LAYOUTS
+from deep_nrsfm_ros.model_files import model_file
 from deep_nrsfm_ros.model_files.known_model import known_model, knows
-from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
+from deep_nrsfm_ros.model_files.model_file import (
+    Model,
+    ModelFileError,
+    load_model,
+    load_once,
+    save_model,
+)
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
@@ -23,6 +30,24 @@ def save(path: Path, layout: KeypointLayout) -> Path:
     model = Model("any", network, layout, Normaliser(), np.eye(3, dtype=np.float32))
     save_model(path, model)
     return path
+
+
+def test_a_file_is_read_once_until_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, read = save(tmp_path / "dog.safetensors", DOG), []
+
+    def counted(file: Path) -> Model:
+        read.append(file)
+        return load_model(file)
+
+    monkeypatch.setattr(model_file, "load_model", counted)
+    assert load_once(path) is load_once(path) and len(read) == 1
+    assert known_model(DOG, [path]) == path and len(read) == 1
+    save(path, HUMAN17)
+    assert load_once(path).layout.keypoints == HUMAN17.keypoints and len(read) == 2
+    with pytest.raises(ModelFileError, match="cannot read"):
+        load_once(tmp_path / "none.safetensors")
 
 
 @pytest.mark.parametrize("name", ["coco17", "body25", "body25b", "mediapipe33", "halpe26"])

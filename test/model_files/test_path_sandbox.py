@@ -51,7 +51,7 @@ def sandbox(places: Path) -> PathSandbox:
 
 @pytest.mark.parametrize("word", OUTSIDE)
 def test_paths_that_lead_outside_are_refused_with_the_mend(sandbox: PathSandbox, word: str) -> None:
-    asked: list[Callable[[], object]] = [lambda: sandbox.bag("train.bags", word)]
+    asked: list[Callable[[], object]] = [lambda: sandbox.recording("train.bags", word)]
     if "safetensors" in word:
         asked += [
             lambda: sandbox.model("model", word),
@@ -75,8 +75,12 @@ def test_a_name_that_climbs_is_no_model(sandbox: PathSandbox) -> None:
 
 def test_a_bag_may_not_hold_a_link_that_leaves(sandbox: PathSandbox, places: Path) -> None:
     with pytest.raises(PathSandboxError, match="half_a_bag, in which a_bag.db3"):
-        sandbox.bag("train.bags", "half_a_bag")
-    assert sandbox.bag("train.bags", "stays") == str(places / "bags" / "a_bag")
+        sandbox.recording("train.bags", "half_a_bag")
+    assert sandbox.recording("train.bags", "stays") == str(places / "bags" / "a_bag")
+    (places / "bags" / "recordings").mkdir()
+    (places / "bags" / "half_a_bag").rename(places / "bags" / "recordings" / "half_a_bag")
+    with pytest.raises(PathSandboxError, match="recordings, in which a_bag.db3"):
+        sandbox.recording("train.inputs", "recordings")
 
 
 def test_what_is_inside_is_found_by_name_and_by_path(sandbox: PathSandbox, places: Path) -> None:
@@ -86,7 +90,9 @@ def test_what_is_inside_is_found_by_name_and_by_path(sandbox: PathSandbox, place
     assert sandbox.layout("train.object", "door.yaml") == str(places / "models" / "door.yaml")
     (places / "models" / "door.yaml").unlink()
     assert sandbox.layout("train.object", "door.yaml") == str(places / "bags" / "door.yaml")
-    assert sandbox.bag("train.bags", str(places / "models" / "a_bag")).endswith("models/a_bag")
+    assert sandbox.recording("train.bags", str(places / "models" / "a_bag")).endswith(
+        "models/a_bag"
+    )
     assert sandbox.layout("keypoint_layout", "coco17") == "coco17"
     with pytest.raises(ModelFileError, match="there is no model file"):
         sandbox.model("model", "gone.safetensors")
@@ -106,13 +112,13 @@ def test_what_the_owner_names_at_the_start_may_be_anywhere(
     words = ("outside/door.yaml", str(places / "outside" / "a_bag"), "outside/secret.safetensors")
     sandbox = PathSandbox(places / "models", places / "bags", words)
     assert sandbox.layout("train.object", words[0]) == str(places / words[0])
-    assert sandbox.bag("train.bags", words[1]) == words[1]
+    assert sandbox.recording("train.bags", words[1]) == words[1]
     assert sandbox.model("model", words[2]).is_file()
     # A bag that the working folder lacks is one of bags_dir.
     sandbox = PathSandbox(places / "models", places / "bags", ("a_bag",))
-    assert sandbox.bag("train.bags", "a_bag") == str(places / "bags" / "a_bag")
+    assert sandbox.recording("train.bags", "a_bag") == str(places / "bags" / "a_bag")
     with pytest.raises(PathSandboxError):
-        sandbox.bag("train.bags", "/etc")
+        sandbox.recording("train.bags", "/etc")
 
 
 def test_nothing_is_written_through_a_link_that_leaves(sandbox: PathSandbox) -> None:
@@ -131,7 +137,7 @@ def test_no_word_leads_outside(tmp_path_factory: pytest.TempPathFactory, word: s
     folders = root / "m", root / "b"
     sandbox = PathSandbox(*folders)
     inside = [os.path.realpath(folder) for folder in folders]
-    for ask in (sandbox.bag, sandbox.layout, sandbox.model):
+    for ask in (sandbox.recording, sandbox.layout, sandbox.model):
         try:
             found = ask("option", word)
         except (ValueError, OSError):

@@ -61,7 +61,7 @@ def test_where_it_has_no_place_nothing_is_factorised(
     hidden: float,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(few_frames, "consensus", agreed)
+    monkeypatch.setattr(few_frames, "consensus", lambda W, _: agreed(W))
     assert factorise(store(figure), preset()) is not None
     assert factorise(store(figure, frames, hidden), preset(**recipe)) is None
 
@@ -69,13 +69,13 @@ def test_where_it_has_no_place_nothing_is_factorised(
 def test_solutions_that_disagree_are_not_believed(
     figure: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(few_frames, "consensus", lambda W: agreed(W, 1.01 * MAX_SPREAD))
+    monkeypatch.setattr(few_frames, "consensus", lambda W, _: agreed(W, 1.01 * MAX_SPREAD))
     assert factorise(store(figure), preset()) is None
 
 
 def test_missing_keypoints_are_filled_in(figure: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
-    monkeypatch.setattr(few_frames, "consensus", lambda W: seen.append(W) or agreed(W))
+    monkeypatch.setattr(few_frames, "consensus", lambda W, _: seen.append(W) or agreed(W))
     factorise(store(figure, hidden=0.1), preset())
     points = figure.points[:FRAMES] - figure.points[:FRAMES].mean(1, keepdims=True)
     filled = seen[0] - seen[0].mean(1, keepdims=True)
@@ -98,7 +98,7 @@ def test_the_network_is_taught_the_factorisation(
     monkeypatch.setattr(few_frames, "MIN_STEPS", 1)
     points, truth = figure.points[:FRAMES], figure.shapes[:FRAMES]
     turned = Consensus(truth * [1, 1, -1], np.zeros((FRAMES, 3, 3)), np.ones(FRAMES), 0.01, 5)
-    monkeypatch.setattr(few_frames, "consensus", lambda W: turned)
+    monkeypatch.setattr(few_frames, "consensus", lambda W, _: turned)
     small = preset(steps=300)
     small = small._replace(architecture=dataclasses.replace(small.architecture, widths=(64, 32)))
     trainer = loop.train(points, np.ones(points.shape[:2], bool), small)
@@ -107,3 +107,9 @@ def test_the_network_is_taught_the_factorisation(
     model = finish(trainer, "few", figure.layout, "test")
     assert model.provenance["factorisation"] == {"solutions": 5, "spread": 0.01}
     assert trainer.measure()[1] < 0.2
+
+
+def test_it_can_be_stopped_between_factorisations(figure: Any) -> None:
+    answers = iter([False, False, True])
+    assert factorise(store(figure), preset(), lambda: next(answers)) is None
+    assert next(answers, "none is left") == "none is left"

@@ -30,6 +30,7 @@ from deep_nrsfm_ros.training.request import (
     TrainingRequest,
     choose_layouts,
     choose_topic,
+    data_in_words,
     training_request,
 )
 
@@ -83,6 +84,32 @@ def test_every_parameter_reaches_the_configuration(tmp_path: Path) -> None:
     assert request(tmp_path, topic="/other").config.data.topic == "/other"
     with pytest.raises(ValueError, match="allows at most 2"):
         request(tmp_path, max_minutes=2.0)
+
+
+def test_files_of_keypoints_are_data_too(tmp_path: Path) -> None:
+    np.savez(tmp_path / "people.npz", points=np.ones((20, 17, 2)))
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "people.npz").write_bytes((tmp_path / "people.npz").read_bytes())
+    asked = request(tmp_path, inputs=("people.npz", "more"))
+    assert asked.config.data.files() == [
+        tmp_path / "people.npz",
+        tmp_path / "more" / "people.npz",
+    ]
+    assert (asked.config.data.bags, asked.config.data.topic) == ((), "")  # a file has no topic
+    asked.accept()
+    assert data_in_words(asked.config.data) == f"{tmp_path}/people.npz, {tmp_path}/more"
+    write_bag(tmp_path / "bag", INPUT.topic, frames(np.ones((2, 17, 2)), np.ones((2, 17))))
+    both = request(tmp_path, bags=("bag",), inputs=("people.npz",)).config.data
+    assert data_in_words(both) == f"{INPUT.topic} of {tmp_path}/bag and {tmp_path}/people.npz"
+    assert request(tmp_path, inputs=("bag",)).config.data.topic == INPUT.topic
+    with pytest.raises(
+        ValueError, match=r"train\.inputs names .*nowhere.npz, which does not exist"
+    ):
+        request(tmp_path, inputs=("nowhere.npz",)).accept()
+    with pytest.raises(ValueError, match=r"train\.inputs names /etc/passwd, .* outside"):
+        request(tmp_path, inputs=("/etc/passwd",))
+    with pytest.raises(ValueError, match=r"train\.bags and train\.inputs"):
+        request(tmp_path).accept()
 
 
 def test_a_start_brings_its_architecture(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.reporting.stage import Stage, make_stage, stage_page
 
 TORSO = 0.5
@@ -54,7 +55,10 @@ def arguments() -> argparse.ArgumentParser:
         "the extras ros and train",
     )
     parser.add_argument(
-        "--train-steps", type=int, default=300, help="training steps; 0 = no training"
+        "--train-steps",
+        type=int,
+        default=AUTOMATIC,
+        help="training steps; -1 = as many as `train` takes, 0 = no training",
     )
     return parser
 

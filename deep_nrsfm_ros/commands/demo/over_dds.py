@@ -32,6 +32,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.folders import model_folders
 from deep_nrsfm_ros.model_files.model_file import find_model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.training.job import ENDED
 
 TOPIC = "/keypoints"
@@ -76,7 +77,7 @@ def run(given: argparse.Namespace) -> None:
         "train.bags": f"[{bags['keypoints'].absolute()}]",
         "train.topic": TOPIC,
         "train.name": TRAINED,
-        "train.steps": max(1, given.train_steps),
+        "train.steps": given.train_steps or AUTOMATIC,
         "train.minutes": _MOST_MINUTES,
     }
     with lifter(parameters, given.output / LOG) as process:

@@ -19,7 +19,7 @@ Source: Dai, Li and He (2014); Torresani, Hertzmann and Bregler (2008); the cons
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,18 +80,20 @@ class _Solution(NamedTuple):
     S: Floats
 
 
-def consensus(W: Floats) -> Consensus:
+def consensus(W: Floats, before_each: Callable[[], None] = lambda: None) -> Consensus:
     """Return the shapes on which factorisations of all frames agree.
 
     Args:
         W: (f, p, 2) complete images, x right and y down; at least 4 frames and points.
+        before_each: called before each factorisation, which takes a second or two of 1000 frames;
+            an exception ends the work.
     """
     W = centre(W.astype(np.float64))
     scales = image_scales(W)
     W = W / scales[:, None, None]
-    starts = _best_starts(W)
-    exact = _exact(W)
-    refined = [] if exact else [item for start in starts for item in _refined(W, start)]
+    starts = _best_starts(W, before_each)
+    exact = _exact(W, before_each)
+    refined = [] if exact else [s for start in starts for s in _refined(W, start, before_each)]
     starts = exact or starts
     solutions = starts + refined
     depth = np.stack([(item.S @ item.Q.swapaxes(1, 2))[..., 2] for item in solutions])
@@ -127,25 +129,29 @@ def image_scales(W: Floats) -> Floats:
     return np.ones(len(W)) if same else scales
 
 
-def _best_starts(W: Floats) -> list[_Solution]:
+def _best_starts(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     """Return the cameras that allow shapes of the lowest nuclear norm, with these shapes."""
     most = min(2 * len(W), W.shape[1]) // 3
     cameras = [rigid_rotations(W)]
     cameras += [block_rotations(W, K) for K in sorted({min(K, most) for K in RANKS})]
     starts, norms = [], []
     for R in cameras:
+        before_each()
         S = least_nuclear_norm(W, R)
         starts.append(_meeting(W, rotation_from_camera(R.swapaxes(1, 2)), S))
         norms.append(np.linalg.svd(starts[-1].S.reshape(len(W), -1), compute_uv=False).sum())
     return [s for s, norm in zip(starts, norms, strict=True) if norm <= _SAME_NORM * min(norms)]
 
 
-def _exact(W: Floats) -> list[_Solution]:
+def _exact(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     """Return the likelier solution of EM-PPCA with 2 and 3 modes, if it leaves no noise.
 
     It starts from rigid factorisation: the least nuclear norm is far from few modes.
     """
-    models = [fit(W, K, iterations=_EM_ITERATIONS) for K in (2, _FEW_MODES)]
+    models = []
+    for K in (2, _FEW_MODES):
+        before_each()
+        models.append(fit(W, K, iterations=_EM_ITERATIONS))
     model = min(models, key=lambda model: model.variance)
     if model.variance > _NO_NOISE * float((W**2).mean()):
         return []
@@ -153,9 +159,10 @@ def _exact(W: Floats) -> list[_Solution]:
     return [_meeting(W, model.Q, shapes_of(W, model))]
 
 
-def _refined(W: Floats, start: _Solution) -> Iterator[_Solution]:
+def _refined(W: Floats, start: _Solution, before_each: Callable[[], None]) -> Iterator[_Solution]:
     """Yield the solutions of EM-PPCA with different numbers of modes."""
     for K in MODES:
+        before_each()
         model = from_shapes(W, start.Q, start.S, K, iterations=_EM_ITERATIONS)
         yield _meeting(W, model.Q, shapes_of(W, model))
 
