@@ -129,7 +129,7 @@ def cmu(data: Path) -> list[Part]:
 def hand_nyu(data: Path) -> list[Part]:
     """Return the labelled hand."""
     hand = hands.labelled(data / "scenes")
-    known = np.isfinite(hand.truth).all((0, 2))
+    known = np.asarray(np.isfinite(hand.truth).all((0, 2)))
     names = [name for name, has in zip(preset("hand21").keypoints, known, strict=True) if has]
     return [Part(preset("hand21"), hand.points, hand.confidence, hand.truth[:, known], names)]
 

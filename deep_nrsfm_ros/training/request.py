@@ -154,8 +154,7 @@ def training_request(
     """
     options = sandboxed(parameters.options, sandbox)
     source, target = choose_layouts(options, lifter)
-    named = (tuple(map(Path, words)) for words in (options.bags, options.inputs))
-    data = DataConfig(*named)
+    data = DataConfig(tuple(map(Path, options.bags)), tuple(map(Path, options.inputs)))
     bags = [*data.bags, *filter(is_bag, data.files())]
     has_topic = bags or not data.inputs  # a resumed training names no data
     config = TrainingConfig(
