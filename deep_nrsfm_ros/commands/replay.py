@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import sys
 import threading
@@ -181,15 +182,14 @@ def live_layout(lifter: str, said: str, model: Model) -> KeypointLayout:
 
     Args:
         lifter: name of the node.
-        said: name of the layout as the lifter's diagnostics give it; "" if there were none.
+        said: name of the layout as the lifter's diagnostics give it.
         model: whose layout is taken where the lifter's is not known.
     """
     if layout := {**LAYOUTS, model.layout.name: model.layout}.get(said):
         return layout
-    reason = f"uses the layout {said!r}, which is no preset" if said else "has sent no diagnostics"
     warn(
-        f"{lifter} {reason}: its keypoints are drawn in the order of {model.layout.name}; name "
-        "their order with --keypoint-layout if they look wrong"
+        f"{lifter} uses the layout {said!r}, which is no preset: its keypoints are drawn in the "
+        f"order of {model.layout.name}; name their order with --keypoint-layout if they look wrong"
     )
     return model.layout
 
@@ -203,7 +203,12 @@ def watch(args: argparse.Namespace, model: Model, layout: KeypointLayout | None)
     from deep_nrsfm_ros.node.lifter_client import LifterClient, LifterTopics, running_layout
 
     lifter = args.lifter or _LIFTER
-    source = layout or live_layout(lifter, running_layout(lifter, _DIAGNOSTICS_WAIT), model)
+    if layout is None:
+        said = running_layout(lifter, _DIAGNOSTICS_WAIT)
+        if not said:
+            warn(f"waiting for {lifter}: does it run? --lifter names another one")
+        layout = live_layout(lifter, said or running_layout(lifter, math.inf), model)
+    source = layout
     inputs, transform = override(InputOptions(), args), SceneTransform()
 
     def work(broadcast: Broadcast, stop: threading.Event) -> None:
@@ -223,11 +228,7 @@ def watch(args: argparse.Namespace, model: Model, layout: KeypointLayout | None)
         finally:
             rclpy.try_shutdown()
 
-    serve(
-        live_page(source, model.layout, f"live: {lifter}"),
-        _PORT if args.port is None else args.port,
-        work,
-    )
+    serve(live_page(source, model.layout, f"live: {lifter}"), args.port, work)
 
 
 def play(args: argparse.Namespace, recording: Recording, origin: str) -> None:
@@ -237,11 +238,7 @@ def play(args: argparse.Namespace, recording: Recording, origin: str) -> None:
     def work(broadcast: Broadcast, stop: threading.Event) -> None:
         in_real_time(scenes(recording), broadcast.put, stop.wait)
 
-    serve(
-        live_page(source, target, f"{args.input.name}, {origin}"),
-        _PORT if args.port is None else args.port,
-        work,
-    )
+    serve(live_page(source, target, f"{args.input.name}, {origin}"), args.port, work)
 
 
 @program

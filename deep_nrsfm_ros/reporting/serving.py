@@ -71,7 +71,7 @@ def server(page: str, broadcast: Broadcast, port: int) -> ThreadingHTTPServer:
         port: TCP port; 0 = any free one.
 
     Raises:
-        OSError: the port is in use.
+        OSError: the port is in use, or not allowed.
     """
 
     class Handler(BaseHTTPRequestHandler):
@@ -102,7 +102,10 @@ def server(page: str, broadcast: Broadcast, port: int) -> ThreadingHTTPServer:
         def log_message(self, *words: Any) -> None:
             pass
 
-    http = ThreadingHTTPServer((HOST, port), Handler)
+    try:
+        http = ThreadingHTTPServer((HOST, port), Handler)
+    except OSError as error:
+        raise OSError(f"port {port} cannot be used ({error.strerror}): choose another") from error
     http.daemon_threads = True
     return http
 

@@ -121,8 +121,6 @@ def test_the_layout_of_a_running_lifter(capsys: pytest.CaptureFixture[str]) -> N
     assert not capsys.readouterr().err
     assert live_layout("/lifter", "mine", model) is model.layout
     assert "uses the layout 'mine', which is no preset" in capsys.readouterr().err
-    assert live_layout("/lifter", "", model) is model.layout
-    assert "/lifter has sent no diagnostics" in capsys.readouterr().err
 
 
 def test_a_recording_is_served_until_ctrl_c(answered: Path) -> None:

@@ -107,3 +107,8 @@ def test_a_browser_follows_until_it_is_held_back(
     tab.wait("index === 3")
     broadcast.end()
     tab.wait("document.getElementById('state').textContent === 'end of the recording'")
+
+
+def test_a_port_in_use_is_named() -> None:
+    with server("", Broadcast(), 0) as first, pytest.raises(OSError, match="cannot be used"):
+        server("", Broadcast(), first.server_port)
