@@ -43,6 +43,7 @@ class Observation(NamedTuple):
             detector gives none at all.
         scores: n, of the objects, in the detector's own scale; () if it gives none.
         left_out: a reason for each object or keypoint of the message that is left out.
+        places: n, the index in the message of each object; () if the message has no list of them.
     """
 
     points: NDArray[np.float32]
@@ -50,6 +51,7 @@ class Observation(NamedTuple):
     identities: Identities = ()
     scores: tuple[float, ...] = ()
     left_out: tuple[str, ...] = ()
+    places: tuple[int, ...] = ()
 
     def above(self, min_score: float) -> Observation:
         """Return the objects with a score of at least `min_score`; all if none has a score."""
@@ -64,6 +66,7 @@ class Observation(NamedTuple):
             tuple(self.identities[i] for i in kept) if self.identities else (),
             tuple(self.scores[i] for i in kept),
             self.left_out,
+            tuple(self.places[i] for i in kept) if self.places else (),
         )
 
 

@@ -93,9 +93,11 @@ def read_observation(
     mapping = _mapping(input_type)
     try:
         if mapping:
-            values, identities, scores, left_out = mapping(message, keypoints, size)
-            observation = to_observation(values, min_confidence, identities)
-            return observation._replace(scores=scores, left_out=left_out)
+            mapped = mapping(message, keypoints, size)
+            observation = to_observation(mapped.values, min_confidence, mapped.identities)
+            return observation._replace(
+                scores=mapped.scores, left_out=mapped.left_out, places=mapped.places
+            )
         if isinstance(input_type, str) and (reader := _READERS.get(input_type)):
             return to_observation(reader(message, keypoints), min_confidence)
     except MessageError:

@@ -39,12 +39,14 @@ class MappedObjects(NamedTuple):
         identities: n, None for an object without one.
         scores: n, of the objects; () if the mapping names no score.
         left_out: a reason for each object or keypoint that is left out.
+        places: n, the index in the message of each object.
     """
 
     values: NDArray[np.floating]
     identities: Identities
     scores: tuple[float, ...] = ()
     left_out: tuple[str, ...] = ()
+    places: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -253,6 +255,7 @@ class FieldMapping:
         identities: list[str | None] = []
         scores: list[float] = []
         left_out: list[str] = []
+        places: list[int] = []
         refused: MessageError | None = None
         items = self.items(message)
         identity = self._of_object("identity", message, len(items))
@@ -268,12 +271,13 @@ class FieldMapping:
                 continue
             if row is not None:
                 rows.append(row)
+                places.append(i)
                 identities.append(_identity_text(identity(i, item)) if identity else None)
                 if score:
                     scores.append(float(score(i, item)))
         if refused and not rows:
             raise refused
-        others = tuple(identities), tuple(scores), tuple(left_out)
+        others = tuple(identities), tuple(scores), tuple(left_out), tuple(places)
         width = len(self.columns)
         shape = (len(rows), keypoints, width)
         if rows and isinstance(rows[0], list):  # twice as fast as np.array

@@ -109,7 +109,8 @@ class Pipeline:
         points = to_pixels(points, confidence, size)
         if size:
             points, confidence, *_ = without_border(Observation(points, confidence), size)
-        return header, Observation(*self._map(points, confidence), observation.identities)
+        found = Observation(*self._map(points, confidence), observation.identities)
+        return header, found._replace(places=observation.places)
 
     @property
     def needs_identities(self) -> bool:
@@ -133,6 +134,13 @@ class Pipeline:
         """Forget all identities of a topic, as when its stamps begin anew."""
         self._smoothers.pop(topic, None)
         self._memories.pop(topic, None)
+
+    @property
+    def shared_keypoints(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of the indices in detector's and model's layout of the keypoints of one name."""
+        target = self.model.layout.keypoints
+        names = enumerate(self.source.keypoints)
+        return tuple((i, target.index(name)) for i, name in names if name in target)
 
     def forget(self) -> None:
         """Forget all identities of all topics."""

@@ -13,6 +13,7 @@ For every message on `keypoints` the node publishes, with the header of that mes
 - ~/markers: shapes for RViz; only with a subscriber.
 - ~/skeleton: names of keypoints and joints, latched; ~/joints, ~/joint_states, ~/tracks: frames,
   angles and states of tracking; only with a subscriber. See `node/bodies.py` for more of them.
+- ~/detections_3d: the detections of yolo_ros with 3D keypoints; with CameraInfo and a subscriber.
 - /tf: a frame for each object; only with the parameter tf_prefix.
 
 With the parameter managed, it is a managed node (lifecycle); see `node/lifecycle.py`.
@@ -56,6 +57,8 @@ from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.detections_3d import Lifted3D
+from deep_nrsfm_ros.messages.field_mapping import YOLO
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
@@ -70,6 +73,7 @@ from deep_nrsfm_ros.node import parameter_bridge, publishing
 from deep_nrsfm_ros.node.bodies import BodyOptions, BodyPublishers, Scene
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
 from deep_nrsfm_ros.node.depth import DepthOptions, DepthSubscription
+from deep_nrsfm_ros.node.detections_3d import DetectionsPublisher
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.entities import Entities
 from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
@@ -233,6 +237,7 @@ class LifterNode(Node):
         self._rotation = self._quiet_publisher(QuaternionStamped, "~/camera_rotation")
         self._objects = self._quiet_publisher(MultiDOFJointState, "~/objects")
         self._markers = self._quiet_publisher(MarkerArray, "~/markers")
+        self._detections: DetectionsPublisher | None = None
         self._bodies = BodyPublishers(self, self._body_options, camera.tf_prefix)
         self._bodies.describe(self._pipeline.model.layout)
         self._training = TrainingService(
@@ -375,6 +380,8 @@ class LifterNode(Node):
                     positioned=positioned,
                 )
             )
+        if positioned and source.reader.input_type == YOLO.type:
+            self._publish_detections(header, lifted, raw, observation.places)
         self._publish_bodies(source, Scene(header, lifted, identities, detected, moment))
         self._lifter_diagnostics.lifted(
             time.perf_counter() - started, lifted.residual, lifted.confidence
@@ -396,6 +403,22 @@ class LifterNode(Node):
         return lifted._replace(
             shapes=scales[:, None, None] * lifted.shapes, scale=lifted.scale / scales
         )
+
+    def _publish_detections(
+        self, header: Header, lifted: Lifted, raw: bytes, places: Sequence[int]
+    ) -> None:
+        """Publish the detections of yolo_ros in 3D for a subscriber; a failure ends no node."""
+        try:
+            if self._detections is None:
+                self._detections = DetectionsPublisher(self)
+            if self._detections.has_subscriber():
+                shared = self._pipeline.shared_keypoints
+                self._detections.publish(raw, Lifted3D(header.frame_id, lifted, places, shared))
+        except Exception as problem:
+            self.get_logger().warning(
+                f"~/detections_3d not published: {_error_text(problem)}",
+                throttle_duration_sec=LOG_PERIOD,
+            )
 
     def _publish_bodies(self, source: KeypointTopic, scene: Scene) -> None:
         """Publish what is asked of the joints; a failure must not end the node."""

@@ -308,7 +308,13 @@ def leaves(split: Any) -> set[str]:
 
 
 def test_the_layout_of_foxglove_shows_what_the_lifter_says() -> None:
-    layout = json.loads((EXAMPLES.parent / "config" / "foxglove.json").read_text())
+    text = (EXAMPLES.parent / "config" / "foxglove.json").read_text()
+    layout = json.loads(text)
+    names = ("points", "markers", "joints", "joint_states", "tracks", "skeleton")
+    assert set(re.findall(r"/lifter/(\w+)", text)) == set(names)
+    panels = {"Image", "3D", "Plot", "StateTransitions", "RawMessages"}
+    panels |= {"DiagnosticSummary", "DiagnosticStatusPanel"}
+    assert {name.partition("!")[0] for name in layout["configById"]} == panels
     assert leaves(layout["layout"]) == set(layout["configById"])
     for path in layout["configById"]["Plot!angles"]["paths"]:
         column = TREE.angle_names.index(path["label"])
