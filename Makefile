@@ -60,7 +60,7 @@ demo-live: $(EXAMPLES_READY)
 # make test DEEP_NRSFM_REQUIRE_KERNEL=0
 test: export DEEP_NRSFM_REQUIRE_KERNEL = 1
 test: lint
-	$(PYTHON) -m pytest $(if $(filter-out 1,$(TEST_PROCESSES)),-n $(TEST_PROCESSES) --dist loadfile)
+	$(PYTHON) -m pytest $(if $(filter-out 1,$(TEST_PROCESSES)),-n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder)
 
 lint: $(READY)
 	$(PYTHON) -m ruff check .

@@ -777,6 +777,8 @@ def main() -> None:
     signals: list[int] = []
     for number in _SIGNALS:
         signal.signal(number, lambda number, _: signals.append(number))
+    # An executor that a signal interrupts in its constructor fails once more when it is destroyed.
+    sys.unraisablehook = lambda error: None if signals else sys.__unraisablehook__(error)
     try:
         rclpy.init()
     except Exception as problem:  # such as a malformed parameter; rclpy has no public class for it

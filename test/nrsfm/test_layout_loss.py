@@ -71,6 +71,12 @@ def test_bones_by_the_book(seed: int) -> None:
     np.testing.assert_allclose(found, 2 * expected, rtol=1e-6)
 
 
+def test_the_gradient_of_bones_is_that_of_their_differences() -> None:
+    S = shapes(0).requires_grad_()
+    loss = LayoutLoss(LayoutLossWeights(bone_length_weight=2.0), ANIMAL)
+    assert torch.autograd.gradcheck(lambda S: loss(S, cameras(0)), S)
+
+
 @some
 @given(seeds)
 def test_the_front_is_what_the_handedness_votes_on(seed: int) -> None:
