@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import random
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.table import Table
+from deep_nrsfm_ros.commands.demo.domain import take_domain
 
 
 def machine() -> str:
@@ -73,10 +73,10 @@ def require_one_thread() -> None:
         os.execv(sys.executable, sys.orig_argv)
 
 
-def random_domain(*others: int) -> int:
-    """Return a random DDS domain other than `others`; restrict discovery to this machine."""
+def random_domain() -> int:
+    """Return a DDS domain of this process alone; restrict discovery to this machine."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    return random.choice([number for number in range(1, 102) if number not in others])
+    return take_domain()
 
 
 @contextmanager

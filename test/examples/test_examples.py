@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from deep_nrsfm_ros.commands.demo.domain import take_domain
+
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 
@@ -49,7 +51,7 @@ def test_the_notebook_lifts_draws_and_trains() -> None:
 def test_a_published_person_is_printed(tmp_path: Path) -> None:
     live = environment() | {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_DOMAIN_ID": str(take_domain()),
     }
     commands = (
         ["-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-p", "keypoint_layout:=body25b"],

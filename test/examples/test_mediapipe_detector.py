@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 
+from deep_nrsfm_ros.commands.demo.domain import take_domain
 from deep_nrsfm_ros.data.pose2sim import JOINTS, extract_videos, read_session
 from deep_nrsfm_ros.layouts.presets import BODY25B, HAND21, MEDIAPIPE33, MEDIAPIPE75
 from deep_nrsfm_ros.lifting.observation import MessageError
@@ -197,7 +197,7 @@ def start(
 ) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Return a function that starts the detector with parameters."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(random.randrange(1, 102)))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(take_domain()))
     started = []
 
     def run(**parameters: Any) -> subprocess.Popen[str]:

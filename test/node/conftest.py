@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-import random
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -32,6 +29,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 import deep_nrsfm_ros
+from deep_nrsfm_ros.commands.demo import domain as domains
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31, HUMAN17
@@ -65,17 +63,9 @@ def own_domain() -> Iterator[int]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         patch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROMPT_DISCOVERY))
-        for number in random.sample(range(1, 102), 101):
-            path = Path(tempfile.gettempdir()) / f"ros_domain_{number}_in_test.lock"
-            with path.open("w") as lock:
-                try:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    continue
-                patch.setenv("ROS_DOMAIN_ID", str(number))
-                yield number
-                return
-    pytest.fail("all DDS domains are taken by other tests")
+        with domains.own_domain() as number:
+            patch.setenv("ROS_DOMAIN_ID", str(number))
+            yield number
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-import random
 import shutil
 import signal
 import sys
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.commands.demo.client import NO_LATENCY, Client, DemoError, Played, lifter
+from deep_nrsfm_ros.commands.demo.domain import take_domain
 from deep_nrsfm_ros.commands.demo.evaluation import read_points, table
 from deep_nrsfm_ros.commands.demo.first_look import TORSO, read_model, say, show, stage_of
 from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
@@ -176,13 +176,13 @@ def comparison(session: Session, models: Mapping[str, Path]) -> str:
 
 
 def launch(run: Callable[[argparse.Namespace], None], given: argparse.Namespace) -> None:
-    """Run a demo on a random DDS domain, limited to this machine, with the exit codes of `main`."""
+    """Run a demo on a DDS domain of its own on this machine, with the exit codes of `main`."""
     # A shell starts background jobs with SIGINT ignored.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(random.randrange(1, 102))
     try:
+        os.environ["ROS_DOMAIN_ID"] = str(take_domain())
         run(given)
     except KeyboardInterrupt:
         sys.exit(130)
