@@ -8,8 +8,10 @@ for each trial there are none, as in a recording by a fixed camera.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
@@ -28,8 +30,13 @@ _LIFTED = ("network alone", "as shipped")
 _SHOWN = [name for name in CONVENTIONS if name != "point cm"]
 
 
-def benchmark(session: Session) -> Table:
-    """Train and solve each subject in each protocol; return the errors on the same frames."""
+def benchmark(session: Session, words: Sequence[str] = ("",)) -> Table:
+    """Train and solve each subject in each protocol; return the errors on the same frames.
+
+    Args:
+        session: data, subjects, seeds and baselines.
+        words: of which the name of a protocol has one.
+    """
     table = Table(
         "protocols",
         "The paper's protocol and two that are less nearly multi-view, in-sample",
@@ -41,6 +48,8 @@ def benchmark(session: Session) -> Table:
     table.digits["frames"] = 0
     for subject in session.subjects:
         for protocol, changes in PROTOCOLS.items():
+            if not any(word in protocol for word in words):
+                continue
             changed = dataclasses.replace(session, **changes)
             dataset = changed.mocap([subject], "train")
             for seed in session.seeds:
@@ -62,7 +71,11 @@ def benchmark(session: Session) -> Table:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    run_program(benchmark, __doc__, SUBJECTS, argv)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--protocols", nargs="+", default=[""], metavar="WORD")
+    known, others = parser.parse_known_args(argv)
+    description = f"{__doc__}\nWith --protocols WORD ... those alone whose name has one of them."
+    run_program(partial(benchmark, words=known.protocols), description, SUBJECTS, others)
 
 
 if __name__ == "__main__":

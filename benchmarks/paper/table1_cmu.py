@@ -90,9 +90,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--recipes", nargs="+", choices=tuple(OURS), default=tuple(OURS))
-    chosen_recipes, others = parser.parse_known_args(argv)
+    known, others = parser.parse_known_args(argv)
     description = f"{__doc__}\nWith --recipes NAME ... these trainings alone: {', '.join(OURS)}."
-    make = partial(benchmark, recipes=chosen_recipes.recipes)
+    make = partial(benchmark, recipes=known.recipes)
     run_program(make, description, SUBJECTS, others)
 
 

@@ -127,6 +127,16 @@ def test_nrsfm_on_cmu_has_the_papers_figures_beside_ours(data: Path, output: Pat
     assert 0 <= float(ours["CPU min"]) < 1
 
 
+@pytest.mark.usefixtures("few")
+def test_recipes_and_protocols_can_be_chosen(data: Path, output: Path) -> None:
+    options = ["--data", str(data), "--output", str(output), *LONE, "--baselines"]
+    table1_cmu.main([*options, "--recipes", "paper"])
+    ours = {row["method"] for row in rows(output, "table1_cmu") if row["seed"]}
+    assert ours == {"paper's network, ours, network alone"}
+    protocols.main([*options, "--protocols", "trial"])
+    assert {row["protocol"] for row in rows(output, "protocols")} == {"a camera a trial, 120 Hz"}
+
+
 def test_papers_table_is_whole() -> None:
     assert table1_cmu.PAPER["Simple"]["127"] == {"shape %": 23.70, "point cm": 10.9473}
     assert all(len(subjects) == 10 for subjects in table1_cmu.PAPER.values())
