@@ -142,6 +142,7 @@ setup(
             "h5py",  # writes files as DeepLabCut does
             "kinpy",  # reads the URDF of a person; its forward kinematics must be ours
             "jsonschema",  # object files against their schema
+            "check-jsonschema>=0.30",  # the schemas of workflows, issue forms, CITATION.cff
             "pillow",  # the demo's picture
             "hypothesis",  # properties over generated input
             "ruff",  # lint and format
