@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -255,7 +256,7 @@ def spread_out(
         most: number of indices to return at most.
     """
     chosen: list[int] = []
-    for i in order.tolist():
+    for i in map(int, order):
         if all(abs(int(frames[i] - frames[j])) > gap for j in chosen):
             chosen.append(i)
             if len(chosen) == most:
@@ -282,25 +283,72 @@ def changed_frames(
     """
     kept = np.zeros(len(points), bool)
     recent: deque[_Kept] = deque(maxlen=_RECENT)
+    row = 0  # kept frames since the last one that was not
     for part in slices(len(points)):
-        scaled = _scaled(points[part], visible[part])
-        patterns = (int.from_bytes(row) for row in np.packbits(visible[part], 1))
-        for i, frame, pattern in zip(range(part.start, part.stop), scaled, patterns, strict=True):
-            limit = min_change**2 * pattern.bit_count()
-            for other in recent:
-                if pattern & ~other.pattern:
-                    continue
-                reference = other.scaled
-                if pattern != other.pattern:  # compare the keypoints that both show
-                    reference = _scaled(points[other.frame], visible[i])
-                difference = (frame - reference).ravel()
-                if difference @ difference < limit:
-                    break
+        scaled, shown = _scaled(points[part], visible[part]), np.packbits(visible[part], 1)
+        may_be_near = _may_be_near(scaled, points[part], visible[part], min_change)
+        near = [*np.flatnonzero(may_be_near).tolist(), len(scaled)]
+        frames = range(len(scaled))
+        i = 0
+        while i < len(scaled):
+            # Where the frames just before are kept, so are all up to the next that may be near.
+            clear = near[bisect_left(near, i)] - i if row >= _RECENT else 0
+            new = frames[i : i + max(clear, 1)]
+            last = [
+                _Kept(part.start + k, int.from_bytes(shown[k]), scaled[k]) for k in new[-_RECENT:]
+            ]
+            if clear or not any(
+                _is_near(last[0], other, points, visible, min_change) for other in recent
+            ):
+                kept[part.start + new.start : part.start + new.stop] = True
+                recent.extend(last)
+                row += len(new)
             else:
-                kept[i] = True
-                recent.append(_Kept(i, pattern, frame))
+                row = 0
+            i = new.stop
         on_progress(part.stop, len(points))
     return kept
+
+
+def _may_be_near(
+    scaled: NDArray[np.float32], points: NDArray[np.float32], visible: Bools, min_change: float
+) -> Bools:
+    """Return which frames are near duplicates of one of the few frames before them.
+
+    Args:
+        scaled: (f, p, 2) from `_scaled`.
+        points: (f, p, 2), in any unit.
+        visible: (f, p).
+        min_change: in RMS radii of the object.
+
+    Returns:
+        (f,) also True where rounding may decide, and for the first few, of which not all frames
+        before are here.
+    """
+    near = np.arange(len(scaled)) < _RECENT
+    limit = 1.001 * min_change**2 * visible.sum(1)
+    for lag in range(1, _RECENT + 1):
+        rows = np.arange(_RECENT, len(scaled))
+        rows = rows[~(visible[rows] & ~visible[rows - lag]).any(1)]  # the others cannot be
+        reference = scaled[rows - lag]
+        fewer = np.flatnonzero((visible[rows] != visible[rows - lag]).any(1))
+        reference[fewer] = _scaled(points[rows[fewer] - lag], visible[rows[fewer]])
+        difference = scaled[rows] - reference
+        near[rows] |= np.einsum("fpc,fpc->f", difference, difference) < limit[rows]
+    return near
+
+
+def _is_near(
+    new: _Kept, other: _Kept, points: NDArray[np.float32], visible: Bools, min_change: float
+) -> bool:
+    """Return whether a frame is a near duplicate of a kept one; see `changed_frames`."""
+    if new.pattern & ~other.pattern:
+        return False
+    reference = other.scaled
+    if new.pattern != other.pattern:  # compare the keypoints that both show
+        reference = _scaled(points[other.frame], visible[new.frame])
+    difference = (new.scaled - reference).ravel()
+    return bool(difference @ difference < min_change**2 * new.pattern.bit_count())
 
 
 class _Kept(NamedTuple):

@@ -48,12 +48,23 @@ def median_normalised(points: NDArray[np.float32], visible: Bools) -> Floats:
         (f, p, 2), 0 where missing.
     """
     X = np.where(visible[..., None], points.astype(np.float64), np.nan)
-    some = visible.any(1)
-    X[some] -= np.nanmedian(X[some], axis=1, keepdims=True)
-    radius = np.ones(len(X))
-    radius[some] = np.nanmedian(np.linalg.norm(X[some], axis=2), axis=1)
+    X -= _median(X.swapaxes(1, 2))[:, None]
+    radius = _median(np.sqrt((X**2).sum(2)))
     scaled: Floats = np.nan_to_num(X / np.maximum(radius, 1e-9)[:, None, None])
     return scaled
+
+
+def _median(values: Floats) -> Floats:
+    """Return the median over the last axis without NaN, 0 where there is nothing else.
+
+    A tenth of the time of `np.nanmedian`, which takes short rows one by one.
+    """
+    ordered = np.sort(values, -1)  # NaN last
+    count = np.isfinite(values).sum(-1, keepdims=True)
+    lower = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, -1)
+    upper = np.take_along_axis(ordered, count // 2, -1)
+    median: Floats = np.where(count > 0, (lower + upper) / 2, 0.0)[..., 0]
+    return median
 
 
 @dataclass(frozen=True)
@@ -160,15 +171,24 @@ class PointModel:
         """
         p = visible.shape[1]
         covariance = self.covariance + np.kron(np.ones((p, p)), np.eye(2)) * _POSITION_VARIANCE
-        patterns, index, counts = np.unique(
-            visible, axis=0, return_inverse=True, return_counts=True
-        )
-        frames = np.split(np.argsort(index.ravel(), kind="stable"), np.cumsum(counts)[:-1])
-        for pattern, members in zip(patterns, frames, strict=True):
-            yield (
-                members,
-                np.linalg.inv(covariance + np.diag(_MISSING_VARIANCE * np.repeat(~pattern, 2))),
-            )
+        for members in _alike(visible):
+            missing = np.repeat(~visible[members[0]], 2)
+            yield members, np.linalg.inv(covariance + np.diag(_MISSING_VARIANCE * missing))
+
+
+def _alike(visible: Bools) -> list[NDArray[np.intp]]:
+    """Return the indices of the frames of each pattern of visible points, ascending.
+
+    Patterns are compared as whole numbers of 64 bits: sorting rows of booleans takes most of the
+    time of a comparison otherwise.
+    """
+    packed = np.packbits(visible, 1)
+    words = np.zeros((len(packed), -(-packed.shape[1] // 8) * 8), np.uint8)
+    words[:, : packed.shape[1]] = packed
+    keys = words.view(np.uint64)
+    order = np.lexsort(keys.T)
+    changes = (keys[order[1:]] != keys[order[:-1]]).any(1)
+    return np.split(order, np.flatnonzero(changes) + 1)
 
 
 def find_outliers(
