@@ -68,8 +68,13 @@ _ONE_EURO = SmoothingOptions(enabled=True)
 SYSTEMS = {
     FRAME_BY_FRAME: System(),
     "filter after": System(filter=_ONE_EURO),
-    "smoothing before": System(HistoryOptions(bones_time=0)),
-    "own bones": System(HistoryOptions(shape_time=0, hidden_time=0, rotation_time=0)),
+    "smoothing before": System(HistoryOptions(bones_time=0, depth_cutoff=0)),
+    "own bones": System(
+        HistoryOptions(shape_time=0, hidden_time=0, rotation_time=0, depth_cutoff=0)
+    ),
+    "steady depth": System(
+        HistoryOptions(shape_time=0, hidden_time=0, rotation_time=0, bones_time=0)
+    ),
     "gravity": System(gravity=True),
     "in time": System(HistoryOptions()),
     "in time, filter after": System(HistoryOptions(), filter=_ONE_EURO),

@@ -17,6 +17,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.lifting.history import MAX_BACK, MAX_GAP, Context, Memory
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Identities, Observation
+from deep_nrsfm_ros.lifting.steady_depth import steady_depths
 from deep_nrsfm_ros.lifting.tracking import Tracker
 
 Floats = NDArray[Any]
@@ -196,7 +197,7 @@ def lift_stream(
             names = tuple(stream.identities[rows]) if over_time.smooth != NONE else ()
             names = names or ("",) * (rows.stop - rows.start)
             context = memory(names, time, over_time.up)
-            part = lift(points, confidence, context)
+            part = steady_depths(lift(points, confidence, context), memory, context)
             if whole is None:
                 whole = Lifted(*(empty((m, *each.shape[1:]), each.dtype) for each in part))
             # Each frame goes to its place, so that memory holds the objects but once.

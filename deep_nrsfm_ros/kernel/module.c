@@ -12,6 +12,7 @@
 #include "joints.h"
 #include "point_cloud.h"
 #include "plan.h"
+#include "depth.h"
 #include "tracking.h"
 #include "training_module.h"
 
@@ -264,6 +265,28 @@ static PyObject *update_tracks_entry(PyObject *Py_UNUSED(module), PyObject *args
     Py_RETURN_NONE;
 }
 
+/* steady_depths(constants, states, rows, shapes, rotations): change the last two, (n, p, 3) and (n, 3, 3), and the rows of
+   the states (capacity, 1 + 7 p); rows (n,) int32, below 0: none. */
+static PyObject *steady_depths_entry(PyObject *Py_UNUSED(module), PyObject *args) {
+    static const ArrayArgument expected[5] = {
+        {"constants", FLOAT64, 0}, {"states", FLOAT64, 1}, {"rows", INT32, 0}, {"shapes", FLOAT32, 1}, {"rotations", FLOAT32, 1}};
+    PyObject *o[5];
+    Py_buffer arrays[5];
+    if (!parse_arguments(args, "OOOOO:steady_depths", &o[0], &o[1], &o[2], &o[3], &o[4])) return NULL;
+    if (!get_arrays(5, expected, o, arrays)) return NULL;
+    Py_ssize_t n = count_items(arrays + 2), items = count_items(arrays + 3), nine;
+    Py_ssize_t p = n > 0 ? items / n / 3 : 0, of_object[1] = {3 * p};
+    int sound = p > 0 && count_items(arrays) == DEPTH_CONSTANTS && lengths_match(1, arrays + 3, of_object, n);
+    sound = sound && !__builtin_mul_overflow(n, 9, &nine) && count_items(arrays + 4) == nine;
+    Py_ssize_t capacity = sound ? count_items(arrays + 1) / (1 + 7 * p) : 0;
+    const int *rows = arrays[2].buf;
+    for (Py_ssize_t i = 0; sound && i < n; i++) sound = rows[i] < capacity;
+    if (sound) steady_depths(arrays[0].buf, n, p, arrays[1].buf, rows, arrays[3].buf, arrays[4].buf);
+    release_arrays(5, arrays);
+    if (!sound) return PyErr_Format(PyExc_ValueError, "the arrays do not fit each other");
+    Py_RETURN_NONE;
+}
+
 /* joint_frames(indices, constants, directions, rotations, angles, (n, j)): fill rotations (n, j, 3, 3) of the joints that
    the indices name, and angles (n, a), from the directions (n, m, 3). */
 static PyObject *joint_frames_entry(PyObject *Py_UNUSED(module), PyObject *args) {
@@ -329,6 +352,7 @@ static PyMethodDef methods[] = {{"plan", plan, METH_VARARGS, NULL},
                                 {"decode_keypoints", decode_keypoints_entry, METH_VARARGS, NULL},
                                 {"match_tracks", match_tracks_entry, METH_VARARGS, NULL},
                                 {"update_tracks", update_tracks_entry, METH_VARARGS, NULL},
+                                {"steady_depths", steady_depths_entry, METH_VARARGS, NULL},
                                 {"joint_frames", joint_frames_entry, METH_VARARGS, NULL},
                                 {"quaternions", quaternions_entry, METH_VARARGS, NULL},
                                 {"choose_vectors", choose, METH_O, NULL},

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a lifter remembers of each identity from frame to frame.
 
-Three things are remembered: the shape and the rotation that the network has found, smoothed
-(`lifting.network_smoothing`), and the lengths of this object's bones (`lifting.own_bones`). All of
-it stands in one row of numbers for each identity, which the backends read and update. A row has a
-fixed length, each number in it decays with time, and rows of identities that are gone are used
-again, so that memory is bounded.
+Four things are remembered: the shape and the rotation that the network has found, smoothed
+(`lifting.network_smoothing`), the lengths of this object's bones (`lifting.own_bones`), and its
+depths (`lifting.steady_depth`), in rows of their own. All of it stands in one row of numbers for
+each identity, which the backends read and update. A row has a fixed length, each number in it
+decays with time, and rows of identities that are gone are used again, so that memory is bounded.
 
 Source: ours, not in the paper.
 """
@@ -97,11 +97,18 @@ class Context(NamedTuple):
 
 
 class Memory:
-    """Finds the row of each identity of one topic."""
+    """Finds the row of each identity of one topic.
 
-    def __init__(self, layout: StateLayout) -> None:
+    Attributes:
+        depth_cutoff: in Hz, of depths; 0: they are not smoothed. See `steady_depth`.
+        depth_states: (capacity, 1 + 7 p) what is remembered of depths.
+    """
+
+    def __init__(self, layout: StateLayout, depth_cutoff: float = 0.0) -> None:
         """Start without identities."""
+        self.depth_cutoff = depth_cutoff
         self._states = np.full((_FIRST_ROWS, layout.size), np.nan)
+        self.depth_states = np.full((_FIRST_ROWS, 1 + 7 * layout.p), np.nan)
         self._rows: dict[str, int] = {}
         self._free = list(range(_FIRST_ROWS))
         self._last: tuple[tuple[str, ...], NDArray[np.int32]] = ((), np.zeros(0, np.int32))
@@ -149,7 +156,7 @@ class Memory:
         if not self._free:
             self._make_room(present, time)
         row = self._rows[identity] = self._free.pop()
-        self._states[row] = np.nan
+        self._states[row] = self.depth_states[row] = np.nan
         return row
 
     def _make_room(self, present: tuple[str, ...], time: float) -> None:
@@ -164,5 +171,8 @@ class Memory:
             self._free.append(self._rows.pop(name))
         if not self._free:
             capacity = len(self._states)
-            self._states = np.concatenate((self._states, np.full_like(self._states, np.nan)))
+            self._states, self.depth_states = (
+                np.concatenate((each, np.full_like(each, np.nan)))
+                for each in (self._states, self.depth_states)
+            )
             self._free = list(range(capacity, 2 * capacity))

@@ -140,7 +140,8 @@ class Lifter:
     def memory(self) -> Memory:
         """Return an empty memory, for the identities of one stream."""
         bones = self.constants.bones
-        return Memory(StateLayout(len(self.model.layout), len(bones.lengths) if bones else 0))
+        layout = StateLayout(len(self.model.layout), len(bones.lengths) if bones else 0)
+        return Memory(layout, self.constants.history.depth_cutoff)
 
     def learned_lengths(self, memory: Memory, identity: str) -> tuple[dict[str, float], float]:
         """Return what is learned of an object's bones.

@@ -149,6 +149,14 @@ class HistoryOptions:
         low=0.0,
         high=60.0,
     )
+    depth_cutoff: float = option(
+        0.2,
+        "cutoff frequency in Hz with which the depths of an object at rest are smoothed after the "
+        "correction (One-Euro filter; it rises with the object's speed); each point stays where "
+        "the image has it, so nothing lags there; 0 = off, 0.2 typical, 1 weak",
+        low=0.0,
+        high=1000.0,
+    )
 
 
 @dataclass(frozen=True)

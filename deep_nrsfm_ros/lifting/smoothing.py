@@ -26,7 +26,8 @@ Floats = NDArray[Any]
 FILTER_RESET_TIME = 1.0
 """Seconds after which an object that was not lifted is filtered from its next frame on."""
 _INTERVALS = 3.0  # between messages, for which a filter lives and a gap is filled at least
-_SPEED_CUTOFF = 1.0  # Hz, of the low-pass of the speed, as in the paper
+SPEED_CUTOFF = 1.0
+"""Hz, of the low-pass of the speed, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +83,21 @@ class _OneEuro:
             seconds: time between the two.
             size: unit of the step.
         """
-        self._speed += _alpha(_SPEED_CUTOFF, seconds) * (step / seconds - self._speed)
+        self._speed += low_pass_gain(SPEED_CUTOFF, seconds) * (step / seconds - self._speed)
         speed = np.sqrt((self._speed * self._speed).sum(-1, keepdims=True)) / size
-        alpha: Floats = _alpha(self._options.min_cutoff + self._options.beta * speed, seconds)
+        alpha: Floats = low_pass_gain(
+            self._options.min_cutoff + self._options.beta * speed, seconds
+        )
         return alpha
 
 
-def _alpha(cutoff: Any, seconds: float) -> Any:
-    """Return the weight of the newest value in a low-pass with `cutoff` in Hz."""
+def low_pass_gain(cutoff: Any, seconds: float) -> Any:
+    """Return the weight of the newest value in a low-pass.
+
+    Args:
+        cutoff: in Hz, above 0.
+        seconds: since the value before.
+    """
     return 1 - 1 / (1 + 2 * np.pi * cutoff * seconds)
 
 

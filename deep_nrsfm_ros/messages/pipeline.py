@@ -16,6 +16,7 @@ from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.sanity import to_pixels
 from deep_nrsfm_ros.lifting.smoothing import Smoother, SmoothingOptions
+from deep_nrsfm_ros.lifting.steady_depth import steady_depths
 from deep_nrsfm_ros.lifting.track_matching import keypoint_tolerances
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.options import InputOptions
@@ -188,7 +189,7 @@ class Pipeline:
             MessageError: there are objects, and none can be lifted.
         """
         points, confidence = observation.points, observation.confidence
-        context = None
+        context = memory = None
         if self.remembers:
             memory = self._memories.get(topic)
             if memory is None:
@@ -200,6 +201,8 @@ class Pipeline:
             lifted = lift_perspective(self._lifter, intrinsics, points, confidence, context)
         else:
             lifted = self._lifter.lift(points, confidence, context=context)
+        if memory is not None and context:
+            lifted = steady_depths(lifted, memory, context)
         smoother = self._smoothers.get(topic)
         if smoother is None:
             smoother = self._smoothers[topic] = Smoother(self._smoothing)

@@ -10,7 +10,6 @@ keypoints that hardly move, are then a matter of chance without this loss
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -64,7 +63,9 @@ class LayoutLoss:
         """
         weights, losses = self.weights, []
         if weights.bone_length_weight:
-            variation = _bone_variation(S, self._edges.to(S), self._partners.to(S))
+            variation = _BoneVariation.apply(  # type: ignore[no-untyped-call]
+                S, self._edges.to(S), self._partners.to(S)
+            )
             losses.append(weights.bone_length_weight * variation)
         if weights.handedness_weight:
             losses.append(weights.handedness_weight * self._front(S))
@@ -142,9 +143,6 @@ class _BoneVariation(torch.autograd.Function):
         d_bones = bones * (d_lengths / lengths)[:, None]
         d_S = (d_bones.view(-1, bones.shape[-1]) @ edges.T).view(len(bones), 3, -1).mT
         return d_S * (gradient / shares.numel()), None, None
-
-
-_bone_variation: Callable[[Tensor, Tensor, Tensor], Tensor] = _BoneVariation.apply
 
 
 def _differences(p: int, pairs: list[tuple[int, int]]) -> Tensor:

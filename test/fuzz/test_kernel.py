@@ -220,6 +220,20 @@ def network_backward(
     return [pool, floats(spoiler, size), floats(spoiler, n, kept), *bars, output(size)]
 
 
+def steady_depths(spoiler: Spoiler) -> Arguments:
+    """Return arguments of `steady_depths`."""
+    n, p, capacity = spoiler.choice((1, 2, 40)), spoiler.choice((1, 8)), spoiler.choice((1, 5))
+    rows = np.array([spoiler.randrange(-1, capacity) for _ in range(n)], np.int32)
+    states, shapes, rotations = (
+        output(capacity, 1 + 7 * p, dtype=np.float64),
+        output(n, p, 3),
+        output(n, 3, 3),
+    )
+    for part in (states, shapes, rotations):
+        part[:] = floats(spoiler, *part.shape)
+    return [floats(spoiler, 6).astype(float), states, rows, shapes, rotations]
+
+
 # Valid arguments of every entry point.
 ENTRY_POINTS: dict[str, Callable[[Spoiler], Arguments]] = {
     "plan": plan,
@@ -227,6 +241,7 @@ ENTRY_POINTS: dict[str, Callable[[Spoiler], Arguments]] = {
     "decode_keypoints": decode_keypoints,
     "match_tracks": match_tracks,
     "update_tracks": update_tracks,
+    "steady_depths": steady_depths,
     "joint_frames": joint_frames,
     "quaternions": lambda s: [floats(s, 4, 3, 3).astype(float), output(4, 4, dtype=np.float64)],
     "choose_vectors": lambda spoiler: [spoiler.choice((16, 32, 64))],
