@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.data.pose2sim_scenes import Scene, scenes
+from benchmarks.data.pose2sim_scenes import UP, Scene, scenes
 from deep_nrsfm_ros.data.mocap import human17, read_amc, read_asf, trials
-from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE
+from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, View
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN17, MEDIAPIPE33
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
@@ -187,24 +187,36 @@ def clip_track(scene: Scene) -> Track:
 
     The detections are those that come with the clip, else MediaPipe's.
     """
-    mediapipe, own = scene.mediapipe, scene.detections
-    limbs = [MEDIAPIPE33.index(joint) for joint in JOINTS]
-    points, confidence, layout = (
-        (mediapipe.points, mediapipe.confidence, MEDIAPIPE33)
-        if own is None
-        else (own.points, own.confidence, BODY25B)
-    )
+    mediapipe = scene.mediapipe
+    world = mediapipe.world[:, [MEDIAPIPE33.index(joint) for joint in JOINTS]]
+    if scene.detections is not None:
+        return view_track(scene.detections)._replace(world_landmarks=world)
     return Track(
         scene.camera,
-        layout,
-        np.nan_to_num(points),
-        confidence,
-        np.arange(len(points)) / RATE,
+        MEDIAPIPE33,
+        np.nan_to_num(mediapipe.points),
+        mediapipe.confidence,
+        np.arange(len(mediapipe.points)) / RATE,
         scene.intrinsics,
         scene.truth,
         scene.up,
         _torso(_with_middles(scene.truth), HUMAN17),
-        mediapipe.world[:, limbs],
+        world,
+    )
+
+
+def view_track(view: View) -> Track:
+    """Return the track of the detections that come with the pose2sim clip."""
+    return Track(
+        view.camera.name,
+        BODY25B,
+        np.nan_to_num(view.points),
+        view.confidence,
+        np.arange(len(view.points)) / RATE,
+        view.camera.intrinsics,
+        view.truth,
+        view.camera.rotation @ UP,
+        _torso(_with_middles(view.truth), HUMAN17),
     )
 
 

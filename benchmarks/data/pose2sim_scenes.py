@@ -22,7 +22,8 @@ Floats = NDArray[Any]
 CACHE = Path(".cache")
 """Download folder of the demo."""
 LIMBS = [MEDIAPIPE33.index(joint) for joint in JOINTS]
-_UP = np.array([0.0, 0.0, 1.0])  # against gravity, in the world of the calibration
+UP = np.array([0.0, 0.0, 1.0])
+"""Against gravity, in the world of the calibration, whose floor is at height 0."""
 
 
 class PoseDetections(NamedTuple):
@@ -62,7 +63,7 @@ def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]
     moving = detect_trial(wheel, "Balancing", output)
     balancing = [
         Scene(
-            *(view.camera.name, view.camera.intrinsics, view.camera.rotation @ _UP),
+            *(view.camera.name, view.camera.intrinsics, view.camera.rotation @ UP),
             *(view.truth, moving[view.camera.name], view),
         )
         for view in session.views
@@ -75,7 +76,7 @@ def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]
     world, reprojection = triangulate([c.without_lens() for c in cameras], points, weights)
     truths = [
         Scene(
-            *(camera.name, camera.intrinsics, camera.rotation @ _UP),
+            *(camera.name, camera.intrinsics, camera.rotation @ UP),
             *(camera.to_camera(world), mediapipe, None),
         )
         for camera, mediapipe in zip(cameras, standing, strict=True)

@@ -4,14 +4,14 @@
 Motion capture that `human` was not trained on, before simulated cameras 1.4 m high, with a
 detector's noise. The depth is rendered from the truth: capsules around the bones, whose thickness
 is drawn for each person and is not that of the lifter, a wall, the noise and the holes of a depth
-camera, and an occluder. Smaller people are the same motions at 70 % of their size. On the
-pose2sim clip, place and size by the floor.
+camera, and a board as an occluder. Smaller people are the same motions at 70 % of their size.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,24 +25,28 @@ from benchmarks.real.people import SYSTEMS, lift_track
 from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.body.depth import (
     AGREEMENT,
+    MIN_CONFIDENCE,
     MIN_KEYPOINTS,
     DepthFit,
     DepthScale,
+    RangeScale,
     surface_radii,
 )
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
-from deep_nrsfm_ros.messages.depth_messages import window, window_depth
+from deep_nrsfm_ros.messages.depth_messages import DepthPoints, window, window_depth
 from deep_nrsfm_ros.model_files.model_file import load_model
 
 Floats = NDArray[Any]
 Masks = NDArray[np.bool_]
 
 WALL = 2.0  # m behind the person's middle
-NOISE = 0.00285  # m / m^2: standard deviation of a depth over the square of the depth
+NOISE = 0.0014  # m / m^2: standard deviation of a depth over the square of the depth
+LIDAR_NOISE = 0.02  # m
 HOLES, WINDOW_HOLES = 0.1, 0.05  # share of pixels and of keypoints without a depth
 FLESH = (0.7, 1.4)  # thickness of a person's capsules, relative to `BONES`
+MEAN_RADIUS = 0.07  # m, of the next line's
 BONES = (
     *((f"{side}_shoulder", f"{side}_elbow", 0.045) for side in ("left", "right")),
     *((f"{side}_elbow", f"{side}_wrist", 0.035) for side in ("left", "right")),
@@ -62,14 +66,18 @@ class Case:
     """How the depth is measured.
 
     Attributes:
+        sensor: "image", "cloud" (a lidar of `LINES`) or "range" (one distance on the axis).
         hidden: share of the person's height that a board hides from below, 0 = no board.
+        since: seconds from which on the board is there.
         delay: frames by which the depth is behind the keypoints.
         shift: pixels by which the depth image is beside the image.
         factor: measured over true depth.
         dropout: share of the frames without any depth, in bursts of 1 s.
     """
 
+    sensor: str = "image"
     hidden: float = 0.0
+    since: float = 0.0
     delay: int = 0
     shift: float = 0.0
     factor: float = 1.0
@@ -78,36 +86,47 @@ class Case:
 
 CASES = {
     "depth": Case(),
-    "depth in half of the time": Case(dropout=0.5),
-    "depth, legs hidden by a board": Case(hidden=0.45),
-    "depth, all but head and shoulders hidden": Case(hidden=0.8),
+    "lidar of 16 lines": Case("cloud"),
+    "range": Case("range"),
+    "depth in half of the seconds": Case(dropout=0.5),
+    "depth, legs behind a board": Case(hidden=0.45),
+    "depth, all but head and shoulders behind it": Case(hidden=0.8),
+    "the same after 1 s of full view": Case(hidden=0.8, since=1.0),
     "depth, 0.1 s late": Case(delay=3),
-    "depth, not registered: 20 pixels beside": Case(shift=20.0),
+    "depth, not registered: 40 pixels beside": Case(shift=40.0),
     "depth, 5 % too far": Case(factor=1.05),
 }
+BOARD = CASES["depth, legs behind a board"]
+MEDIAN, SURFACE = "depth, legs behind it, plain median", "depth, joints on the surface"
+"""Rows that show what two parts of the method are worth."""
+LINES, COLUMNS = 2.0, 0.4  # degrees between the lines of the lidar, and along one
+MARGIN = 50  # pixels around the person within which points of the lidar are computed
+BEAM = 0.05  # rad, half of the range finder's
 FIGURES = {
     "place mm": "distance of the centroids in the camera's frame, median",
     "place %": "of the distance to the camera, median",
     "size %": "error of the person's size, median",
     "points mm": "mean distance of the 12 limb joints in the camera's frame, median",
-    "agree": "mean number of keypoints that agree, of 17",
-    "found %": "share of the keypoints behind the board that are called occluded",
-    "false %": "share of the other keypoints that are called occluded",
+    "agree": "mean number of keypoints that agree",
+    "found %": "share of the limb joints with something nearer than the person's skin, the board "
+    "or the person, that are called occluded",
+    "false %": "share of the other limb joints that are called occluded",
 }
 
 
 class Scene:
     """A person's capsules, a wall and a board before a camera."""
 
-    def __init__(self, truth: Floats, size: float, case: Case, rng: np.random.Generator) -> None:
+    def __init__(self, track: Track, size: float, case: Case, rng: np.random.Generator) -> None:
         """Build the scene.
 
         Args:
-            truth: (f, 12, 3) `JOINTS` in m in the camera's axes.
+            track: has the truth.
             size: of the person, 1 = adult.
             case: how the depth is measured.
             rng: draws the thickness.
         """
+        truth = track.truth / 1000
         points = dict(zip(JOINTS, truth.swapaxes(0, 1), strict=True))
         for middle, part in (("neck", "shoulder"), ("mid_hip", "hip")):
             points[middle] = (points[f"left_{part}"] + points[f"right_{part}"]) / 2
@@ -121,23 +140,23 @@ class Scene:
         # The board hangs 0.7 m before the nearest point, wide enough to hide the person.
         self._board = truth[..., 2].min(1) - 0.7
         self._edge = (bottom - case.hidden * (bottom - top)) / truth[..., 2].mean(1)
-        self._hides = case.hidden > 0
+        self._hides = (track.seconds >= case.since)[:, None] & (case.hidden > 0)
 
-    def depth(self, rays: Floats) -> Floats:
-        """Return the depth (f, k) of the first surface on rays (f, k, 2) of the plane z = 1."""
+    def depth(self, rays: Floats, frames: slice = slice(None)) -> Floats:
+        """Return the depth (f, k) of the first surface on rays (f, k, 2) of the plane z = 1.
+
+        Args:
+            rays: of each frame.
+            frames: the f frames; all if it is left out.
+        """
         depth = np.full(rays.shape[:2], self._wall)
         d = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
+        starts, ends = self._starts[frames, None], self._ends[frames, None]
         for bone, radius in enumerate(self._radii.tolist()):
-            start, end = self._starts[:, None, bone], self._ends[:, None, bone]
-            depth = np.fmin(depth, capsule_depth(d, start, end, radius))
-        if self._hides:
-            depth = np.where(self.behind_board(rays), self._board[:, None], depth)
-        return depth
-
-    def behind_board(self, rays: Floats) -> Masks:
-        """Return which rays (f, k, 2) meet the board."""
-        hidden: Masks = (rays[..., 1] > self._edge[:, None]) & self._hides
-        return hidden
+            surface = capsule_depth(d, starts[:, :, bone], ends[:, :, bone], radius)
+            depth = np.fmin(depth, surface)
+        hidden = (rays[..., 1] > self._edge[frames, None]) & self._hides[frames]
+        return np.where(hidden, self._board[frames, None], depth)
 
 
 def capsule_depth(d: Floats, start: Floats, end: Floats, radius: float) -> Floats:
@@ -173,34 +192,77 @@ def _first_root(a: Floats, b: Floats, c: Floats) -> Floats:
     return first
 
 
-def measured_depth(
-    scene: Scene, intrinsics: Intrinsics, pixels: Floats, case: Case, rng: np.random.Generator
-) -> Floats:
-    """Return the depth (f, p) that a depth camera measures in windows around pixels (f, p, 2)."""
-    f, p = pixels.shape[:2]
-    at = window(np.nan_to_num(pixels) + [case.shift, 0])
-    rays = intrinsics.rays(at.reshape(f, -1, 2).astype(float))
-    depth = case.factor * scene.depth(rays)
-    depth += NOISE / 2 * depth**2 * rng.standard_normal(depth.shape)
-    depth = depth.reshape(f, p, -1)
+def noisy_depth(depth: Floats, rng: np.random.Generator) -> Floats:
+    """Return depths (f, p, w) of windows with the noise and the holes of a depth camera."""
     # Half of the variance is common to the pixels of a window, as of a matched patch.
-    depth += NOISE / 2 * depth**2 * rng.standard_normal((f, p, 1))
-    depth[rng.random(depth.shape) < HOLES] = np.nan
-    depth[rng.random((f, p)) < WINDOW_HOLES] = np.nan
-    found = window_depth(depth)
+    own, common = rng.standard_normal(depth.shape), rng.standard_normal((*depth.shape[:2], 1))
+    measured: Floats = depth + NOISE * depth**2 * np.sqrt(0.5) * (own + common)
+    measured[rng.random(depth.shape) < HOLES] = np.nan
+    measured[rng.random(depth.shape[:2]) < WINDOW_HOLES] = np.nan
+    return measured
+
+
+def measured_depth(
+    scene: Scene, track: Track, pixels: Floats, case: Case, rng: np.random.Generator
+) -> Floats:
+    """Return the depth (f, p) that is measured at pixels (f, p, 2); NaN where there is none."""
+    f, p = pixels.shape[:2]
+    shifted = np.nan_to_num(pixels) + [case.shift, 0]
+    if case.sensor == "cloud":
+        found = cloud_depth(scene, track, shifted, rng)
+    else:
+        rays = track.intrinsics.rays(window(shifted).reshape(f, -1, 2).astype(float))
+        found = window_depth(noisy_depth(case.factor * scene.depth(rays).reshape(f, p, -1), rng))
     found = np.concatenate([np.full((case.delay, p), np.nan), found[: f - case.delay]])
-    second = np.arange(f) // 30
-    silent = rng.random(second[-1] + 1 if f else 0) < case.dropout
+    second = track.seconds.astype(int)
+    silent = rng.random(second[-1] + 1) < case.dropout
+    silent[0] = False
     found[silent[second]] = np.nan
     return np.where(np.isfinite(pixels).all(-1), found, np.nan)
 
 
+def cloud_depth(scene: Scene, track: Track, pixels: Floats, rng: np.random.Generator) -> Floats:
+    """Return the depth (f, p) at pixels (f, p, 2) from the points of a lidar at the camera."""
+    up, across = np.arange(-15.0, 15.1, LINES), np.arange(-35.0, 35.1, COLUMNS)
+    rays = np.tan(np.radians(np.stack(np.meshgrid(across, up), -1).reshape(1, -1, 2)))
+    at = track.intrinsics.pixels(rays[0])
+    found = []
+    for i, row in enumerate(pixels):
+        near = ((at > row.min(0) - MARGIN) & (at < row.max(0) + MARGIN)).all(1)
+        depth = scene.depth(rays[:, near], slice(i, i + 1))[0]
+        depth = depth + LIDAR_NOISE * rng.standard_normal(depth.shape)
+        points = np.concatenate([rays[0, near], np.ones((len(depth), 1))], 1) * depth[:, None]
+        found.append(DepthPoints(points, track.intrinsics).at(row))
+    return np.array(found)
+
+
+def measured_range(scene: Scene, track: Track, rng: np.random.Generator) -> Floats:
+    """Return the distance (f,) to the first surface in the beam of a range finder."""
+    radius = np.sqrt(np.linspace(0, 1, 60)) * np.tan(BEAM)
+    angle = 2.4 * np.arange(60)  # a spiral with even density
+    rays = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)[None]
+    rays = np.repeat(rays, len(track.seconds), 0)
+    far = scene.depth(rays) * np.sqrt(1 + np.square(rays).sum(-1))
+    nearest: Floats = far.min(1) + LIDAR_NOISE * rng.standard_normal(len(far))
+    return nearest
+
+
+def by_range(lifter: Lifter, track: Track, lifted: Lifted, distance: Floats) -> Floats:
+    """Return the shapes (f, p, 3) with a measured distance, frame after frame."""
+    layout = lifter.model.layout
+    scale = RangeScale(radii(lifter), [(a, b) for a, b in layout.edge_indices()])
+    scales = [
+        scale(("person",), lifted.shapes[i : i + 1], float(distance[i]), BEAM, second)[0]
+        for i, second in enumerate(track.seconds.tolist())
+    ]
+    return scaled(lifted, np.concatenate(scales))
+
+
 def by_depth(
-    lifter: Lifter, track: Track, lifted: Lifted, measured: Floats
+    track: Track, lifted: Lifted, measured: Floats, radii: Floats
 ) -> tuple[Floats, DepthFit]:
     """Return the shapes (f, p, 3) with measured depth, frame after frame, and the fits."""
-    length = lifter.options.length_for(lifter.model.layout)
-    scale = DepthScale(surface_radii(lifter.model.layout, length), AGREEMENT, MIN_KEYPOINTS)
+    scale = DepthScale(radii, AGREEMENT, MIN_KEYPOINTS)
     scales, fits = [], []
     for i, second in enumerate(track.seconds.tolist()):
         row = slice(i, i + 1)
@@ -209,9 +271,29 @@ def by_depth(
         )
         scales.append(found)
         fits.append(fit)
-    factors = np.concatenate(scales)
-    shapes = np.where(np.isnan(factors), 1, factors)[:, None, None] * lifted.shapes
-    return shapes, DepthFit(*map(np.concatenate, zip(*fits, strict=True)))
+    fit = DepthFit(*map(np.concatenate, zip(*fits, strict=True)))
+    return scaled(lifted, np.concatenate(scales)), fit
+
+
+def by_median(lifted: Lifted, measured: Floats, radii: Floats) -> Floats:
+    """Return the shapes (f, p, 3) with the median factor of the confident keypoints."""
+    ratios = measured / (lifted.shapes[..., 2] - radii)
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # frames without depth
+        factors = np.nanmedian(np.where(lifted.confidence >= MIN_CONFIDENCE, ratios, np.nan), 1)
+    return scaled(lifted, factors)
+
+
+def radii(lifter: Lifter) -> Floats:
+    """Return the lifter's distances (p,) of keypoints from the surface."""
+    layout = lifter.model.layout
+    return surface_radii(layout, lifter.options.length_for(layout))
+
+
+def scaled(lifted: Lifted, factors: Floats) -> Floats:
+    """Return shapes (f, p, 3) times factors (f,), of which NaN is 1."""
+    shapes: Floats = np.where(np.isnan(factors), 1, factors)[:, None, None] * lifted.shapes
+    return shapes
 
 
 def pixels_of(lifted: Lifted, intrinsics: Intrinsics) -> Floats:
@@ -227,53 +309,74 @@ def points_error(track: Track, shapes: Floats) -> Floats:
     return error
 
 
-def benchmark(lifter: Lifter, data: Path, stride: int, cases: dict[str, Case]) -> Table:
+def occlusion(scene: Scene, track: Track, size: float) -> Masks:
+    """Return the limb joints (f, 12) in front of which something is nearer than their skin."""
+    truth = track.truth / 1000
+    surface = scene.depth(truth[..., :2] / truth[..., 2:])
+    hidden: Masks = truth[..., 2] - surface > AGREEMENT + size * MEAN_RADIUS
+    return hidden
+
+
+def person_rows(lifter: Lifter, track: Track, size: float, seed: int) -> Iterator[tuple[str, Any]]:
+    """Yield the name of each row and the errors of one track for it, in the order of `FIGURES`."""
+    limbs = [lifter.model.layout.index(joint) for joint in JOINTS]
+    lifted = lift_track(lifter, track, SYSTEMS["in time"], intrinsics=True)
+    pixels = pixels_of(lifted, track.intrinsics)
+    nothing = (np.zeros(0),) * 3
+
+    def row(shapes: Floats) -> tuple[Floats, ...]:
+        return (*errors(track, shapes[:, limbs]), points_error(track, shapes[:, limbs]))
+
+    yield ASSUMED, (*row(lifted.shapes), *nothing)
+    for name, case in CASES.items():
+        rng = np.random.default_rng(seed)
+        scene = Scene(track, size, case, rng)
+        if case.sensor == "range":
+            distance = measured_range(scene, track, rng)
+            yield name, (*row(by_range(lifter, track, lifted, distance)), *nothing)
+            continue
+        measured = measured_depth(scene, track, pixels, case, rng)
+        shapes, fit = by_depth(track, lifted, measured, radii(lifter))
+        hidden = occlusion(scene, track, size)
+        known = np.isfinite(measured[:, limbs]) & np.isfinite(fit.scales)[:, None]
+        called = fit.occluded[:, limbs].astype(float)
+        counts = (fit.agree.sum(1).astype(float), called[hidden & known], called[~hidden & known])
+        yield name, (*row(shapes), *counts)
+        if case == BOARD:
+            yield MEDIAN, (*row(by_median(lifted, measured, radii(lifter))), *nothing)
+        elif case == Case():
+            shapes, _ = by_depth(track, lifted, measured, 0 * radii(lifter))
+            yield SURFACE, (*row(shapes), *nothing)
+
+
+def summary(columns: Mapping[str, Floats]) -> dict[str, float]:
+    """Return the figures of errors by name: medians, a mean number, shares in %."""
+    result = {}
+    for name, values in columns.items():
+        if len(values):
+            mean = float(values.mean())
+            is_share, is_mean = name in ("found %", "false %"), name == "agree"
+            middle = mean if is_mean else float(np.median(values))
+            result[name] = 100 * mean if is_share else middle
+    return result
+
+
+def benchmark(lifter: Lifter, data: Path, stride: int) -> Table:
     """Return the table of errors by size of the people and by case."""
     table = Table(
         *("depth", "Place and size of people by measured depth", ("people", "metres from")),
         *(tuple(FIGURES), FIGURES, bars("place mm", "points mm")),
     )
-    limbs = [lifter.model.layout.index(joint) for joint in JOINTS]
     motions = list(held_out_motions(data / "cmu"))[::stride]
     for people, size in SIZES.items():
         found: dict[str, list[Any]] = {}
         for seed, motion in enumerate(motions):
             track = noisy(filmed(size * motion, 120.0 * (seed % 3), seed), seed)
-            lifted = lift_track(lifter, track, SYSTEMS["in time"], intrinsics=True)
-            shapes = lifted.shapes[:, limbs]
-            none = np.full(len(shapes), np.nan)
-            plain = (*errors(track, shapes), points_error(track, shapes), none, none, none)
-            found.setdefault(ASSUMED, []).append(plain)
-            pixels = pixels_of(lifted, track.intrinsics)
-            for name, case in cases.items():
-                rng = np.random.default_rng(seed)
-                scene = Scene(track.truth / 1000, size, case, rng)
-                measured = measured_depth(scene, track.intrinsics, pixels, case, rng)
-                shapes, fit = by_depth(lifter, track, lifted, measured)
-                shapes = shapes[:, limbs]
-                rays = track.truth[..., :2] / track.truth[..., 2:]
-                behind = scene.behind_board(rays)
-                occluded = fit.occluded[:, limbs].astype(float)
-                known = np.isfinite(measured[:, limbs])
-                row = (
-                    *errors(track, shapes),
-                    points_error(track, shapes),
-                    fit.agree.sum(1),
-                    occluded[behind & known],
-                    occluded[~behind & known],
-                )
+            for name, row in person_rows(lifter, track, size, seed):
                 found.setdefault(name, []).append(row)
         for name, parts in found.items():
-            columns = [np.concatenate(p) for p in zip(*parts, strict=True)]
-            figures = [float(np.median(column)) for column in columns[:4]]
-            figures += [float(columns[4].mean())]
-            figures += [
-                100 * float(column.mean()) if len(column) else np.nan for column in columns[5:]
-            ]
-            table.add(
-                (people, name),
-                {k: v for k, v in zip(FIGURES, figures, strict=True) if np.isfinite(v)},
-            )
+            columns = [np.concatenate(part) for part in zip(*parts, strict=True)]
+            table.add((people, name), summary(dict(zip(FIGURES, columns, strict=True))))
     return table
 
 
@@ -286,8 +389,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--stride", type=int, default=1, help="use every n-th trial")
     args = parser.parse_args(argv)
     print_tables(
-        lambda: [benchmark(Lifter(load_model(args.model)), args.data, args.stride, CASES)],
-        args.output,
+        lambda: [benchmark(Lifter(load_model(args.model)), args.data, args.stride)], args.output
     )
 
 

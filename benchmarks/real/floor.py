@@ -2,12 +2,14 @@
 """Place and size of people by the camera's height above the floor, against an assumed body height.
 
 Motion capture that `human` was not trained on, before simulated cameras 1.4 m high with a
-detector's noise; smaller people are the same motions at 70 % of their size.
+detector's noise; smaller people are the same motions at 70 % of their size. A real person in the
+pose2sim clip, before four calibrated cameras.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.data.people_scenes import HEIGHT, Track, filmed, held_out_motions, noisy
+from benchmarks.data.people_scenes import (
+    HEIGHT,
+    Track,
+    filmed,
+    held_out_motions,
+    noisy,
+    view_track,
+)
+from benchmarks.data.pose2sim_scenes import CACHE, UP
 from benchmarks.real.people import SYSTEMS, lift_track
 from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.body.floor import FloorScale
-from deep_nrsfm_ros.data.pose2sim import JOINTS
+from deep_nrsfm_ros.data.pose2sim import JOINTS, fetch_wheel, read_session
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import load_model
 
@@ -38,7 +48,7 @@ FIGURES = {
 
 def errors(track: Track, shapes: Floats) -> tuple[Floats, Floats, Floats]:
     """Return errors of place in mm, and of place and size in %, of the limbs (f, 12, 3) in m."""
-    known = np.isfinite(shapes).all((1, 2))
+    known = np.isfinite(shapes).all((1, 2)) & np.isfinite(track.truth).all((1, 2))
     S, T = 1000 * shapes[known].astype(float), track.truth[known]
     apart = np.linalg.norm(S.mean(1) - T.mean(1), axis=1)
     spread = [np.sqrt(np.square(X - X.mean(1, keepdims=True)).sum((1, 2))) for X in (S, T)]
@@ -62,16 +72,59 @@ def benchmark(lifter: Lifter, data: Path, stride: int) -> Table:
             found.setdefault(ASSUMED, []).append(errors(track, shapes[:, limbs]))
             for name, wrong in ROWS.items():
                 # A step of 0.2 m: the camera is taken to be 0.2 m too high above the feet.
-                floor = FloorScale(HEIGHT + abs(wrong))
-                scales = [
-                    floor(("person",), shapes[i : i + 1], track.up, second)
-                    for i, second in enumerate(track.seconds.tolist())
-                ]
-                scaled = np.concatenate(scales)[:, None, None] * shapes
+                scaled = on_floor(track, shapes, HEIGHT + abs(wrong))
                 found.setdefault(name, []).append(errors(track, scaled[:, limbs]))
         for name, parts in found.items():
-            medians = [float(np.median(np.concatenate(p))) for p in zip(*parts, strict=True)]
-            table.add((people, name), dict(zip(FIGURES, medians, strict=True)))
+            table.add((people, name), medians(parts))
+    return table
+
+
+def on_floor(track: Track, shapes: Floats, height: float) -> Floats:
+    """Return shapes (f, p, 3) at the size with which they stand on the floor, frame after frame.
+
+    Args:
+        track: has their times and the direction of gravity.
+        shapes: at their positions before the camera.
+        height: of the camera in metres.
+    """
+    floor = FloorScale(height)
+    scales = [
+        floor(("person",), shapes[i : i + 1], track.up, second)
+        for i, second in enumerate(track.seconds.tolist())
+    ]
+    scaled: Floats = np.concatenate(scales)[:, None, None] * shapes
+    return scaled
+
+
+def medians(parts: Sequence[tuple[Floats, ...]]) -> dict[str, float]:
+    """Return the `FIGURES` of the errors of several tracks."""
+    columns = (float(np.median(np.concatenate(part))) for part in zip(*parts, strict=True))
+    return dict(zip(FIGURES, columns, strict=True))
+
+
+def clip_table(lifter: Lifter) -> Table:
+    """Return the table of errors on the pose2sim clip, whose calibration has cameras' heights.
+
+    Raises:
+        OSError: the clip is not there and cannot be fetched.
+    """
+    table = Table(
+        *("floor_clip", "Place and size of the person of the pose2sim clip", ("camera", "metres")),
+        *((*FIGURES, "height m"), FIGURES | {"height m": "of the camera"}, bars("place mm")),
+    )
+    limbs = [lifter.model.layout.index(joint) for joint in JOINTS]
+    found: dict[str, list[Any]] = {}
+    for view in read_session(fetch_wheel(CACHE)).views:
+        track, camera = view_track(view), view.camera
+        shapes = lift_track(lifter, track, SYSTEMS["in time"], intrinsics=True).shapes
+        height = float(UP @ -(camera.rotation.T @ camera.translation)) / 1000
+        scaled = on_floor(track, shapes, height)
+        for name, S in ((ASSUMED, shapes), ("floor", scaled)):
+            row = errors(track, S[:, limbs])
+            table.add((camera.name, name), medians([row]) | {"height m": height})
+            found.setdefault(name, []).append(row)
+    for name, parts in found.items():
+        table.add(("all", name), medians(parts))
     return table
 
 
@@ -83,9 +136,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     parser.add_argument("--stride", type=int, default=1, help="use every n-th trial")
     args = parser.parse_args(argv)
-    print_tables(
-        lambda: [benchmark(Lifter(load_model(args.model)), args.data, args.stride)], args.output
-    )
+
+    def tables() -> list[Table]:
+        lifter = Lifter(load_model(args.model))
+        simulated = benchmark(lifter, args.data, args.stride)
+        try:
+            return [simulated, clip_table(lifter)]
+        except OSError as error:
+            print(f"no rows of the pose2sim clip: {error}", file=sys.stderr)
+            return [simulated]
+
+    print_tables(tables, args.output)
 
 
 if __name__ == "__main__":

@@ -41,6 +41,7 @@ _RADII = {
 
 They are rounded measures of an adult with a trunk of `_TRUNK`; nose and eyes are on the surface.
 """
+_PREFERRED = 3  # times as many keypoints may agree with another scale than that of the identity
 _TRUNK = 0.5  # m
 _BEAM_STEPS = 9  # points along a bone
 AGREEMENT = 0.2
@@ -49,7 +50,7 @@ MIN_KEYPOINTS = 3
 """Fewest keypoints of an object that must agree."""
 MIN_CONFIDENCE = 0.3
 """Least confidence of a point that may vote on the scale."""
-_SAME_SIZE = 0.15  # log of the factor by which a scale may differ from that of its identity
+_SAME_SIZE = 0.1  # log of the factor by which a scale may differ from that of its identity
 
 
 class DepthFit(NamedTuple):
@@ -96,9 +97,9 @@ def fit_depth(
         surface: (n, p) lifted depth of the surface, z - r.
         measured: (n, p) depth along the optical axis in metres; NaN: a hole.
         confident: (n, p) keypoints that may vote.
-        known: (n,) scale of each object from earlier messages; NaN: none. It is preferred where
-            at least half as many keypoints agree with it: an occluder of most of a person does
-            not make the person smaller.
+        known: (n,) scale of each object from earlier messages; NaN: none. It is preferred unless
+            three times as many keypoints agree with another one: an occluder of most of a person
+            does not make the person smaller.
         agreement: metres between the two surfaces up to which they agree.
         min_keypoints: fewest that must agree.
     """
@@ -112,7 +113,7 @@ def fit_depth(
         scores = np.fmax(1 - np.square(residuals / agreement), 0).sum(2)
         best = scores.max(1, keepdims=True)
         familiar = np.abs(np.log(ratios / known[:, None])) < _SAME_SIZE
-        scores[familiar & (2 * scores >= best)] += surface.shape[1]
+        scores[familiar & (_PREFERRED * scores >= best)] += surface.shape[1]
         chosen = scores.argmax(1)
         rows = np.arange(len(surface))
         members = np.abs(residuals[rows, chosen]) <= agreement

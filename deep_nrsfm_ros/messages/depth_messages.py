@@ -58,18 +58,22 @@ class DepthPoints:
         with np.errstate(all="ignore"):
             ahead = np.isfinite(points).all(1) & (points[:, 2] > 0)
             points = points[ahead].astype(np.float64)
-            self._pixels = intrinsics.pixels(points[:, :2] / points[:, 2:])
-        self._depth = points[:, 2]
+            pixels = intrinsics.pixels(points[:, :2] / points[:, 2:])
+        order = np.argsort(pixels[:, 0])
+        self._columns, self._rows = pixels[order].T
+        self._depth = points[order, 2]
         self._radius = _CONE * max(intrinsics.focal)
 
     def at(self, pixels: Floats) -> Floats:
         """Return the depth (...,) in metres at pixels (..., 2), NaN without points near them."""
         flat = pixels.reshape(-1, 2)
         depth = np.full(len(flat), np.nan)
-        for i, pixel in enumerate(flat):
-            near = (np.abs(self._pixels - pixel) <= self._radius).all(1)
+        first = np.searchsorted(self._columns, flat[:, 0] - self._radius)
+        last = np.searchsorted(self._columns, flat[:, 0] + self._radius, "right")
+        for i, (start, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+            near = np.abs(self._rows[start:end] - flat[i, 1]) <= self._radius
             if near.any():
-                depth[i] = np.median(self._depth[near])
+                depth[i] = np.median(self._depth[start:end][near])
         return depth.reshape(pixels.shape[:-1])
 
 

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import Protocol
+from dataclasses import Field, fields
+from typing import Any, ClassVar, Protocol
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
@@ -70,6 +70,28 @@ def unused_options(
         text = f"person_height is {lifting.person_height:g} and has no effect, since {reason}"
         warnings["person_height"] = text
     return warnings
+
+
+class DepthParameters(Protocol):
+    """A dataclass of the parameters of measured depth."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def topic(self) -> str:
+        """Topic of measured depth; "": not used."""
+
+
+def unused_depth(depth: DepthParameters) -> dict[str, str]:
+    """Return a warning for each parameter of measured depth that has no effect, by its name."""
+    if depth.topic:
+        return {}
+    changed = [f for f in fields(depth) if getattr(depth, f.name) != f.default]
+    names = {f"depth.{f.name.rstrip('_')}": getattr(depth, f.name) for f in changed}
+    return {
+        name: f"{name} is {value} and has no effect, since depth.topic is empty"
+        for name, value in names.items()
+    }
 
 
 def unused_height(

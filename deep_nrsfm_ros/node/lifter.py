@@ -65,7 +65,12 @@ from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
-from deep_nrsfm_ros.messages.unused_options import unused_gravity, unused_height, unused_options
+from deep_nrsfm_ros.messages.unused_options import (
+    unused_depth,
+    unused_gravity,
+    unused_height,
+    unused_options,
+)
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
@@ -703,6 +708,7 @@ class LifterNode(Node):
             warnings |= unused_height(height, up, sources, self._target.name)
         else:
             warnings |= unused_gravity(up, sources, lifting, self._pipeline.model.layout)
+        warnings |= unused_depth(self._depth_options)
         changed = {change.name for change in changes}
         said, self._unused = self._unused, frozenset(warnings)
         return list({t: 0 for name, t in warnings.items() if name in changed or name not in said})

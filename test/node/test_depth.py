@@ -21,6 +21,7 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
 from deep_nrsfm_ros.messages.serialised import Header
+from deep_nrsfm_ros.messages.unused_options import unused_depth
 from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
 from deep_nrsfm_ros.node.depth import DepthOptions, DepthSubscription
 from test.fixtures.standing_person import standing_person
@@ -193,6 +194,15 @@ def test_depth_without_a_camera_is_refused() -> None:
     camera = CameraInfoSubscription(node, CameraOptions())
     with pytest.raises(ValueError, match=r"depth.topic is '/depth' without camera_info"):
         DepthSubscription(node, DepthOptions("/depth"), camera)
+
+
+def test_options_of_depth_without_a_topic_are_warned_of() -> None:
+    assert not unused_depth(DepthOptions("/depth", "range", 0.2)) and not unused_depth(
+        DepthOptions()
+    )
+    warnings = unused_depth(DepthOptions(type_="range", tolerance=0.2))
+    assert warnings.keys() == {"depth.type", "depth.tolerance"}
+    assert warnings["depth.type"].endswith("has no effect, since depth.topic is empty")
 
 
 @pytest.fixture
