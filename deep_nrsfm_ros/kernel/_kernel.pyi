@@ -123,11 +123,14 @@ def decode_keypoints(
         ValueError: A number is out of range, or the arrays do not fit the data.
     """
 
-def steady_depths(constants: Any, states: Any, rows: Any, shapes: Any, rotations: Any, /) -> None:
+def steady_depths(
+    time: float, constants: Any, states: Any, rows: Any, shapes: Any, rotations: Any, /
+) -> None:
     """Make the depths of n objects of p points steady: `lifting.steady_depth`.
 
     Args:
-        constants: float64, in the order of `steady_depths`.
+        time: of the frame in seconds.
+        constants: float64, in the order of `steady_depth`.
         states: (capacity, 1 + 7 p) float64, updated.
         rows: (n,) int32, the row of each object; below 0: none.
         shapes: (n, p, 3) float32, changed.

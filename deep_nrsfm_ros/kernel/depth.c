@@ -37,10 +37,10 @@ static void turn(const double v[3], float *R) {
     }
 }
 
-static void steady(const DepthConstants *c, ptrdiff_t p, double *state, float *S, float *R) {
-    double *points = state + 1, *velocity = points + 3 * p, *depths = velocity + 3 * p, elapsed = c->time - state[0];
+static void steady(const DepthConstants *c, double time, ptrdiff_t p, double *state, float *S, float *R) {
+    double *points = state + 1, *velocity = points + 3 * p, *depths = velocity + 3 * p, elapsed = time - state[0];
     if (!(elapsed >= -c->max_back && elapsed <= c->max_gap)) {
-        state[0] = c->time;
+        state[0] = time;
         restart(p, velocity, depths, points, S);
         return;
     }
@@ -63,7 +63,7 @@ static void steady(const DepthConstants *c, ptrdiff_t p, double *state, float *S
         depths[i] += gain * (S[3 * i + 2] - depths[i]);
         in_front = in_front && fmin(S[3 * i + 2], depths[i]) > NEAREST;
     }
-    state[0] = c->time;
+    state[0] = time;
     double inertia[3][3] = {{0}}, moment[3] = {0}, vector[3];
     for (ptrdiff_t i = 0; i < p; i++) {
         float *s = S + 3 * i;
@@ -83,11 +83,11 @@ static void steady(const DepthConstants *c, ptrdiff_t p, double *state, float *S
     turn(vector, R);
 }
 
-void steady_depths(const DepthConstants *c, ptrdiff_t n, ptrdiff_t p, double *states, const int *rows, float *shapes,
+void steady_depths(const DepthConstants *c, double time, ptrdiff_t n, ptrdiff_t p, double *states, const int *rows, float *shapes,
                    float *rotations) {
     for (ptrdiff_t i = 0; i < n; i++) {
         int lifted = rows[i] >= 0;
         for (ptrdiff_t k = 0; lifted && k < 3 * p; k++) lifted = isfinite(shapes[3 * p * i + k]);
-        if (lifted) steady(c, p, states + rows[i] * (1 + 7 * p), shapes + 3 * p * i, rotations + 9 * i);
+        if (lifted) steady(c, time, p, states + rows[i] * (1 + 7 * p), shapes + 3 * p * i, rotations + 9 * i);
     }
 }

@@ -265,14 +265,15 @@ static PyObject *update_tracks_entry(PyObject *Py_UNUSED(module), PyObject *args
     Py_RETURN_NONE;
 }
 
-/* steady_depths(constants, states, rows, shapes, rotations): change the last two, (n, p, 3) and (n, 3, 3), and the rows of
+/* steady_depths(time, constants, states, rows, shapes, rotations): change the last two, (n, p, 3) and (n, 3, 3), and the rows of
    the states (capacity, 1 + 7 p); rows (n,) int32, below 0: none. */
 static PyObject *steady_depths_entry(PyObject *Py_UNUSED(module), PyObject *args) {
     static const ArrayArgument expected[5] = {
         {"constants", FLOAT64, 0}, {"states", FLOAT64, 1}, {"rows", INT32, 0}, {"shapes", FLOAT32, 1}, {"rotations", FLOAT32, 1}};
     PyObject *o[5];
     Py_buffer arrays[5];
-    if (!parse_arguments(args, "OOOOO:steady_depths", &o[0], &o[1], &o[2], &o[3], &o[4])) return NULL;
+    double time;
+    if (!parse_arguments(args, "dOOOOO:steady_depths", &time, &o[0], &o[1], &o[2], &o[3], &o[4])) return NULL;
     if (!get_arrays(5, expected, o, arrays)) return NULL;
     Py_ssize_t n = count_items(arrays + 2), items = count_items(arrays + 3), nine;
     Py_ssize_t p = n > 0 ? items / n / 3 : 0, of_object[1] = {3 * p};
@@ -281,7 +282,7 @@ static PyObject *steady_depths_entry(PyObject *Py_UNUSED(module), PyObject *args
     Py_ssize_t capacity = sound ? count_items(arrays + 1) / (1 + 7 * p) : 0;
     const int *rows = arrays[2].buf;
     for (Py_ssize_t i = 0; sound && i < n; i++) sound = rows[i] < capacity;
-    if (sound) steady_depths(arrays[0].buf, n, p, arrays[1].buf, rows, arrays[3].buf, arrays[4].buf);
+    if (sound) steady_depths(arrays[0].buf, time, n, p, arrays[1].buf, rows, arrays[3].buf, arrays[4].buf);
     release_arrays(5, arrays);
     if (!sound) return PyErr_Format(PyExc_ValueError, "the arrays do not fit each other");
     Py_RETURN_NONE;

@@ -11,6 +11,7 @@ Sources: Casiez, Roussel and Vogel, "1 Euro Filter", CHI 2012. The filter of dep
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +52,12 @@ def _split(row: Floats, p: int) -> _State:
     return _State(row[:1], points, velocity, row[1 + 6 * p :])
 
 
+@functools.lru_cache(maxsize=8)
+def _constants(cutoff: float) -> Floats:
+    """Return the constants of the kernel's form."""
+    return np.array([cutoff, BETA, SPEED_CUTOFF, MAX_GAP, MAX_BACK])
+
+
 def steady_depths(lifted: Lifted, memory: Memory, context: Context) -> Lifted:
     """Return the objects of a frame with steady depths.
 
@@ -68,9 +75,10 @@ def steady_depths(lifted: Lifted, memory: Memory, context: Context) -> Lifted:
         return lifted
     shapes, rotations = lifted.shapes.copy(), lifted.rotations.copy()
     if kernel.AVAILABLE and shapes.dtype == rotations.dtype == np.float32:
-        constants = np.array([context.time, cutoff, BETA, SPEED_CUTOFF, MAX_GAP, MAX_BACK])
-        states = memory.depth_states
-        kernel._kernel.steady_depths(constants, states, context.rows, shapes, rotations)
+        kernel._kernel.steady_depths(
+            *(context.time, _constants(cutoff)),
+            *(memory.depth_states, context.rows, shapes, rotations),
+        )
     else:
         for i, row in enumerate(context.rows.tolist()):
             if row >= 0 and not np.isnan(shapes[i]).any():

@@ -231,7 +231,14 @@ def steady_depths(spoiler: Spoiler) -> Arguments:
     )
     for part in (states, shapes, rotations):
         part[:] = floats(spoiler, *part.shape)
-    return [floats(spoiler, 6).astype(float), states, rows, shapes, rotations]
+    return [
+        spoiler.choice(NUMBERS),
+        floats(spoiler, 5).astype(float),
+        states,
+        rows,
+        shapes,
+        rotations,
+    ]
 
 
 # Valid arguments of every entry point.
