@@ -150,10 +150,10 @@ class HistoryOptions:
         high=60.0,
     )
     depth_cutoff: float = option(
-        0.2,
+        0.5,
         "cutoff frequency in Hz with which the depths of an object at rest are smoothed after the "
         "correction (One-Euro filter; it rises with the object's speed); each point stays where "
-        "the image has it, so nothing lags there; 0 = off, 0.2 typical, 1 weak",
+        "the image has it, so nothing lags there; 0 = off, 0.5 typical, 2 weak",
         low=0.0,
         high=1000.0,
     )

@@ -25,8 +25,8 @@ from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector
 
 Floats = NDArray[Any]
 
-BETA = 4.0
-"""Hz by which the cutoff rises for each RMS radius per second; as `smoothing.beta`."""
+BETA = 8.0
+"""Hz by which the cutoff rises for each RMS radius per second."""
 _NEAREST = 1e-6  # depth in front of the camera, below which there is no ray
 
 
