@@ -32,7 +32,7 @@ def objects(shapes: np.ndarray, rotations: np.ndarray | None = None) -> Lifted:
 
 
 def walk(
-    frames: np.ndarray, seconds: np.ndarray, cutoff: float = 0.2, names: tuple[str, ...] = ("a",)
+    frames: np.ndarray, seconds: np.ndarray, cutoff: float = 0.5, names: tuple[str, ...] = ("a",)
 ) -> np.ndarray:
     """Return the steady shapes (f, n, p, 3) of frames (f, n, p, 3)."""
     memory = Memory(StateLayout(frames.shape[2], 0), cutoff)
@@ -58,7 +58,7 @@ def test_depths_are_steady_and_the_image_is_as_it_was(distance: float) -> None:
     S, frames, seconds = still(distance=distance)
     steady = walk(frames, seconds)
     change = np.abs(np.diff(steady[30:, 0, :, 2], axis=0)).mean()
-    assert change < 0.3 * np.abs(np.diff(frames[30:, 0, :, 2], axis=0)).mean()
+    assert change < 0.5 * np.abs(np.diff(frames[30:, 0, :, 2], axis=0)).mean()
     for found, given_ in ((steady, frames), (frames, frames)):
         by = found[..., 2:] if distance else 1
         expected = given_[..., :2] / given_[..., 2:] if distance else given_[..., :2]
