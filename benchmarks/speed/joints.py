@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time of a message of five people, with and without what the lifter says of their joints."""
+"""CPU time and latency of a message of five people, with and without what is said of joints."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import time
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -43,6 +43,10 @@ LEGEND = {
     "us": f"CPU time of all threads of the node for a message of {PEOPLE} people, model human",
     "% of a core": f"at {RATE:.0f} messages a second, lifting and ~/points included",
     "for joints %": f"the same, without the row '{SWITCHED_OFF}'",
+    "more %": f"us above the row '{SWITCHED_OFF}', in % of it",
+    "points us": "median time from the call with a message until ~/points is handed to the "
+    "middleware",
+    "last us": "the same until the last topic is",
     OWN: "with a subscriber to each, in another process",
     ALL: "these, ~/markers, ~/objects, and joint_states, urdf, position and velocity of each "
     "person (body.humans); without /tf, whose package is not on PyPI",
@@ -54,6 +58,7 @@ _KINDS = {
     "velocity": TwistStamped,
 }
 _ALL = "body.humans:=true"
+_PAIRS = 4  # rounds of the two first rows, which hardly differ, for each of the others
 
 
 def topics(*, everything: bool) -> dict[str, Any]:
@@ -93,6 +98,20 @@ def listener(*, everything: bool) -> Iterator[None]:
         process.wait()
 
 
+class Costs(NamedTuple):
+    """What a message costs, in us.
+
+    Attributes:
+        work: CPU time of all threads.
+        points: time until ~/points is sent.
+        last: time until the last topic is.
+    """
+
+    work: float
+    points: float
+    last: float
+
+
 class Lifter:
     """A lifter in this process that lifts people who stand before its camera."""
 
@@ -106,16 +125,28 @@ class Lifter:
         ((self._source, _),) = self.node._keypoint_topics._subscribed.values()
         self._raw = serialised_keypoints(PEOPLE, len(HUMAN25))
         self._number = 30
+        self._sent = 0.0
+        send = self.node._points.publish
 
-    def lift(self, calls: int) -> float:
-        """Lift messages at the rate of their stamps; return the CPU time of each in us."""
+        def publish(raw: bytes) -> None:
+            send(raw)
+            self._sent = time.perf_counter()
+
+        self.node._points.publish = publish
+
+    def lift(self, calls: int) -> Costs:
+        """Lift messages at the rate of their stamps; return what each costs."""
+        latencies = np.empty((calls, 2))
         began = time.process_time()
-        for _ in range(calls):
+        for call in range(calls):
+            start = time.perf_counter()
             self._number += 1
             second, rest = divmod(self._number / RATE, 1)
             stamp = struct.pack("<iI", int(second), int(1e9 * rest))
             self.node._lift(self._source, self._raw[:4] + stamp + self._raw[12:])
-        return 1e6 * (time.process_time() - began) / calls
+            latencies[call] = self._sent - start, time.perf_counter() - start
+        spent = (time.process_time() - began) / calls
+        return Costs(1e6 * spent, *(1e6 * np.median(latencies, 0)).tolist())
 
     def wait_for(self, publishers: Sequence[Any], seconds: float = 60.0) -> None:
         """Wait until all publishers have a subscriber."""
@@ -132,22 +163,22 @@ class Lifter:
         rclpy.try_shutdown()
 
 
-def measure(rounds: int, calls: int) -> dict[str, float]:
-    """Return the median CPU time in us of a message for each row."""
-    seconds: dict[str, list[float]] = {name: [] for name in (SWITCHED_OFF, SILENT, OWN, ALL)}
+def measure(rounds: int, calls: int) -> dict[str, Costs]:
+    """Return the median costs of a message for each row."""
+    costs: dict[str, list[Costs]] = {name: [] for name in (SWITCHED_OFF, SILENT, OWN, ALL)}
     off = mock.patch.object(BodyPublishers, "has_subscriber", return_value=False)
     silent = Lifter()
     silent.lift(calls)
-    for _ in range(rounds):
+    for _ in range(_PAIRS * rounds):
         with off:
-            seconds[SWITCHED_OFF].append(silent.lift(calls))
-        seconds[SILENT].append(silent.lift(calls))
+            costs[SWITCHED_OFF].append(silent.lift(calls))
+        costs[SILENT].append(silent.lift(calls))
     bodies = silent.node._bodies
     with listener(everything=False):
         silent.wait_for((silent.node._points, bodies._joints, bodies._angles, bodies._tracks))
         silent.lift(calls)
         for _ in range(rounds):
-            seconds[OWN].append(silent.lift(calls))
+            costs[OWN].append(silent.lift(calls))
     silent.close()
     everything = Lifter(_ALL)
     everything.lift(2)
@@ -156,22 +187,25 @@ def measure(rounds: int, calls: int) -> dict[str, float]:
         everything.wait_for((everything.node._markers, *own))
         everything.lift(calls)
         for _ in range(rounds):
-            seconds[ALL].append(everything.lift(calls))
+            costs[ALL].append(everything.lift(calls))
     everything.close()
-    return {name: float(np.median(times)) for name, times in seconds.items()}
+    return {name: Costs(*np.median(each, 0).tolist()) for name, each in costs.items()}
 
 
 def benchmark(args: Namespace) -> Iterator[Table]:
     """Measure and yield the table."""
     os.environ["ROS_DOMAIN_ID"] = str(random_domain())
+    columns = ("us", "% of a core", "for joints %", "more %", "points us", "last us")
     table = Table(
         *("joints", f"What the joints of {PEOPLE} people cost", ("row",)),
-        *(("us", "% of a core", "for joints %"), LEGEND, bars("us")),
+        *(columns, LEGEND, bars("us")),
     )
     results = measure(*((1, 3) if args.quick else (15, 60)))
-    for name, us in results.items():
-        share = [100 * RATE * 1e-6 * x for x in (us, us - results[SWITCHED_OFF])]
-        table.add((name,), {"us": us, "% of a core": share[0], "for joints %": share[1]})
+    without = results[SWITCHED_OFF].work
+    for name, (us, points, last) in results.items():
+        share = [1e-4 * RATE * x for x in (us, us - without)]
+        values = (us, *share, 100 * (us / without - 1), points, last)
+        table.add((name,), dict(zip(columns, values, strict=True)))
     yield table
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Quaternion, QuaternionStamped, Transform, Vector3
+from geometry_msgs.msg import Point, QuaternionStamped, Vector3
 from numpy.typing import NDArray
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.serialization import serialize_message
@@ -132,8 +132,9 @@ def objects(
         positioned: whether the shapes are at their positions before the camera.
 
     Returns:
-        A MultiDOFJointState: transforms as `transforms` gives them, NaN for objects that are not
-        lifted.
+        A MultiDOFJointState: transforms from the axes of each object to those of the camera, NaN
+        for objects that are not lifted. The origin is the mean of the keypoints, 0 if not
+        `positioned`.
     """
     template = _objects(header.frame_id, tuple(identities))
     shapes = lifted.shapes
@@ -148,28 +149,6 @@ def _objects(frame_id: str, identities: tuple[str, ...]) -> SerialisedTemplate:
     message = MultiDOFJointState(header=template_header(frame_id), joint_names=list(identities))
     message.transforms = [template_transform(i) for i in range(len(identities))]
     return SerialisedTemplate(message, TRANSFORM_NUMBERS * len(identities))
-
-
-def transforms(lifted: Lifted, *, positioned: bool) -> list[Transform]:
-    """Return the transform from the axes of each object to those of the camera.
-
-    The origin of an object is the mean of its keypoints.
-
-    Args:
-        lifted: n objects.
-        positioned: whether the shapes are at their positions; if not, translations are 0.
-    """
-    means = lifted.shapes.mean(1) if positioned else np.zeros((len(lifted.shapes), 3))
-    translations = (Vector3(x=x, y=y, z=z) for x, y, z in means.tolist())
-    rotations = map(to_quaternion, lifted.rotations)
-    pairs = zip(translations, rotations, strict=True)
-    return [Transform(translation=t, rotation=q) for t, q in pairs]
-
-
-def to_quaternion(rotation: NDArray[np.float32]) -> Quaternion:
-    """Return the Quaternion of a rotation (3, 3); NaN stays NaN."""
-    x, y, z, w = quaternion(rotation).tolist()
-    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def markers(

@@ -18,7 +18,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, TransformStamped, TwistStamped
 from rclpy.serialization import deserialize_message
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import CameraInfo, JointState, MultiDOFJointState, PointCloud2
 from std_msgs.msg import String
 
@@ -28,7 +28,7 @@ from deep_nrsfm_ros.body.urdf import UrdfDrawing, urdf
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.node import body_messages
-from deep_nrsfm_ros.node.bodies import topic_name
+from deep_nrsfm_ros.node.bodies import BodyPublishers, topic_name
 from deep_nrsfm_ros.node.serialised_template import (
     SerialisedTemplate,
     TextTemplate,
@@ -42,13 +42,13 @@ from test.fixtures.standing_person import (
     random_rotations,
     standing_person,
 )
+from test.fixtures.tf_messages import STORE, serialise_frames
 from test.node.conftest import LATCHED, Client, lifters, own_domain, write_models
 from test.node.test_camera import info, keypoints
 
 TREE = KinematicTree(HUMAN17)
 OFFSETS = TREE.offsets(TREE(standing_person()[None]))[0]
 CONFIDENCE = np.array([0.9, 0.2])
-STORE = get_typestore(Stores.ROS2_JAZZY)
 EXAMPLES = Path(__file__).parents[2] / "examples"
 Q = ("x", "y", "z", "w")
 
@@ -103,33 +103,6 @@ def test_position_and_velocity_are_those_of_the_root() -> None:
         v = twist.twist.linear
         assert (v.x, v.y, v.z) == tuple(point) and twist.twist.angular.z == 0
         assert sent.header == twist.header and sent.header.stamp.sec == k
-
-
-def serialise_frames(message: Any) -> bytes:
-    """Return the bytes of a TFMessage, whose package PyPI lacks."""
-    kinds = STORE.types
-    stamped = [
-        kinds["geometry_msgs/msg/TransformStamped"](
-            header=kinds["std_msgs/msg/Header"](
-                stamp=kinds["builtin_interfaces/msg/Time"](
-                    t.header.stamp.sec, t.header.stamp.nanosec
-                ),
-                frame_id=t.header.frame_id,
-            ),
-            child_frame_id=t.child_frame_id,
-            transform=kinds["geometry_msgs/msg/Transform"](
-                translation=kinds["geometry_msgs/msg/Vector3"](
-                    *(getattr(t.transform.translation, k) for k in "xyz")
-                ),
-                rotation=kinds["geometry_msgs/msg/Quaternion"](
-                    *(getattr(t.transform.rotation, k) for k in Q)
-                ),
-            ),
-        )
-        for t in message.transforms
-    ]
-    kind = "tf2_msgs/msg/TFMessage"
-    return bytes(STORE.serialize_cdr(kinds[kind](stamped), kind))
 
 
 def frames_on_tf(pose: Pose, names: tuple[str, ...]) -> dict[str, Any]:
@@ -300,6 +273,25 @@ def test_the_example_shows_an_elbow(client: Client, tmp_path: Path) -> None:
             process.kill()
             process.wait()
     assert re.match(r"object\d+/l_elbow: +-?\d", shown.read_text())
+
+
+def test_the_list_of_bodies_is_that_of_hri_msgs() -> None:
+    """By its definition, through rosbags: hri_msgs is not on PyPI."""
+    name = "hri_msgs/msg/IdsList"
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg("std_msgs/Header header\nstring[] ids", name))
+    sent: list[Any] = []
+    bodies: Any = object.__new__(BodyPublishers)
+    bodies._bodies = {"anna": [], "7": []}
+    bodies._ids, bodies._ids_message = SimpleNamespace(publish=sent.append), store.types[name]
+    bodies._publish_ids(Header(3, 4, "camera"))
+    stamp = store.types["builtin_interfaces/msg/Time"](3, 4)
+    header = store.types["std_msgs/msg/Header"](stamp, "camera")
+    (message,) = sent
+    assert (message.header.stamp.sec, message.header.frame_id) == (3, "camera")
+    message.header = header  # rclpy's own would be one already
+    raw = store.serialize_cdr(message, name)
+    assert store.deserialize_cdr(raw, name).ids == ["anna", "id_7"]
 
 
 def leaves(split: Any) -> set[str]:

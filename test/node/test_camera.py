@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 from array import array
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,10 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages import serialised
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
-from deep_nrsfm_ros.node.transforms import frames
+from deep_nrsfm_ros.node.body_messages import FrameMessages
+from deep_nrsfm_ros.node.transforms import object_frames
 from deep_nrsfm_ros.nrsfm.geometry import quaternion
+from test.fixtures.tf_messages import STORE, serialise_frames
 from test.node.test_publishing import read_markers
 
 P = len(HUMAN17)
@@ -150,7 +153,11 @@ def placed() -> Lifted:
 
 def test_frames_lead_from_the_objects_to_the_camera() -> None:
     lifted = placed()
-    found = frames(serialised.Header(frame_id="optical"), lifted, ["a", "b", "c"])
+    messages = FrameMessages(SimpleNamespace, serialise_frames)
+    header = serialised.Header(frame_id="optical")
+    raw = object_frames(messages, header, lifted, ["a", "b", "c"])
+    message: Any = STORE.deserialize_cdr(raw, "tf2_msgs/msg/TFMessage")
+    found = message.transforms
     assert [frame.child_frame_id for frame in found] == ["a", "c"]
     for frame, i in zip(found, (0, 2), strict=True):
         assert frame.header.frame_id == "optical"

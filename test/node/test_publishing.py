@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-from geometry_msgs.msg import QuaternionStamped
+from geometry_msgs.msg import Quaternion, QuaternionStamped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.executors import SingleThreadedExecutor
@@ -30,7 +30,7 @@ from deep_nrsfm_ros.messages.decoding import POINT_FIELDS as FIELDS
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.node import lifter, publishing
-from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
+from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_quaternion
 from test.node.conftest import DEADLINE
 
 
@@ -103,7 +103,8 @@ def test_what_is_serialised_is_what_ros_would_send(sent: list[tuple[Header, int,
         assert_same_bytes(publishing.point_cloud(header, wanted), message)
         turned = QuaternionStamped(header=message.header)
         R = rotation_from_quaternion(np.array([n, p, -1, 2.0])).astype(np.float32)
-        turned.quaternion = publishing.to_quaternion(R)
+        x, y, z, w = quaternion(R).tolist()
+        turned.quaternion = Quaternion(x=x, y=y, z=z, w=w)
         assert_same_bytes(publishing.camera_rotation(header, R), turned)
 
 
