@@ -126,13 +126,14 @@ class Lifter:
         self._raw = serialised_keypoints(PEOPLE, len(HUMAN25))
         self._number = 30
         self._sent = 0.0
-        send = self.node._points.publish
+        points: Any = self.node._points
+        send = points.publish
 
         def publish(raw: bytes) -> None:
             send(raw)
             self._sent = time.perf_counter()
 
-        self.node._points.publish = publish
+        points.publish = publish
 
     def lift(self, calls: int) -> Costs:
         """Lift messages at the rate of their stamps; return what each costs."""

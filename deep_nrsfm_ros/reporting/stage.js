@@ -7,7 +7,7 @@ const RAMP = [[230, 97, 1], [253, 184, 99], [120, 198, 121], [0, 104, 55]];
 const TRUTH = "#b4bcc4";
 const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
 const count = data.views[0].points.length;
-let index = 0, chosen = 0, playing = false, turning = !still, clock = 0, before = 0, wheel = 1;
+let index = 0, chosen = 0, playing = false, turning = !still, bodied = true, clock = 0, before = 0, wheel = 1;
 
 function colour(confidence) {
   const at = Math.min(1, Math.max(0, confidence)) * (RAMP.length - 1);
@@ -98,6 +98,7 @@ const orbit = new Orbit($("lifted"), 0, 0.24, () => {
   arrow(project, view);
   const shape = view.shapes[index], truth = view.truth[index];
   bones(data.target, shape, ([a, b]) => stroke(project([a[0], a[1], 0]), project([b[0], b[1], 0]), "rgba(40,48,56,0.16)", 7));
+  if (bodied) body(view.capsules[index], view.radius, project);
   orbit.joints = shape.every(known) ? shape.map(project) : [];
   const drawn = [];
   bones(data.truth, truth, ([a, b]) => drawn.push([project(a), project(b), TRUTH, 8]));
@@ -107,6 +108,17 @@ const orbit = new Orbit($("lifted"), 0, 0.24, () => {
   if (!orbit.joints.length) write(pen, 16, 28, "no answer for this frame: dropped, or not lifted");
   write(pen, 14, orbit.height - 14, `floor: one square is ${data.grid} m`);
 });
+
+// The capsules of the person's URDF, far ones first, each with an outline.
+function body(capsules, thickness, project) {
+  capsules.filter(ends => ends.every(known)).map(ends => ends.map(project))
+    .sort((e, f) => e[0][2] + e[1][2] - f[0][2] - f[1][2])
+    .forEach(([a, b]) => {
+      const near = 1 - (a[2] + b[2]) / 2 / orbit.distance, width = 2 * thickness * orbit.zoom / Math.max(0.1, near);
+      stroke(a, b, "#b9c6d3", width + 2);
+      stroke(a, b, "#e6edf4", width);
+    });
+}
 
 function bones(layout, points, draw) {
   layout.edges.forEach(([a, b], k) => {
@@ -199,6 +211,7 @@ const KEYS = {
   Home: () => seek(0),
   End: () => seek(count - 1),
   t: () => turn(!turning),
+  b: () => { bodied = !bodied; orbit.draw(); },
   r: () => { turn(false); reset(); },
   ...Object.fromEntries(data.views.map((_, k) => [String(k + 1), () => choose(k)])),
 };

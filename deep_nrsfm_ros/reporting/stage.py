@@ -19,6 +19,7 @@ from deep_nrsfm_ros.data.clip import IMAGE_STEP, Images
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, Session
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
+from deep_nrsfm_ros.reporting.capsules import body_capsules
 from deep_nrsfm_ros.reporting.drawing import edge_colours
 from deep_nrsfm_ros.reporting.template import embedded, render
 
@@ -132,7 +133,7 @@ def stage_page(stage: Stage, title: str, notes: Sequence[str]) -> str:
         "truth": _drawn(stage.truth),
         "rate": RATE / stage.step,
         "grid": GRID,
-        "views": [_view(view, stage.frames) for view in stage.views],
+        "views": [_view(view, stage.frames, stage.target) for view in stage.views],
     }
     return render(
         "stage.html.j2",
@@ -145,9 +146,10 @@ def stage_page(stage: Stage, title: str, notes: Sequence[str]) -> str:
     )
 
 
-def _view(view: StageView, frames: range) -> dict[str, Any]:
+def _view(view: StageView, frames: range, target: KeypointLayout) -> dict[str, Any]:
     """Return a view for stage.js; numbers in pixels, confidence in percent, metres."""
     rows = slice(frames.start, frames.stop, frames.step)
+    capsules = body_capsules(target, view.shapes[rows])
     return {
         "name": view.name,
         "size": view.images.size,
@@ -161,6 +163,8 @@ def _view(view: StageView, frames: range) -> dict[str, Any]:
         "confidence": [_numbers(frame, 2) for frame in view.confidence[rows]],
         "shapes": [_numbers(frame, 3) for frame in view.shapes[rows]],
         "truth": [_numbers(frame, 3) for frame in view.truth[rows]],
+        "capsules": [_numbers(frame, 3) for frame in capsules.ends],
+        "radius": round(capsules.radius, 4),
     }
 
 

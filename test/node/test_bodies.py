@@ -291,7 +291,8 @@ def test_the_list_of_bodies_is_that_of_hri_msgs() -> None:
     assert (message.header.stamp.sec, message.header.frame_id) == (3, "camera")
     message.header = header  # rclpy's own would be one already
     raw = store.serialize_cdr(message, name)
-    assert store.deserialize_cdr(raw, name).ids == ["anna", "id_7"]
+    read: Any = store.deserialize_cdr(raw, name)
+    assert read.ids == ["anna", "id_7"]
 
 
 def leaves(split: Any) -> set[str]:

@@ -70,6 +70,20 @@ def test_page_shows_images_and_a_fitted_person(tab: Any, page: str) -> None:
     assert joints[ANKLE, 1] > joints[NOSE, 1]
 
 
+def test_the_body_is_drawn_until_b_is_pressed(tab: Any, page: str) -> None:
+    tab.open(page)
+    tab.press("t")
+    widths = (
+        "(() => { const before = stroke, found = []; stroke = (a, b, style, width) => {"
+        "if (style === '#e6edf4') found.push(width); before(a, b, style, width); };"
+        "orbit.draw(); stroke = before; return found; })()"
+    )
+    drawn = tab.evaluate(widths)
+    assert len(drawn) > 10 and min(drawn) > 3  # pixels
+    tab.press("b")
+    assert tab.evaluate(widths) == []
+
+
 def test_another_camera_is_chosen_by_its_number(tab: Any, page: str) -> None:
     tab.open(page)
     tab.press("t")
