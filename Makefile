@@ -35,7 +35,7 @@ LIBASAN = $(shell $(SANITIZE_CC) -print-file-name=libasan.so)
 LIBSTDCXX = $(shell $(SANITIZE_CC) -print-file-name=libstdc++.so.6)
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer -g
 SANITIZE_TESTS := test/kernel test/fuzz/test_kernel.py test/lifting/test_compiled_backend.py \
-    test/lifting/test_tracking.py test/body/test_kinematic_tree.py test/messages/test_serialised.py $(wildcard test/training/test_compiled_*.py)
+    test/lifting/test_tracking.py test/lifting/test_steady_depth.py test/body/test_kinematic_tree.py test/messages/test_serialised.py $(wildcard test/training/test_compiled_*.py)
 SANITIZE_FUZZ ?= 1000
 
 # Test files that run at the same time, each on a DDS domain of its own.

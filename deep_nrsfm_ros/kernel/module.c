@@ -12,7 +12,7 @@
 #include "joints.h"
 #include "point_cloud.h"
 #include "plan.h"
-#include "depth.h"
+#include "steady_depth.h"
 #include "tracking.h"
 #include "training_module.h"
 

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Depths that are steady over time: lifting/steady_depth.py. */
-#ifndef DEPTH_H
-#define DEPTH_H
+#ifndef STEADY_DEPTH_H
+#define STEADY_DEPTH_H
 
 #include <stddef.h>
 

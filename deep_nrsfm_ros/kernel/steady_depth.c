@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* The formulas are those of lifting/steady_depth.py, which test/lifting/test_steady_depth.py compares. */
-#include "depth.h"
+#include "steady_depth.h"
 
 #include <math.h>
 
