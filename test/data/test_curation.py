@@ -202,3 +202,31 @@ def test_apart_skips_neighbours() -> None:
     frames = np.array([0, 1, 2, 50, 51, 90])
     assert spread_out(np.array([4, 3, 0, 1, 5]), frames, 10, 2) == [4, 0]
     assert spread_out(np.array([4, 3, 0, 1, 5]), frames, 10, 9) == [4, 0, 5]
+
+
+@pytest.mark.parametrize("missing", [0, 0.02, 0.3])
+def test_new_frames_at_once_are_those_that_are_found_one_by_one(missing: float) -> None:
+    rng = np.random.default_rng(1)
+    f = 150
+    steps = 30 * rng.random((f, 1, 1)) ** 6  # some frames hardly move
+    start = 100 * rng.standard_normal((P, 2))
+    points = start + np.cumsum(steps * rng.standard_normal((f, P, 2)), 0)
+    visible = rng.random((f, P)) >= missing
+
+    def scaled(frame: int, shown: np.ndarray) -> np.ndarray:
+        X = points[frame, shown] - points[frame, shown].mean(0)
+        return X / np.sqrt((X**2).sum() / len(X))
+
+    kept: list[int] = []
+    for i in range(f):
+        shown = visible[i]
+        near = [
+            np.square(scaled(i, shown) - scaled(k, shown)).sum() < 0.05**2 * shown.sum()
+            for k in kept[-4:]
+            if not (shown & ~visible[k]).any()
+        ]
+        if not any(near):
+            kept.append(i)
+    assert f / 10 < len(kept) < f
+    found = changed_frames(points.astype(np.float32), visible, 0.05)
+    assert np.flatnonzero(found).tolist() == kept
