@@ -2,14 +2,16 @@
 """Frames per second that processes of a training read from a bag, and memory of a large training.
 
 Each process reads its own share of the bag. The rate is all frames over the processor time of the
-slowest process, which does not depend on what else the machine does. With `--long` a training
-reads, curates and learns ten million frames.
+slowest process, which does not depend on what else the machine does. `--curation` measures the
+curation alone, for more and more frames. With `--long` a training reads, curates and learns ten
+million frames.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -23,8 +25,11 @@ import numpy as np
 from benchmarks.speed.timing import print_and_write, speed_parser
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.data.bags import Frame, read_bags, write_bag
+from deep_nrsfm_ros.data.curation import curate
+from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.share import Share
+from deep_nrsfm_ros.large_arrays import empty, release
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
@@ -81,6 +86,39 @@ def train(bag: Path, frames: int, folder: Path) -> tuple[float, float]:
     return usage.ru_maxrss / 1024, usage.ru_utime + usage.ru_stime
 
 
+def curation(counts: Sequence[int]) -> Iterator[Table]:
+    """Yield the table of the time and memory of the curation of these numbers of frames."""
+    table = Table(
+        "curation",
+        f"Curation of frames of {len(HUMAN17)} keypoints, one thread",
+        ("frames",),
+        ("us a frame", "peak MiB", "dataset MiB"),
+        {
+            "us a frame": "processor time",
+            "peak MiB": "resident, of the whole process, pages of temporary files included",
+        },
+        bars("us a frame"),
+    )
+    for count in sorted(counts):
+        points = empty((count, len(HUMAN17), 2), np.float32)
+        visible = empty(points.shape[:2], bool)
+        visible[:] = True
+        for i, frame in enumerate(repeated_frames(count, 1000)):
+            points[1000 * i : 1000 * (i + 1)] = frame.points
+        release((points, visible))
+        began = time.process_time()
+        curate(Dataset(points, visible, HUMAN17, "made"))
+        seconds = time.process_time() - began
+        figures = {
+            "us a frame": 1e6 * seconds / count,
+            "peak MiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "dataset MiB": (points.nbytes + visible.nbytes) / _MIB,
+        }
+        table.add((str(count),), figures)
+        release((points, visible))
+    yield table
+
+
 def benchmark(args: Namespace) -> Iterator[Table]:
     """Yield the table of rates, and with `--long` that of the large training."""
     table = Table(
@@ -127,11 +165,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--frames", type=int, default=LARGE, help="of the large training (default: %(default)s)"
     )
+    parser.add_argument(
+        "--curation", type=int, nargs="+", help="the curation of these thousands of frames alone"
+    )
     parser.add_argument("--bag", type=Path, help="internal: read a share of this bag")
     parser.add_argument("--share", type=int, nargs=2, help="internal: process, processes")
     args = parser.parse_args(argv)
     if args.bag:
         print(json.dumps(read_share(args.bag, Share(*args.share))))
+    elif args.curation:
+        print_and_write(curation([1000 * each for each in args.curation]), args.output)
     else:
         print_and_write(benchmark(args), args.output)
 
