@@ -91,7 +91,7 @@ MORE_WRONG_SIDES = 0.005
 """Share of mirrored or turned frames by which a model must differ from another to be worse."""
 MOST_OPPOSED = 0.05
 """Share of frames with the other's mirror image above which one of both mirrors them."""
-STEADIER_BONES = 0.45
+STEADIER_BONES = 0.5
 """Of the other's variation of bones, up to which a model is the one that does not mirror them."""
 LOOSER_BONES = 2.5
 """Times the other's variation of bones above which a model has fitted its keypoints too closely.
