@@ -6,7 +6,7 @@ Lift the keypoints of n objects with a model that comes with the package:
     from deep_nrsfm_ros import Lifter, load_model
 
     lifter = Lifter(load_model("human"), layout="coco17")
-    lifted = lifter(points)  # (n, 17, 2) pixels -> lifted.shapes (n, 17, 3), lifted.rotations
+    lifted = lifter(points)  # (n, 17, 2) pixels -> lifted.shapes (n, 25, 3), lifted.rotations
 
 Importing the package imports nothing else; each name below imports what it needs at its first use.
 """
