@@ -71,7 +71,7 @@ def draw(axes: Any, tree: KinematicTree, angles: dict[str, float], title: str) -
             axes.text(*(origin + [0, 0, 0.035]), f"  {name}", fontsize=9)
     axes.set_title(title, fontsize=9, y=-0.1)
     axes.set_box_aspect((1, 1, 2), zoom=1.3)
-    axes.set(xlim=(-0.45, 0.45), ylim=(-0.45, 0.45), zlim=(-0.95, 0.85))
+    axes.set(xlim=(-0.45, 0.45), ylim=(-0.45, 0.45), zlim=(-1.1, 1.0))
     axes.view_init(_ELEVATION, _AZIMUTH)
     axes.set_axis_off()
 
