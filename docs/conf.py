@@ -27,7 +27,7 @@ html_theme = "furo"
 html_title = f"deep_nrsfm_ros {__version__}"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_extra_path = ["reference/object.schema.json"]
+html_extra_path = ["reference/object.schema.json", "reference/mapping.schema.json"]
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4

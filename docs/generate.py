@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import argparse
 import ast
+import inspect
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from deep_nrsfm_ros.layouts.layout_file import FIELDS, HANDEDNESS
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.field_mapping import NEGATIVE, NORMALISED, PIXELS, FieldMapping
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.node.bodies import BodyOptions
 from deep_nrsfm_ros.node.camera import CameraOptions
@@ -287,6 +290,52 @@ def schema_of_objects() -> str:
     return json.dumps(schema, indent=2) + "\n"
 
 
+_PATH = {"type": "string"}
+_NAMES = {"type": "array", "items": {"type": "string"}, "minItems": 1}
+_PATHS = {"anyOf": [_PATH, _NAMES]}
+_SIZE = {"type": "array", "items": {"type": "integer", "minimum": 1}, "minItems": 2, "maxItems": 2}
+_MAPPING_KINDS: dict[str, dict[str, Any]] = {
+    "type": {"type": "string", "pattern": r"^[A-Za-z]\w*/(msg/)?[A-Za-z]\w*$"},
+    **dict.fromkeys(("keypoints", "x", "y", "confidence"), _PATHS),
+    **dict.fromkeys(("objects", "where", "identity", "score", "count", "keypoint_id"), _PATH),
+    "first_id": {"type": "integer"},
+    "max_confidence": {"type": "number", "exclusiveMinimum": 0},
+    "names": _NAMES,
+    "units": {"anyOf": [{"enum": [PIXELS, NORMALISED]}, _SIZE]},
+    "missing": {
+        "anyOf": [
+            {"enum": [NEGATIVE]},
+            {"type": "number"},
+            {"type": "array", "items": {"type": "number"}},
+        ]
+    },
+    "counts": {"type": "object", "additionalProperties": {"type": "integer"}},
+}
+
+
+def schema_of_mappings() -> str:
+    """Return the JSON Schema of a field mapping; the texts are those of `FieldMapping`."""
+    text = (inspect.getdoc(FieldMapping) or "").partition("Attributes:\n")[2]
+    texts = {
+        name: " ".join(words.split())
+        for name, words in re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, re.MULTILINE)
+    }
+    properties = {
+        name: {"description": texts[name], "anyOf": [kind, {"type": "null"}]}
+        for name, kind in _MAPPING_KINDS.items()
+    }
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Field mapping of deep_nrsfm_ros",
+        "type": "object",
+        "properties": properties,
+        "required": ["type"],
+        "anyOf": [{"required": ["keypoints"]}, {"required": ["x", "y"]}],
+        "additionalProperties": False,
+    }
+    return json.dumps(schema, indent=2) + "\n"
+
+
 def object_file_page() -> str:
     """Return the page of the fields of an object file, in Markdown."""
     rows = [f"| `{name}` | {_FIELDS[name][0]} |" for name in FIELDS]
@@ -313,6 +362,7 @@ PAGES = {
     "command_line.md": command_line_page,
     "object_file.md": object_file_page,
     "object.schema.json": schema_of_objects,
+    "mapping.schema.json": schema_of_mappings,
     "../operations/troubleshooting.md": troubleshooting_page,
 }
 

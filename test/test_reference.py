@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import pytest
 import yaml
 
 from deep_nrsfm_ros.layouts.layout_file import FIELDS
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from docs.generate import FOLDER, PAGES
 from docs.site_links import rewrite
 
@@ -72,7 +76,32 @@ def test_an_object_file_of_the_package_fits_the_schema() -> None:
     for path in (*ROOT.glob("config/layouts/*.yaml"), *ROOT.glob("*/layouts/presets/*.yaml")):
         fields = yaml.safe_load(path.read_text("utf-8"))
         assert set(schema["required"]) <= set(fields) <= set(schema["properties"])
-        pytest.importorskip("jsonschema").validate(fields, schema)
+        jsonschema.validate(fields, schema)
+
+
+def test_a_mapping_of_the_package_fits_the_schema() -> None:
+    schema = json.loads(PAGES["mapping.schema.json"]())
+    fields = {field.name for field in dataclasses.fields(FieldMapping) if field.init}
+    assert set(schema["properties"]) == fields
+    for path in ROOT.glob("config/mappings/*.yaml"):
+        jsonschema.validate(json.loads(json.dumps(yaml.safe_load(path.read_text()))), schema)
+
+
+@pytest.mark.parametrize(
+    ("page", "wrong"),
+    [
+        ("object", {"name": "dog"}),
+        ("object", {"name": "dog", "keypoints": ["nose"], "edges": [["nose"]]}),
+        ("object", {"name": "dog", "keypoints": ["nose"], "colour": "brown"}),
+        ("mapping", {"type": "my_msgs/People", "x": "x"}),
+        ("mapping", {"type": "People", "keypoints": "keypoints"}),
+        ("mapping", {"type": "my_msgs/People", "keypoints": "k", "units": "metres"}),
+        ("mapping", {"type": "my_msgs/People", "keypoints": "k", "max_confidence": 0}),
+    ],
+)
+def test_wrong_files_do_not_fit_the_schema(page: str, wrong: dict[str, Any]) -> None:
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(wrong, json.loads(PAGES[f"{page}.schema.json"]()))
 
 
 def test_each_layout_has_a_small_picture() -> None:
