@@ -68,7 +68,8 @@ def draw(axes: Any, tree: KinematicTree, angles: dict[str, float], title: str) -
             end = origin + AXIS * pose.rotations[0, i, :, axis]
             axes.plot(*np.stack([origin, end]).T, color=colour, linewidth=2)
         if name in _NAMED:
-            axes.text(*(origin + [0, 0, 0.035]), f"  {name}", fontsize=9)
+            side = "right" if name == "body" else "left"  # a hip is close to its right
+            axes.text(*(origin + [0, 0, 0.035]), f"  {name}  ", fontsize=9, ha=side)
     axes.set_title(title, fontsize=9, y=-0.1)
     axes.set_box_aspect((1, 1, 2), zoom=1.3)
     axes.set(xlim=(-0.45, 0.45), ylim=(-0.45, 0.45), zlim=(-1.1, 1.0))

@@ -487,8 +487,10 @@ def spearman(a: Floats, b: Floats) -> float:
 
 def draw(table: Table, figure: Figure) -> None:
     """Plot the share of correct points against the confidence, and how far each cut is off."""
-    figure.set_size_inches(9, 4.5)
+    figure.set_size_inches(9, 5.5)
+    figure.set_layout_engine("constrained")
     left, right = figure.subplots(1, 2)
+    models, data = ([*dict.fromkeys(row.labels[i] for row in table.rows)] for i in range(2))
     cuts = list(dict.fromkeys(row.labels[2] for row in table.rows if row.labels[2] != EVERY))
     for labels in dict.fromkeys(row.labels[:2] for row in table.rows):
         rows = [row for row in table.rows if row.labels[:2] == labels]
@@ -497,16 +499,18 @@ def draw(table: Table, figure: Figure) -> None:
         left.plot(
             [figures["confidence %"] for figures in of_bins],
             [figures["near %"] for figures in of_bins],
-            "o-",
+            color=(colour := f"C{data.index(labels[1])}"),
+            marker=(marker := "os^"[models.index(labels[0]) % 3]),
             label=" on ".join(labels),
         )
-        right.plot(list(at.values()), [cuts.index(cut) for cut in at], "o")
+        places = [cuts.index(cut) for cut in at]
+        right.plot(list(at.values()), places, color=colour, marker=marker, linestyle="")
     left.plot([0, 100], [0, 100], color="0.7", linestyle="--", zorder=0)
     left.set(xlabel="confidence %", ylabel=f"within {CORRECT_DISTANCE:.0%} of the object's size, %")
     right.set(xlabel="off, mean over the bins, %", xlim=(0, None))
     right.set_yticks(range(len(cuts)), cuts)
     right.invert_yaxis()
-    left.legend(fontsize="small")
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small")
 
 
 def _add(table: Table, model: Model, test_data: str, cuts: Mapping[str, Predictions]) -> None:
