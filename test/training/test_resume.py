@@ -175,7 +175,7 @@ def test_a_full_disk_is_named_and_the_old_model_stays(folder: Folder) -> None:
 def test_a_folder_that_cannot_be_written_to_is_named_before_training(folder: Folder) -> None:
     folder.models = Path("/sys/kernel")  # refuses root too
     lines = lines_of(folder.begin("--steps", "3"))
-    assert {line["state"] for line in lines} <= {"reading", "failed"}
+    assert {line["state"] for line in lines} <= {"reading", "curating", "failed"}
     assert lines[-1]["state"] == "failed"
     assert "cannot write to /sys/kernel" in lines[-1]["message"]
 
