@@ -11,6 +11,7 @@ import yaml
 
 _MAX_BYTES = 64 * 2**10
 _MAX_DEPTH = 8
+_TOO_DEEP = f"is nested deeper than {_MAX_DEPTH}: not a description"
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's is ten times faster
 
 
@@ -62,8 +63,10 @@ def _check_nesting(text: bytes) -> None:
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             if depth > _MAX_DEPTH:
-                raise ValueError(f"is nested deeper than {_MAX_DEPTH}: not a description")
+                raise ValueError(_TOO_DEEP)
     except yaml.YAMLError as error:
+        if "maximum nesting depth" in str(error):  # libyaml's own limit, which is higher
+            raise ValueError(_TOO_DEEP) from error
         raise ValueError(f"is not YAML: {' '.join(str(error).split())}") from error
 
 
