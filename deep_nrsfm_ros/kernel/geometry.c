@@ -36,6 +36,13 @@ void transpose(rotation R, rotation out) {
         for (int j = 0; j < 3; j++) out[i][j] = R[j][i];
 }
 
+void rotation_from_quaternion(double x, double y, double z, double w, rotation R) {
+    rotation turned = {{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
+                       {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
+                       {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}};
+    memcpy(R, turned, sizeof(turned));
+}
+
 void rotation_part(rotation R, double part, rotation out) {
     double trace = R[0][0] + R[1][1] + R[2][2], q[4]; /* a quaternion x, y, z, w: as `quaternion` of geometry.py */
     int i = R[1][1] > R[0][0] ? 1 : 0;
@@ -50,11 +57,7 @@ void rotation_part(rotation R, double part, rotation out) {
     }
     double sine = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]), sign = q[3] < 0 ? -1 : 1;
     double half = part * atan2(sine, sign * q[3]), by = sine > TINY ? sign * sin(half) / sine : 0;
-    double x = by * q[0], y = by * q[1], z = by * q[2], w = cos(half);
-    double turned[3][3] = {{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
-                           {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
-                           {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}};
-    memcpy(out, turned, sizeof(turned));
+    rotation_from_quaternion(by * q[0], by * q[1], by * q[2], cos(half), out);
 }
 
 void rotate(int p, int stride, rotation A, float *S) {

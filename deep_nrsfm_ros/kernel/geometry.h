@@ -26,6 +26,8 @@ void polar(camera A);
 /* Set R, whose first two rows are the columns of M and the third their cross product. */
 void rotation_from_camera(camera M, rotation R);
 void transpose(rotation R, rotation out);
+/* Set R to the rotation of a unit quaternion. */
+void rotation_from_quaternion(double x, double y, double z, double w, rotation R);
 /* Set out to the rotation about the same axis by `part` in [0, 1] of the angle of R; out may be R. */
 void rotation_part(rotation R, double part, rotation out);
 

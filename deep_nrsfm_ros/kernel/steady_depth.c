@@ -4,6 +4,8 @@
 
 #include <math.h>
 
+#include "geometry.h"
+
 static const double NEAREST = 1e-6; /* steady_depth._NEAREST */
 
 static double low_pass_gain(double cutoff, double seconds) { return 1 - 1 / (1 + 2 * M_PI * cutoff * seconds); }
@@ -27,10 +29,9 @@ static void solve(const double A[3][3], const double b[3], double x[3]) {
 /* Set R = Q R for the rotation Q of a rotation vector. */
 static void turn(const double v[3], float *R) {
     double angle = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), half = angle / 2;
-    double by = angle > 1e-12 ? sin(half) / angle : 0.5, x = by * v[0], y = by * v[1], z = by * v[2], w = cos(half);
-    const double Q[3][3] = {{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
-                            {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
-                            {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}};
+    double by = angle > 1e-12 ? sin(half) / angle : 0.5;
+    rotation Q;
+    rotation_from_quaternion(by * v[0], by * v[1], by * v[2], cos(half), Q);
     for (int c = 0; c < 3; c++) {
         double column[3] = {R[c], R[3 + c], R[6 + c]};
         for (int r = 0; r < 3; r++) R[3 * r + c] = (float)(Q[r][0] * column[0] + Q[r][1] * column[1] + Q[r][2] * column[2]);
