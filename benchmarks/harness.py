@@ -186,6 +186,21 @@ def errors_by_column(
     return row
 
 
+def model_parser(description: str | None, data: str) -> argparse.ArgumentParser:
+    """Return the command line of a benchmark that lifts trials with one model.
+
+    Args:
+        description: of the program.
+        data: what the folder of data holds.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("model", nargs="?", default="human", help="name or file of a model")
+    parser.add_argument("--data", type=Path, required=True, help=f"folder with {data}")
+    parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
+    parser.add_argument("--stride", type=int, default=1, help="use every n-th trial or sequence")
+    return parser
+
+
 def run_program(
     benchmark: Callable[[Session], Table],
     description: str | None,

@@ -8,7 +8,6 @@ Closure: forward kinematics of the angles with a person's mean bone lengths, aga
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -28,6 +27,7 @@ from benchmarks.data.people_scenes import (
     noisy,
     people_scenes,
 )
+from benchmarks.harness import model_parser
 from benchmarks.real.people import SYSTEMS, lift_track
 from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.body.kinematic_tree import KinematicTree
@@ -264,11 +264,7 @@ def closure(tree: KinematicTree, points: Floats) -> dict[str, float]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("model", nargs="?", default="human", help="name or file of a model")
-    parser.add_argument("--data", type=Path, required=True, help="folder with cmu/ and scenes/")
-    parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
-    parser.add_argument("--stride", type=int, default=1, help="use every n-th trial or sequence")
+    parser = model_parser(__doc__, "cmu/ and scenes/")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), help="names of scenes")
     parser.add_argument("--frames", type=int, default=10_000, help="poses of a subject to close")
     args = parser.parse_args(argv)

@@ -9,7 +9,6 @@ camera, and a board as an occluder. Smaller people are the same motions at 70 % 
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.data.people_scenes import Track, filmed, held_out_motions, noisy
+from benchmarks.harness import model_parser
 from benchmarks.real.floor import ASSUMED, SIZES, errors
 from benchmarks.real.people import SYSTEMS, lift_track
 from benchmarks.table import Table, bars, print_tables
@@ -382,12 +382,7 @@ def benchmark(lifter: Lifter, data: Path, stride: int) -> Table:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("model", nargs="?", default="human", help="name or file of a model")
-    parser.add_argument("--data", type=Path, required=True, help="folder with cmu/")
-    parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
-    parser.add_argument("--stride", type=int, default=1, help="use every n-th trial")
-    args = parser.parse_args(argv)
+    args = model_parser(__doc__, "cmu/").parse_args(argv)
     print_tables(
         lambda: [benchmark(Lifter(load_model(args.model)), args.data, args.stride)], args.output
     )

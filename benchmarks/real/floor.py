@@ -8,7 +8,6 @@ pose2sim clip, before four calibrated cameras.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from benchmarks.data.people_scenes import (
     view_track,
 )
 from benchmarks.data.pose2sim_scenes import CACHE, UP
+from benchmarks.harness import model_parser
 from benchmarks.real.people import SYSTEMS, lift_track
 from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.body.floor import FloorScale
@@ -130,12 +130,7 @@ def clip_table(lifter: Lifter) -> Table:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("model", nargs="?", default="human", help="name or file of a model")
-    parser.add_argument("--data", type=Path, required=True, help="folder with cmu/")
-    parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
-    parser.add_argument("--stride", type=int, default=1, help="use every n-th trial")
-    args = parser.parse_args(argv)
+    args = model_parser(__doc__, "cmu/").parse_args(argv)
 
     def tables() -> list[Table]:
         lifter = Lifter(load_model(args.model))
