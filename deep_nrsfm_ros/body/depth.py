@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.body.mean_scale import RANGE, MeanScale
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.nrsfm.geometry import finite_median
 
 Floats = NDArray[Any]
 Masks = NDArray[np.bool_]
@@ -117,7 +118,7 @@ def fit_depth(
         chosen = scores.argmax(1)
         rows = np.arange(len(surface))
         members = np.abs(residuals[rows, chosen]) <= agreement
-        scales = _median(np.where(members, ratios, np.nan))
+        scales = finite_median(np.where(members, ratios, np.nan))
         gap = measured - scales[:, None] * surface
         agree = believed & (np.abs(gap) <= agreement)
         scales[agree.sum(1) < min_keypoints] = np.nan
@@ -129,17 +130,6 @@ def fit_depth(
             (gap > agreement) & fitted,
             (confident & np.isfinite(measured)).sum(1),
         )
-
-
-def _median(values: Floats) -> Floats:
-    """Return the median (n,) of the finite values (n, p) of each row, NaN if there is none."""
-    ordered = np.sort(values, 1)  # NaN last
-    count = np.isfinite(values).sum(1)
-    rows = np.arange(len(values))
-    low, high = np.maximum(count - 1, 0) // 2, count // 2
-    high = np.minimum(high, values.shape[1] - 1)
-    median: Floats = (ordered[rows, low] + ordered[rows, high]) / 2
-    return median
 
 
 class DepthScale:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.batched import Progress, no_progress, slices
 from deep_nrsfm_ros.large_arrays import empty
+from deep_nrsfm_ros.nrsfm.geometry import finite_median
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -48,23 +49,10 @@ def median_normalised(points: NDArray[np.float32], visible: Bools) -> Floats:
         (f, p, 2), 0 where missing.
     """
     X = np.where(visible[..., None], points.astype(np.float64), np.nan)
-    X -= _median(X.swapaxes(1, 2))[:, None]
-    radius = _median(np.sqrt((X**2).sum(2)))
+    X -= np.nan_to_num(finite_median(X.swapaxes(1, 2)))[:, None]
+    radius = np.nan_to_num(finite_median(np.sqrt((X**2).sum(2))))
     scaled: Floats = np.nan_to_num(X / np.maximum(radius, 1e-9)[:, None, None])
     return scaled
-
-
-def _median(values: Floats) -> Floats:
-    """Return the median over the last axis without NaN, 0 where there is nothing else.
-
-    A tenth of the time of `np.nanmedian`, which takes short rows one by one.
-    """
-    ordered = np.sort(values, -1)  # NaN last
-    count = np.isfinite(values).sum(-1, keepdims=True)
-    lower = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, -1)
-    upper = np.take_along_axis(ordered, count // 2, -1)
-    median: Floats = np.where(count > 0, (lower + upper) / 2, 0.0)[..., 0]
-    return median
 
 
 @dataclass(frozen=True)
