@@ -171,6 +171,7 @@ class BodyPublishers:
                 "objects; set tf_prefix, for example to person"
             )
         self._node, self._options, self._prefix = node, options, tf_prefix
+        self._outbox = publishing.Outbox()
         quiet: Any = {"event_callbacks": publishing.NO_EVENT_CALLBACKS}
         self._skeleton = node.create_publisher(String, "~/skeleton", _LATCHED, **quiet)
         self._joints = node.create_publisher(MultiDOFJointState, "~/joints", 10, **quiet)
@@ -241,6 +242,14 @@ class BodyPublishers:
             scene: what it has shown.
             positioned: whether the shapes are at their positions, not centred.
         """
+        try:
+            lost = self._make(topic, scene, positioned=positioned).lost
+        finally:
+            self._outbox.send()
+        self._forget(lost)
+
+    def _make(self, topic: str, scene: Scene, *, positioned: bool) -> Motion:
+        """Make the messages of `publish`; return the motion of the objects."""
         joints = self._joints.get_subscription_count()
         angles = self._angles.get_subscription_count()
         tracks = self._tracks.get_subscription_count()
@@ -254,27 +263,26 @@ class BodyPublishers:
         motion = self._motion(topic, names, places, scene)
         if tracks:
             confidence = scene.lifted.object_confidence
-            self._tracks.publish(body_messages.tracks(header, names, motion, confidence))
+            self._outbox.add(self._tracks, body_messages.tracks(header, names, motion, confidence))
         if pose is None or tree is None or not lifted.any():
-            self._forget(motion.lost)
-            return
+            return motion
         shown = tuple(name for name, known in zip(names, lifted, strict=True) if known)
         pose = Pose(*(part[lifted] for part in pose))
         velocities = motion.velocities[lifted]
         if joints:
             titles = body_messages.joint_names(shown, tree.names)
-            self._joints.publish(body_messages.joints(header, titles, pose, velocities))
+            self._outbox.add(self._joints, body_messages.joints(header, titles, pose, velocities))
         if angles:
             titles = body_messages.joint_names(shown, tree.angle_names)
-            self._angles.publish(body_messages.angles(header, titles, pose.angles))
+            self._outbox.add(self._angles, body_messages.angles(header, titles, pose.angles))
         if self._options.frames and self._tf:
             titles = body_messages.joint_names(
                 tuple(self._prefix + name for name in shown), tree.names
             )
-            self._tf.publish(self._frames(header, pose, tree.parents, titles))
+            self._outbox.add(self._tf, self._frames(header, pose, tree.parents, titles))
         if self._options.per_object or self._options.humans:
-            self._publish_bodies(scene, shown, pose, velocities if positioned else None)
-        self._forget(motion.lost)
+            self._make_bodies(scene, shown, pose, velocities if positioned else None)
+        return motion
 
     def _motion(self, topic: str, names: Sequence[str], places: Floats, scene: Scene) -> Motion:
         """Return the motion of the objects of a message."""
@@ -285,10 +293,10 @@ class BodyPublishers:
         bridged = len(names) - scene.detected
         return tracker(names, places, moment.seconds, moment.period, bridged)
 
-    def _publish_bodies(
+    def _make_bodies(
         self, scene: Scene, names: Sequence[str], pose: Pose, velocities: Floats | None
     ) -> None:
-        """Publish the topics of each object; velocities are None where positions are not known."""
+        """Make the messages of each object; velocities are None where positions are not known."""
         tree, header, seconds = self._tree, scene.header, scene.moment.seconds
         assert tree
         offsets = tree.offsets(pose)
@@ -303,28 +311,32 @@ class BodyPublishers:
             for body, rename in zip(bodies, self._renames(name), strict=True):
                 if due and lengths.offsets is not None:
                     text = urdf(tree, lengths.offsets, topic_name(name), rename)
-                    body.urdf.publish(String(data=text))
+                    self._outbox.add(body.urdf, String(data=text))
                 if body.angles.get_subscription_count():
                     titles = body.titles(tree.angle_names, rename)
-                    body.angles.publish(body_messages.angles(header, titles, pose.angles[i]))
+                    angles = body_messages.angles(header, titles, pose.angles[i])
+                    self._outbox.add(body.angles, angles)
                 if velocities is None:
                     continue
                 if body.position.get_subscription_count():
-                    body.position.publish(body_messages.position(header, pose.origins[i, 0]))
+                    position = body_messages.position(header, pose.origins[i, 0])
+                    self._outbox.add(body.position, position)
                 if body.velocity.get_subscription_count():
-                    body.velocity.publish(body_messages.velocity(header, velocities[i, 0]))
+                    velocity = body_messages.velocity(header, velocities[i, 0])
+                    self._outbox.add(body.velocity, velocity)
         if self._options.humans:
-            self._publish_ids(header)
+            self._make_ids(header)
             if self._tf and velocities is not None:
                 roots = Pose(pose.origins[:, :1], pose.rotations[:, :1], pose.angles)
                 titles = tuple(f"body_{topic_name(name)}" for name in names)
-                self._tf.publish(self._frames(header, roots, (-1,), titles))
+                self._outbox.add(self._tf, self._frames(header, roots, (-1,), titles))
 
-    def _publish_ids(self, header: Header) -> None:
-        """Publish the list of bodies."""
+    def _make_ids(self, header: Header) -> None:
+        """Make the list of bodies."""
         if self._ids:
             ids = [topic_name(name) for name in self._bodies]
-            self._ids.publish(self._ids_message(header=publishing.to_header(header), ids=ids))
+            stamped = self._ids_message(header=publishing.to_header(header), ids=ids)
+            self._outbox.add(self._ids, stamped)
 
     def _renames(self, name: str) -> list[Callable[[str], str]]:
         """Return the functions that rename joints for each prefix of an object's topics."""

@@ -29,6 +29,7 @@ from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.node import body_messages
 from deep_nrsfm_ros.node.bodies import BodyPublishers, topic_name
+from deep_nrsfm_ros.node.publishing import Outbox
 from deep_nrsfm_ros.node.serialised_template import (
     SerialisedTemplate,
     TextTemplate,
@@ -284,7 +285,9 @@ def test_the_list_of_bodies_is_that_of_hri_msgs() -> None:
     bodies: Any = object.__new__(BodyPublishers)
     bodies._bodies = {"anna": [], "7": []}
     bodies._ids, bodies._ids_message = SimpleNamespace(publish=sent.append), store.types[name]
-    bodies._publish_ids(Header(3, 4, "camera"))
+    bodies._outbox = Outbox()
+    bodies._make_ids(Header(3, 4, "camera"))
+    bodies._outbox.send()
     stamp = store.types["builtin_interfaces/msg/Time"](3, 4)
     header = store.types["std_msgs/msg/Header"](stamp, "camera")
     (message,) = sent
