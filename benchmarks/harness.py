@@ -55,7 +55,7 @@ class Session:
     output: Path
     subjects: tuple[str, ...]
     seeds: tuple[int, ...]
-    steps: int | None  # instead of the steps of the presets
+    steps: int | None  # instead of those of the program or the preset
     stride: int  # every n-th frame
     batches: int = 2  # of 500 frames, on which the baselines are solved; 0: all
     one_camera: bool = False  # for all frames of a trial, not one for each frame

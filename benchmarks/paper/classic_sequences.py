@@ -31,6 +31,8 @@ Floats = NDArray[Any]
 
 RANKS = (2, 3, 4, 5, 6, 7, 8)
 """Ranks K to choose from."""
+STEPS = 10_000
+"""Of a training, a third of the default: there are few frames."""
 SEQUENCES = ("drink", "pickup", "face_mocap", "yoga", "dance", "shark")
 BASELINES: dict[str, Any] = {
     "Simple (Dai et al.)": block_matrix,
@@ -149,7 +151,7 @@ def benchmark(session: Session) -> Table:
         for method, printed in PAPER.get(name, {}).items():
             table.add((*labels, f"paper: {method}"), {"e3D": printed})
         for seed in session.seeds:
-            title, preset = f"{name} seed {seed}", session.preset("default", seed)
+            title, preset = f"{name} seed {seed}", session.preset("default", seed, steps=STEPS)
             model = session.trained(title, dataset, preset)
             for lifting, options in LIFTING.items():
                 S = lift_in_object_axes(model, dataset, options)
