@@ -26,10 +26,11 @@ from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.body.depth import (
     AGREEMENT,
     MIN_CONFIDENCE,
-    MIN_KEYPOINTS,
+    Agreement,
     DepthFit,
     DepthScale,
     RangeScale,
+    believed_scales,
     surface_radii,
 )
 from deep_nrsfm_ros.data.pose2sim import JOINTS
@@ -250,7 +251,8 @@ def measured_range(scene: Scene, track: Track, rng: np.random.Generator) -> Floa
 def by_range(lifter: Lifter, track: Track, lifted: Lifted, distance: Floats) -> Floats:
     """Return the shapes (f, p, 3) with a measured distance, frame after frame."""
     layout = lifter.model.layout
-    scale = RangeScale(radii(lifter), [(a, b) for a, b in layout.edge_indices()])
+    edges = [(a, b) for a, b in layout.edge_indices()]
+    scale = RangeScale(radii(lifter), edges, agreement(lifter).scales)
     scales = [
         scale(("person",), lifted.shapes[i : i + 1], float(distance[i]), BEAM, second)[0]
         for i, second in enumerate(track.seconds.tolist())
@@ -259,10 +261,9 @@ def by_range(lifter: Lifter, track: Track, lifted: Lifted, distance: Floats) -> 
 
 
 def by_depth(
-    track: Track, lifted: Lifted, measured: Floats, radii: Floats
+    track: Track, lifted: Lifted, measured: Floats, scale: DepthScale
 ) -> tuple[Floats, DepthFit]:
     """Return the shapes (f, p, 3) with measured depth, frame after frame, and the fits."""
-    scale = DepthScale(radii, AGREEMENT, MIN_KEYPOINTS)
     scales, fits = [], []
     for i, second in enumerate(track.seconds.tolist()):
         row = slice(i, i + 1)
@@ -288,6 +289,12 @@ def radii(lifter: Lifter) -> Floats:
     """Return the lifter's distances (p,) of keypoints from the surface."""
     layout = lifter.model.layout
     return surface_radii(layout, lifter.options.length_for(layout))
+
+
+def agreement(lifter: Lifter) -> Agreement:
+    """Return when measured and lifted depth agree, as in the node."""
+    layout = lifter.model.layout
+    return Agreement(scales=believed_scales(layout, lifter.options.length_for(layout)))
 
 
 def scaled(lifted: Lifted, factors: Floats) -> Floats:
@@ -336,7 +343,9 @@ def person_rows(lifter: Lifter, track: Track, size: float, seed: int) -> Iterato
             yield name, (*row(by_range(lifter, track, lifted, distance)), *nothing)
             continue
         measured = measured_depth(scene, track, pixels, case, rng)
-        shapes, fit = by_depth(track, lifted, measured, radii(lifter))
+        shapes, fit = by_depth(
+            track, lifted, measured, DepthScale(radii(lifter), agreement(lifter))
+        )
         hidden = occlusion(scene, track, size)
         known = np.isfinite(measured[:, limbs]) & np.isfinite(fit.scales)[:, None]
         called = fit.occluded[:, limbs].astype(float)
@@ -345,7 +354,8 @@ def person_rows(lifter: Lifter, track: Track, size: float, seed: int) -> Iterato
         if case == BOARD:
             yield MEDIAN, (*row(by_median(lifted, measured, radii(lifter))), *nothing)
         elif case == Case():
-            shapes, _ = by_depth(track, lifted, measured, 0 * radii(lifter))
+            on_surface = DepthScale(0 * radii(lifter), agreement(lifter))
+            shapes, _ = by_depth(track, lifted, measured, on_surface)
             yield SURFACE, (*row(shapes), *nothing)
 
 

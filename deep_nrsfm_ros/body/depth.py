@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.body.mean_scale import RANGE, MeanScale
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import finite_median
 
 Floats = NDArray[Any]
@@ -44,6 +44,7 @@ They are rounded measures of an adult with a trunk of `_TRUNK`; nose and eyes ar
 """
 _PREFERRED = 3  # times as many keypoints may agree with another scale than that of the identity
 _TRUNK = 0.5  # m
+_TRUNKS = (0.2, 0.65)  # m, of people: from a small child to a height of 2.3 m
 _BEAM_STEPS = 9  # points along a bone
 AGREEMENT = 0.2
 """Metres between measured and lifted surface of a person up to which they agree."""
@@ -52,6 +53,20 @@ MIN_KEYPOINTS = 3
 MIN_CONFIDENCE = 0.3
 """Least confidence of a point that may vote on the scale."""
 _SAME_SIZE = 0.1  # log of the factor by which a scale may differ from that of its identity
+
+
+class Agreement(NamedTuple):
+    """When measured and lifted depth agree.
+
+    Attributes:
+        metres: between the two surfaces, at most.
+        min_keypoints: fewest of an object that must agree.
+        scales: least and largest factor of place and size that is believed.
+    """
+
+    metres: float = AGREEMENT
+    min_keypoints: int = MIN_KEYPOINTS
+    scales: tuple[float, float] = RANGE
 
 
 class DepthFit(NamedTuple):
@@ -83,14 +98,28 @@ def surface_radii(layout: KeypointLayout, reference_length: float) -> Floats:
     return np.array([_RADII.get(word, 0.0) for word in words]) * reference_length / _TRUNK
 
 
+def believed_scales(layout: KeypointLayout, reference_length: float) -> tuple[float, float]:
+    """Return the least and the largest factor that depth may give to a shape.
+
+    A person with a trunk of more than 0.65 m does not exist: there, the measured depth is that of
+    the wall behind, as of an image that is not registered to the camera of the keypoints.
+
+    Args:
+        layout: of the shape.
+        reference_length: of the shape, neck to mid-hip of people.
+    """
+    if layout.reference != TRUNK:
+        return RANGE
+    low, high = _TRUNKS
+    return low / reference_length, high / reference_length
+
+
 def fit_depth(
     surface: Floats,
     measured: Floats,
     confident: Masks,
     known: Floats,
-    *,
-    agreement: float,
-    min_keypoints: int,
+    agreement: Agreement,
 ) -> DepthFit:
     """Return the scales with which lifted and measured surfaces agree best.
 
@@ -101,33 +130,33 @@ def fit_depth(
         known: (n,) scale of each object from earlier messages; NaN: none. It is preferred unless
             three times as many keypoints agree with another one: an occluder of most of a person
             does not make the person smaller.
-        agreement: metres between the two surfaces up to which they agree.
-        min_keypoints: fewest that must agree.
+        agreement: when the two surfaces agree.
     """
+    metres, min_keypoints, (low, high) = agreement
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = np.where(surface > 0, measured / surface, np.nan)
-        believed = confident & (ratios >= RANGE[0]) & (ratios <= RANGE[1])
+        believed = confident & (ratios >= low) & (ratios <= high)
         ratios[~believed] = np.nan
         votes = np.where(believed, measured, np.nan)
         # residual[n, i, j]: of keypoint j with the scale of keypoint i
         residuals = ratios[:, :, None] * surface[:, None] - votes[:, None]
-        scores = np.fmax(1 - np.square(residuals / agreement), 0).sum(2)
+        scores = np.fmax(1 - np.square(residuals / metres), 0).sum(2)
         best = scores.max(1, keepdims=True)
         familiar = np.abs(np.log(ratios / known[:, None])) < _SAME_SIZE
         scores[familiar & (_PREFERRED * scores >= best)] += surface.shape[1]
         chosen = scores.argmax(1)
         rows = np.arange(len(surface))
-        members = np.abs(residuals[rows, chosen]) <= agreement
+        members = np.abs(residuals[rows, chosen]) <= metres
         scales = finite_median(np.where(members, ratios, np.nan))
         gap = measured - scales[:, None] * surface
-        agree = believed & (np.abs(gap) <= agreement)
+        agree = believed & (np.abs(gap) <= metres)
         scales[agree.sum(1) < min_keypoints] = np.nan
         fitted = np.isfinite(scales)[:, None]
         return DepthFit(
             scales,
             agree & fitted,
-            (gap < -agreement) & fitted,
-            (gap > agreement) & fitted,
+            (gap < -metres) & fitted,
+            (gap > metres) & fitted,
             (confident & np.isfinite(measured)).sum(1),
         )
 
@@ -135,15 +164,14 @@ def fit_depth(
 class DepthScale:
     """The scale of each object from measured depth; the mean of its identity without."""
 
-    def __init__(self, radii: Floats, agreement: float, min_keypoints: int) -> None:
+    def __init__(self, radii: Floats, agreement: Agreement) -> None:
         """Start without identities.
 
         Args:
             radii: (p,) as of `surface_radii`.
-            agreement: as in `fit_depth`.
-            min_keypoints: as in `fit_depth`.
+            agreement: when measured and lifted depth agree.
         """
-        self._radii, self._agreement, self._min = radii, agreement, min_keypoints
+        self._radii, self._agreement = radii, agreement
         self._mean = MeanScale()
 
     def __call__(
@@ -171,8 +199,7 @@ class DepthScale:
             measured,
             confidence >= MIN_CONFIDENCE,
             known,
-            agreement=self._agreement,
-            min_keypoints=self._min,
+            self._agreement,
         )
         for identity, scale in zip(identities, fit.scales.tolist(), strict=True):
             self._mean.update(identity, scale, seconds)
@@ -182,14 +209,20 @@ class DepthScale:
 class RangeScale:
     """The scale of each object from one distance along the optical axis, as of a range finder."""
 
-    def __init__(self, radii: Floats, edges: Sequence[tuple[int, int]]) -> None:
+    def __init__(
+        self,
+        radii: Floats,
+        edges: Sequence[tuple[int, int]],
+        scales: tuple[float, float] = RANGE,
+    ) -> None:
         """Start without identities.
 
         Args:
             radii: (p,) as of `surface_radii`.
             edges: pairs of keypoint indices, the bones that the beam may meet.
+            scales: least and largest factor that is believed.
         """
-        self._radii = radii
+        self._radii, self._scales = radii, scales
         self._ends = np.array([*edges, *((i, i) for i in range(len(radii)))], int).T
         self._mean = MeanScale()
 
@@ -227,7 +260,7 @@ class RangeScale:
             nearest = np.where(in_beam, far - radii, np.inf).min((0, 2))
         met = int(nearest.argmin()) if np.isfinite(nearest).any() else -1
         scale = distance / nearest[met] if met >= 0 else np.nan
-        if not RANGE[0] <= scale <= RANGE[1]:
+        if not self._scales[0] <= scale <= self._scales[1]:
             met, scale = -1, np.nan
         scales = np.empty(len(shapes))
         for i, identity in enumerate(identities):

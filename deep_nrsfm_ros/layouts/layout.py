@@ -14,6 +14,8 @@ from deep_nrsfm_ros.layouts.joints import Joint, check_joints
 
 Edge = tuple[str, str]
 Tetrahedron = tuple[str, str, str, str]
+TRUNK = ("neck", "mid_hip")
+"""Reference pair of people."""
 MAX_KEYPOINTS = 1000
 """Most keypoints of a layout: time and memory of lifting grow with the square of the number."""
 

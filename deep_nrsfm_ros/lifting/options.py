@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.configuration import option
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
 
-TRUNK = ("neck", "mid_hip")
-"""Reference pair of people."""
 TRUNK_SHARE = 0.5 / 1.75
 """Length of the trunk, from neck to mid-hip, relative to a person's height."""
 

@@ -17,9 +17,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from deep_nrsfm_ros.body.depth import (
     AGREEMENT,
     MIN_KEYPOINTS,
+    Agreement,
     DepthFit,
     DepthScale,
     RangeScale,
+    believed_scales,
     surface_radii,
 )
 from deep_nrsfm_ros.configuration import option
@@ -39,6 +41,9 @@ _KEPT = 2_000_000_000  # ns for which messages are kept for keypoints that come 
 _KEPT_BYTES = 100_000_000
 _MAX_SHOWN = 8  # objects in the diagnostics
 _MAX_WARNINGS = 20  # different ones in the log
+_LEAST_AGREEMENT = 0.4  # share of keypoints: 0.27 where unregistered, 0.46 to 0.75 else
+_UNUSED = "is not used"
+_ENOUGH = 50  # keypoints with depth in a period that may say so
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ class DepthSubscription:
     """Keeps depth messages for a short time, and scales lifted objects with the matching one.
 
     Attributes:
-        problem: why no keypoints of the last period had depth; "" if some had.
+        problem: why no keypoints of the last period had depth, or why it cannot be believed.
     """
 
     def __init__(self, node: Node, options: DepthOptions, camera: CameraInfoSubscription) -> None:
@@ -126,7 +131,7 @@ class DepthSubscription:
         self._result: _Result | None = None
         self._warned: set[str] = set()
         self.problem = self._reason = ""
-        self._matched = self._asked = 0
+        self._matched = self._asked = self._agree = self._measured = 0
         self._topic = node.create_subscription(
             message_class(kind),
             options.topic,
@@ -167,9 +172,11 @@ class DepthSubscription:
             scales, met = self._scales(identities, shapes, distance, half_angle, seconds)
             self._result = _Result(identities, layout, scales, None, met)
         else:
-            measured = self._measured(depth, shapes)
+            measured = self._depth_of(depth, shapes)
             scales, fit = self._scales(identities, shapes, lifted.confidence, measured, seconds)
             self._result = _Result(identities, layout, scales, fit)
+            self._agree += int(fit.agree.sum())
+            self._measured += int(fit.measured.sum())
         self._matched += depth is not None
         placed = np.isfinite(scales)
         s = np.where(placed, scales, 1).astype(np.float32)
@@ -182,18 +189,29 @@ class DepthSubscription:
 
     def report(self) -> dict[str, str]:
         """Return the state of the period since the last report, for diagnostics."""
-        self.problem = "" if self._matched or not self._asked else self._reason
+        doubt = self._doubt()
+        self.problem = doubt if self._matched or not self._asked else self._reason
         text = f"{self._matched} of {self._asked} messages with depth"
         if self._reason and self._matched < self._asked:
             text += f": {self._reason}"
         if self.problem:
-            self._warn(self.problem)
-        self._matched = self._asked = 0
+            self._warn(self.problem, "is in doubt" if doubt else _UNUSED)
+        self._matched = self._asked = self._agree = self._measured = 0
         values = {"depth": text}
         if self._result is not None:
             for i, identity in enumerate(self._result.identities[:_MAX_SHOWN]):
                 values[f"depth of {identity or i}"] = _describe(self._result, i)
         return values
+
+    def _doubt(self) -> str:
+        """Return why the depth of the period cannot be believed; "" if it can."""
+        if self._measured < _ENOUGH or self._agree >= _LEAST_AGREEMENT * self._measured:
+            return ""
+        return (
+            f"only {100 * self._agree / self._measured:.0f} % of the keypoints have the depth on "
+            f"{self._topic} with which they are lifted, more than half are usual: is it registered "
+            "to the camera of the keypoints?"
+        )
 
     def _receive(self, raw: bytes) -> None:
         """Keep a serialised message."""
@@ -259,7 +277,7 @@ class DepthSubscription:
             return read_depth_image(message, self._camera.size)
         return read_depth_points(message, self._camera.size, intrinsics)
 
-    def _measured(self, depth: Any, shapes: NDArray[np.float32]) -> NDArray[Any]:
+    def _depth_of(self, depth: Any, shapes: NDArray[np.float32]) -> NDArray[Any]:
         """Return the depth (n, p) at the pixels of lifted points, NaN if there is none."""
         intrinsics = self._camera.intrinsics
         if depth is None or intrinsics is None:
@@ -271,10 +289,11 @@ class DepthSubscription:
 
     def _new_scales(self, layout: KeypointLayout, length: float) -> DepthScale | RangeScale:
         """Return an empty memory of scales for a layout."""
-        radii, options = surface_radii(layout, length), self._options
-        if options.type_ == RANGE:
-            return RangeScale(radii, [(a, b) for a, b in layout.edge_indices()])
-        return DepthScale(radii, options.agreement, options.min_keypoints)
+        radii, scales = surface_radii(layout, length), believed_scales(layout, length)
+        if self._options.type_ == RANGE:
+            return RangeScale(radii, [(a, b) for a, b in layout.edge_indices()], scales)
+        agreement = Agreement(self._options.agreement, self._options.min_keypoints, scales)
+        return DepthScale(radii, agreement)
 
     def _why_silent(self) -> str:
         """Return why no depth has been received, from the topics that there are."""
@@ -291,12 +310,12 @@ class DepthSubscription:
             )
         return start + "it has a publisher, which has sent nothing yet"
 
-    def _warn(self, problem: str) -> None:
-        """Log a problem, if its kind is new."""
+    def _warn(self, problem: str, state: str = _UNUSED) -> None:
+        """Log a problem of the depth and what comes of it, if its kind is new."""
         kind = "".join(c for c in problem if not c.isdigit())
         if kind not in self._warned and len(self._warned) < _MAX_WARNINGS:
             self._warned.add(kind)
-            self._node.get_logger().warning(f"depth is not used: {problem}")
+            self._node.get_logger().warning(f"depth {state}: {problem}")
 
 
 def _describe(result: _Result, i: int) -> str:

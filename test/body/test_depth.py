@@ -6,7 +6,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.body.depth import DepthScale, RangeScale, fit_depth, surface_radii
+from deep_nrsfm_ros.body.depth import (
+    Agreement,
+    DepthScale,
+    RangeScale,
+    believed_scales,
+    fit_depth,
+    surface_radii,
+)
+from deep_nrsfm_ros.body.mean_scale import RANGE
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from test.fixtures.standing_person import standing_person
 
@@ -28,7 +37,7 @@ def depth(size: float, distance: float = 4.0) -> np.ndarray:
 
 
 def scale() -> DepthScale:
-    return DepthScale(RADII, 0.15, 3)
+    return DepthScale(RADII, Agreement(0.15, 3))
 
 
 @pytest.mark.parametrize("size", [0.6, 1.0, 1.4])
@@ -55,6 +64,30 @@ def test_what_hides_a_keypoint_and_what_is_behind_the_person_have_no_vote() -> N
     assert np.flatnonzero(fit.occluded).tolist() == hidden
     assert np.flatnonzero(fit.beside).tolist() == [missed]
     assert fit.agree.sum() == P - 4 and fit.measured[0] == P - 1
+
+
+def test_a_person_is_not_put_on_the_wall_behind() -> None:
+    """As where the depth is not registered: most keypoints have that of a wall."""
+    measured = depth(1.0)
+    measured[0, :12] = 5.6
+    believed = believed_scales(HUMAN17, 0.5)
+    (far,), _ = DepthScale(RADII, Agreement(0.2, 3))(("a",), person(), CONFIDENT, measured, 0.0)
+    (found,), fit = DepthScale(RADII, Agreement(0.2, 3, believed))(
+        ("a",), person(), CONFIDENT, measured, 0.0
+    )
+    assert far > 1.35
+    assert found == pytest.approx(1.0)
+    assert fit.beside[0, :12].all()
+
+
+def test_people_have_a_largest_size_whatever_they_are_taken_to_be_and_other_objects_have_not() -> (
+    None
+):
+    low, high = believed_scales(HUMAN17, 0.5)
+    assert low < 0.5 < 1.2 < high < 1.35
+    assert believed_scales(HUMAN17, 0.25) == pytest.approx((2 * low, 2 * high))
+    machine = KeypointLayout("machine", tuple("abcd"))
+    assert believed_scales(machine, 0.5) == RANGE
 
 
 def test_a_keypoint_without_confidence_is_named_but_has_no_vote() -> None:
@@ -100,7 +133,7 @@ def test_objects_that_are_not_lifted_and_absurd_depths_change_nothing() -> None:
 
 def test_no_object_is_no_problem() -> None:
     none = np.zeros((0, P))
-    fit = fit_depth(none, none, none > 0, np.zeros(0), agreement=0.15, min_keypoints=3)
+    fit = fit_depth(none, none, none > 0, np.zeros(0), Agreement(0.15, 3))
     assert fit.scales.shape == (0,)
 
 

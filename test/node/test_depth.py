@@ -148,6 +148,25 @@ def test_depth_of_no_use_is_told_once_and_changes_nothing(message: Image, reason
     assert len(bench.node.warnings) == 1 and reason in bench.node.warnings[0]
 
 
+def test_depth_beside_most_of_the_body_is_doubted_once() -> None:
+    bench = Bench()
+    shifted = np.roll(np.frombuffer(image().data, np.uint16).reshape(H, W), 40, 1)
+    data = array("B", shifted.tobytes())
+    for i in range(2):
+        for k in range(8):
+            stamp = 100.0 + i + 0.1 * k
+            bench.receive(image(stamp, data=data))
+            bench.scale(stamp)
+        bench.depth.report()
+        assert "% of the keypoints have the depth on /depth" in bench.depth.problem
+    assert len(bench.node.warnings) == 1 and "in doubt: only" in bench.node.warnings[0]
+    for k in range(8):
+        bench.receive(image(110.0 + 0.1 * k))
+        bench.scale(110.0 + 0.1 * k)
+    bench.depth.report()
+    assert not bench.depth.problem
+
+
 def test_bytes_of_another_type_are_no_depth() -> None:
     bench = Bench()
     bench.depth._receive(b"\x00\x01\x00")
