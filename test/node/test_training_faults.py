@@ -285,11 +285,14 @@ def test_data_that_cannot_be_trained_on_is_refused_with_advice(
     refused = client.call("/lifter/train")  # before the answer, not after it
     assert not refused.success
     assert "no topic called /elsewhere; its topics are: /keypoints" in refused.message
-    for bag, topic, complaint in [
-        (flat, "/keypoints", "a model cannot be learned from this: the views are flat"),
-        (good, "", ""),
+    file = tmp_path / "people.npy"  # a file is data too, without a bag
+    np.save(file, np.concatenate((views(), np.ones((60, P, 1))), 2))
+    for bags, inputs, complaint in [
+        ([flat], [""], "a model cannot be learned from this: the views are flat"),
+        ([""], [str(file)], ""),
     ]:
-        client.set_parameters(train__bags=[bag], train__topic=topic, train__min_change=0.0)
+        client.set_parameters(train__bags=bags, train__inputs=inputs, train__topic="")
+        client.set_parameters(train__min_change=0.0)
         client.heard["/lifter/training_status"].clear()
         assert client.call("/lifter/train").success
         if complaint:
