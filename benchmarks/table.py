@@ -113,11 +113,16 @@ class Table:
 
 
 def _cell(values: Sequence[float], digits: int) -> str:
-    """Return the mean of the seeds, with half the range if there are several."""
+    """Return the mean of the seeds, with half the range if there are several.
+
+    A whole number that all seeds have, as the number of frames, has no range.
+    """
     if not values:
         return ""
     mean = f"{np.mean(values):.{digits}f}"
-    return mean if len(values) == 1 else f"{mean} ± {np.ptp(values) / 2:.{digits}f}"
+    if len(values) == 1 or (digits == 0 and np.ptp(values) == 0):
+        return mean
+    return f"{mean} ± {np.ptp(values) / 2:.{digits}f}"
 
 
 def bars(*names: str) -> Callable[[Table, Figure], None]:

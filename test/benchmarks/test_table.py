@@ -35,6 +35,14 @@ def test_figures_have_the_decimals_that_the_table_says(table: Table) -> None:
     assert "| ours | alone | 8.50 ± 0.50 | 1.000 ± 0.500 |" in table.markdown()
 
 
+def test_a_count_that_all_seeds_have_shows_no_range(table: Table) -> None:
+    for seed in (0, 1):
+        table.add(("ours", "counted"), {"a %": 7 + seed, "b": 410}, seed=seed)
+    table.digits["b"] = 0
+    assert "| ours | counted | 7.50 ± 0.50 | 410 |" in table.markdown()
+    assert "| ours | alone | 8.50 ± 0.50 | 1 ± 0 |" in table.markdown()
+
+
 def test_csv_has_every_seed(table: Table, tmp_path: Path) -> None:
     table.write(tmp_path)
     assert list(csv.reader((tmp_path / "t.csv").open())) == [
