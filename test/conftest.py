@@ -31,6 +31,7 @@ pytest_plugins = (
     "test.fixtures.synthetic_object",
     "test.fixtures.detector_messages",
     "test.fixtures.pose2sim_session",
+    "test.fixtures.training_program",
 )
 
 

@@ -212,7 +212,7 @@ class _Loop:
         if trainer.end_reason:
             trainer.mirrored_share = self.mirror.share(trainer.net)
         if not self.group.rank:
-            self.callbacks.on_progress(self.clock.progress(trainer))
+            self.callbacks.on_progress(self.clock.progress(trainer, self.iterations))
         return trainer
 
     def _screen(self) -> None:
@@ -254,7 +254,6 @@ class _Loop:
         `chosen`: the seed is chosen; calls `on_step` and looks for the best state.
         """
         trainer, best = self.trainer, self.best if chosen else None
-        self.clock.restart(trainer.step)
         if chosen:
             self.callbacks.on_step(trainer)
         while trainer.step < steps and not (best and best.patience_exceeded):
@@ -273,7 +272,7 @@ class _Loop:
                 self.callbacks.on_step(trainer)
             self._save_if_due()
             if not self.group.rank and self.clock.due():
-                self.callbacks.on_progress(self.clock.progress(trainer))
+                self.callbacks.on_progress(self.clock.progress(trainer, self.iterations))
 
     def _save_if_due(self) -> None:
         """Write a checkpoint if the last one is old enough."""

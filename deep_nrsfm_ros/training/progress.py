@@ -9,6 +9,8 @@ from typing import NamedTuple
 from deep_nrsfm_ros.nrsfm.network import coherence
 from deep_nrsfm_ros.training.trainer import Trainer
 
+_FIRST_REPORT = 1.0  # s
+
 
 class Progress(NamedTuple):
     """A report on a training."""
@@ -31,16 +33,11 @@ class Clock:
         Args:
             steps: of the whole training.
             limit: seconds, 0 = no limit.
-            every_seconds: from one report to the next.
+            every_seconds: from one report to the next; the first one is due after a second.
         """
         self.steps, self.limit, self.every = steps, limit, every_seconds
         self.start, self.earlier_seconds = time.monotonic(), 0.0
-        self.restart(0)
-
-    def restart(self, step: int) -> None:
-        """Measure the pace from this step on."""
-        self.began = self.reported = time.monotonic()
-        self.first = step
+        self.reported = self.start + _FIRST_REPORT - every_seconds
 
     def seconds(self) -> float:
         """Return the seconds that the training has taken, resumed runs included."""
@@ -54,10 +51,15 @@ class Clock:
         """Return whether a report is due."""
         return time.monotonic() - self.reported >= self.every
 
-    def progress(self, trainer: Trainer) -> Progress:
-        """Return the report of a trainer, and count the time to the next one from here."""
+    def progress(self, trainer: Trainer, iterations: int) -> Progress:
+        """Return the report of a trainer, and count the time to the next one from here.
+
+        Args:
+            trainer: at its present step.
+            iterations: steps of all seeds since the start of the clock, which give the pace.
+        """
         self.reported = time.monotonic()
-        pace = (self.reported - self.began) / max(trainer.step - self.first, 1)
+        pace = (self.reported - self.start) / max(iterations, 1)
         loss, cycle = trainer.measure()
         sharpness = coherence(trainer.net.map(lambda w: w.cpu().numpy()))
         step, steps = trainer.step, self.steps

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import deep_nrsfm_ros
 from deep_nrsfm_ros.commands import train
@@ -30,6 +29,7 @@ from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training import run
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.trainer import Trainer
+from test.fixtures.training_program import RunTraining
 
 DEADLINE = 90.0
 QUICK = ("--widths", "8", "4", "--batch", "8", "--threads", "1", "--name", "mine")
@@ -87,25 +87,6 @@ def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
             process.kill()
 
 
-@pytest.fixture
-def in_process(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Run the program within the test, without its signal handlers; return the exit code."""
-    monkeypatch.setattr(train, "stop_on_signals", lambda: lambda: False)
-    monkeypatch.setattr(train, "stop_with_parent", lambda stopped: stopped)
-    threads = torch.get_num_threads()
-
-    def run(*words: str) -> int:
-        try:
-            train.main(words)
-        except SystemExit as end:
-            return int(end.code or 0)
-        finally:
-            torch.set_num_threads(threads)
-        return 0
-
-    return run
-
-
 def test_two_processes_write_one_model(
     arguments: list[str], models: Path, start: Callable[..., subprocess.Popen[str]]
 ) -> None:
@@ -145,7 +126,7 @@ def assert_lifts(path: Path) -> Model:
 def test_from_bag_to_model(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     words = (*arguments, "--steps", "30", "--seeds", "2", "--screening", "5", "--json-progress")
@@ -202,7 +183,7 @@ def stop_after(steps: int) -> Callable[[], Callable[[], bool]]:
 def test_resume_goes_on_where_it_was_cancelled(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     words = [*arguments, "--steps", "12", "--seeds", "1"]
@@ -225,7 +206,7 @@ def test_resume_goes_on_where_it_was_cancelled(
 def test_the_curation_can_be_stopped(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -238,7 +219,7 @@ def test_the_curation_can_be_stopped(
 def test_without_resume_it_begins_anew(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with monkeypatch.context() as cancelled:
@@ -253,7 +234,7 @@ def test_without_resume_it_begins_anew(
 def test_time_ends_a_training(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     before = time.monotonic()
@@ -268,7 +249,7 @@ def test_time_ends_a_training(
 def test_a_cancelled_screening_keeps_a_model_and_goes_on(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -334,7 +315,7 @@ def test_bad_input_is_named_and_ends_with_2(
     words: list[str],
     complaint: str,
     bag: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> None:
@@ -351,14 +332,14 @@ def test_bad_input_is_named_and_ends_with_2(
 
 @pytest.mark.parametrize("words", [("--steps", "many"), ("--unknown",)])
 def test_a_wrong_command_line_ends_with_2(
-    words: tuple[str, ...], in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], in_process: RunTraining, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert in_process(*words) == 2
     assert words[0] in capsys.readouterr().err
 
 
 def test_failing_is_a_line_of_json_too(
-    in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+    in_process: RunTraining, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert in_process("--bag", "absent", "--json-progress") == 2
     (line,) = map(json.loads, capsys.readouterr().out.splitlines())
@@ -366,7 +347,7 @@ def test_failing_is_a_line_of_json_too(
 
 
 def test_a_bag_in_which_nothing_is_seen_fails(
-    tmp_path: Path, in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
 ) -> None:
     points, confidence = people(5)
     write_bag(tmp_path / "dark", "/keypoints", frames(points, 0 * confidence))
@@ -378,7 +359,7 @@ def test_a_bag_in_which_nothing_is_seen_fails(
 def test_the_ground_truth_is_not_read(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     points, confidence = people()
@@ -413,7 +394,7 @@ def write_paws(folder: Path, name: str = "paws") -> Path:
 
 
 def test_a_layout_file_makes_a_model_in_metres(
-    tmp_path: Path, models: Path, in_process: Callable[..., int]
+    tmp_path: Path, models: Path, in_process: RunTraining
 ) -> None:
     (tmp_path / "paw.yaml").write_text(PAW)
     words = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"))
@@ -432,7 +413,7 @@ def test_a_layout_file_makes_a_model_in_metres(
 def test_points_that_nobody_described_are_numbered(
     tmp_path: Path,
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     words = ("--bag", str(write_paws(tmp_path)), "--object", "numbered", "--steps", "3", *QUICK)
@@ -449,7 +430,7 @@ def test_it_goes_on_from_another_model(
     bag: Path,
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert in_process(*arguments, "--steps", "3") == 0
@@ -477,7 +458,7 @@ def test_it_goes_on_from_another_model(
 def test_it_does_not_resume_what_started_elsewhere(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -501,7 +482,7 @@ def write_people(path: Path, points: np.ndarray) -> tuple[str, ...]:
 
 
 def test_data_that_cannot_work_is_refused_before_training(
-    tmp_path: Path, in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(0)
     flat = people(1)[0][0] * rng.uniform(0.5, 2, (60, 1, 1))
@@ -515,7 +496,7 @@ def test_data_that_cannot_work_is_refused_before_training(
 
 
 def test_what_the_data_was_spared_is_said_and_an_option_turns_it_off(
-    tmp_path: Path, in_process: Callable[..., int], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = write_people(tmp_path / "twice", np.repeat(people()[0], 2, axis=0))
     assert in_process(*words, "--steps", "2") == 0
@@ -531,7 +512,7 @@ def test_what_the_data_was_spared_is_said_and_an_option_turns_it_off(
 def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -549,7 +530,7 @@ def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
 def test_a_report_that_cannot_be_written_costs_no_model(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (models / "mine.html").mkdir(parents=True)
@@ -562,7 +543,7 @@ def test_a_report_that_cannot_be_written_costs_no_model(
 def test_a_configuration_file_gives_the_options_that_are_not_given(
     arguments: list[str],
     models: Path,
-    in_process: Callable[..., int],
+    in_process: RunTraining,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:

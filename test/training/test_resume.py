@@ -23,9 +23,13 @@ from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training.record import checkpoint_file, read_record, record_file
+from test.fixtures.training_program import RunTraining
 
 DEADLINE = 60.0
 PROGRAM = (sys.executable, "-m", "deep_nrsfm_ros.commands.train", "--json-progress")
+NEW: tuple[str, ...] = ("--bag", "bag", "--keypoint-layout", "coco17", "--batch", "8")
+NEW += ("--widths", "8", "4", "--seeds", "1")
+Said = Callable[..., dict[str, Any]]
 
 
 class Folder:
@@ -41,13 +45,12 @@ class Folder:
 
     def begin(self, *words: str) -> subprocess.Popen[str]:
         """Start a training anew, from a path that means nothing elsewhere."""
-        words = ("--bag", "bag", "--keypoint-layout", "coco17", "--batch", "8", *words)
-        return self.start("--widths", "8", "4", "--seeds", "1", *words, cwd=self.path)
+        return self.start(*NEW, *words, cwd=self.path)
 
     def start(self, *words: str, cwd: Path | None = None) -> subprocess.Popen[str]:
-        words = (*words, "--threads", "1", "--name", "mine", "--output", str(self.models))
+        """Start a training, or one that goes on."""
         process = subprocess.Popen(
-            [*PROGRAM, *words],
+            [*PROGRAM, *words, *self.common()],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -56,6 +59,10 @@ class Folder:
         )
         self.started.append(process)
         return process
+
+    def common(self) -> tuple[str, ...]:
+        """Return the words of all trainings."""
+        return ("--threads", "1", "--name", "mine", "--output", str(self.models))
 
     def names(self) -> list[str]:
         return sorted(path.name for path in self.models.glob("*"))
@@ -68,6 +75,25 @@ def folder(tmp_path: Path) -> Iterator[Folder]:
     for process in folder.started:
         with process:
             process.kill()
+
+
+@pytest.fixture
+def said(
+    folder: Folder,
+    in_process: RunTraining,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Said:
+    """Train within the test; return the last thing that is said."""
+
+    def run(*words: str) -> dict[str, Any]:
+        monkeypatch.chdir(folder.path)
+        capsys.readouterr()
+        in_process(*words, *folder.common(), "--json-progress")
+        last: dict[str, Any] = json.loads(capsys.readouterr().out.splitlines()[-1])
+        return last
+
+    return run
 
 
 def wait_for(condition: Callable[[], Any], what: str) -> None:
@@ -84,10 +110,10 @@ def lines_of(process: subprocess.Popen[str]) -> list[dict[str, Any]]:
     return lines
 
 
-def test_a_cancelled_training_goes_on_with_nothing_but_its_name(folder: Folder) -> None:
+def test_a_cancelled_training_goes_on_with_nothing_but_its_name(folder: Folder, said: Said) -> None:
     process = folder.begin("--steps", "1000000", "--cycle", "1.5")
     wait_for(record_file(folder.models, "mine").exists, "the record")
-    second = lines_of(folder.begin("--steps", "3"))[-1]
+    second = said(*NEW, "--steps", "3")
     assert second["state"] == "failed" and "another process trains 'mine'" in second["message"]
     found = read_record(folder.models, "mine")
     assert found is not None and found.running and "another process" in str(found)
@@ -104,9 +130,9 @@ def test_a_cancelled_training_goes_on_with_nothing_but_its_name(folder: Folder) 
     assert "train.resume to true" in found.advice
 
     steps = load_model(folder.models / "mine.safetensors").provenance["step"] + 20
-    *said, last = lines_of(folder.start("--resume", "--steps", str(steps)))
+    *before, last = lines_of(folder.start("--resume", "--steps", str(steps)))
     assert last["state"] == "finished", last
-    warnings = [line["message"] for line in said if " was " in line.get("message", "")]
+    warnings = [line["message"] for line in before if " was " in line.get("message", "")]
     change = f"warning: since this training began, --steps was 1000000, is {steps} now"
     assert warnings == [change]
     provenance = load_model(folder.models / "mine.safetensors").provenance
@@ -115,23 +141,23 @@ def test_a_cancelled_training_goes_on_with_nothing_but_its_name(folder: Folder) 
     assert folder.names() == ["mine.html", "mine.safetensors"]
 
 
-def test_nothing_to_resume_is_said(folder: Folder) -> None:
-    last = lines_of(folder.start("--resume"))[-1]
+def test_nothing_to_resume_is_said(folder: Folder, said: Said) -> None:
+    last = said("--resume")
     assert last["state"] == "failed"
     assert "no unfinished training of 'mine'" in last["message"]
     folder.models.mkdir()
     checkpoint_file(folder.models, "mine").write_bytes(b"\0" * 8)
     record_file(folder.models, "mine").write_text("half a rec")
-    last = lines_of(folder.start("--resume"))[-1]
+    last = said("--resume")
     assert "there is no record of the options" in last["message"]
-    last = lines_of(folder.begin("--resume", "--steps", "3"))[-1]
+    last = said(*NEW, "--resume", "--steps", "3")
     assert ".mine.checkpoint cannot be read" in last["message"]
 
 
-def test_a_killed_training_leaves_whole_files_and_goes_on(folder: Folder) -> None:
+def test_a_killed_training_leaves_whole_files_and_goes_on(folder: Folder, said: Said) -> None:
     folder.models.mkdir()
     delays = random.Random(0)
-    assert lines_of(folder.begin("--steps", "3"))[-1]["state"] == "finished"
+    assert said(*NEW, "--steps", "3")["state"] == "finished"
     process = folder.begin("--steps", "400")
     wait_for(record_file(folder.models, "mine").exists, "the record")
     for _ in range(int(os.environ.get("KILLS", "2"))):
@@ -155,8 +181,8 @@ def test_a_killed_training_leaves_whole_files_and_goes_on(folder: Folder) -> Non
     assert not [name for name in folder.names() if name.startswith(".mine.t")]
 
 
-def test_a_full_disk_is_named_and_the_old_model_stays(folder: Folder) -> None:
-    assert lines_of(folder.begin("--steps", "3"))[-1]["state"] == "finished"
+def test_a_full_disk_is_named_and_the_old_model_stays(folder: Folder, said: Said) -> None:
+    assert said(*NEW, "--steps", "3")["state"] == "finished"
     before = (folder.models / "mine.safetensors").read_bytes()
     process = folder.begin("--steps", "1000000")
     for line in process.stdout or ():
