@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of models that were trained on from one of the package, by the number of steps.
+"""Errors of models that were trained on from one of the package, by steps and share of the start.
 
 Of each recording the first 70 % are trained on and the rest is kept back. Learned and later frames,
 and another recording, are lifted by the model that the training starts from and by the new ones.
-The row "default" has the number of steps that a training takes where none is given.
+Rows "default" have the number of steps that a training takes where none is given, by the share of
+the start's weights in the result (`start_share`).
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -40,7 +42,7 @@ from deep_nrsfm_ros.layouts.presets import BODY25B, preset
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
-from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, PRESETS, Recipe
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Preset, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.judge import judge
@@ -49,12 +51,15 @@ from deep_nrsfm_ros.training.loop import Setup, train
 Floats = NDArray[Any]
 
 STEPS = (30, 100, 300, 1000, 3000)
+SHARES = (0.0, 0.3, 0.8)
+"""Shares of the start in the result, beside the default, with the default number of steps."""
 _LEARNED = 0.7  # of a recording; the rest is kept back
 _CMU_SUBJECT = "131"  # one that `human` was not trained on
 _MOST_FRAMES = 1500  # that are lifted
 _LEGEND = {
     "frames": "after curation, without those held out for the judge",
     "steps": "0: the model that the training starts from",
+    "start share": "of the weights of the start in the result; 0.6 by default",
     "learned, later, other": "mean error in mm after alignment by a similarity, without "
     "intrinsics: of the frames trained on, of the rest of the recording, and of another one",
     "mirrored %": "of the rest of the recording; where it has no truth, of the other one",
@@ -176,29 +181,37 @@ def errors(model: Model, part: Part) -> tuple[float, float]:
     return found.aligned, 100 * found.mirrored
 
 
-def tuned(start: Model, part: Part, steps: int, layout: KeypointLayout) -> tuple[Model, bool]:
+def tuned(start: Model, part: Part, recipe: Recipe, layout: KeypointLayout) -> tuple[Model, bool]:
     """Return the model that `train` makes of a part, and whether the judge calls it better."""
     points, confidence = KeypointMap(part.layout, layout)(part.points, part.confidence)
     points, visible = points.astype(np.float32), confidence > 0.1
     data = curate(Dataset(points, visible, layout, "benchmark")).dataset
     frames = split(data, Curation().held_out)
-    recipe = PRESETS["default"]._replace(
-        architecture=start.network.architecture,
-        normaliser=start.normaliser,
-        recipe=Recipe(steps=steps),
-    )
+    preset = Preset(start.network.architecture, start.normaliser, recipe)
     setup = Setup(start_from(start, layout))
-    trainer = train(frames.training.points, frames.training.visible, recipe, setup)
+    trainer = train(frames.training.points, frames.training.visible, preset, setup)
     model = inherit(finish(trainer, "tuned", layout, data.source), start)
     return model, not judge(frames, model, start).doubt
 
 
-def benchmark(names: Sequence[str], steps: Sequence[int], data: Path) -> list[Table]:
+def recipes(steps: Sequence[int], shares: Sequence[float]) -> list[Recipe]:
+    """Return the recipes of these numbers of steps, and those of the default number by share."""
+    default = Recipe()
+    return [
+        *(dataclasses.replace(default, steps=count) for count in steps),
+        *(dataclasses.replace(default, start_share=share) for share in shares),
+        default,
+    ]
+
+
+def benchmark(
+    names: Sequence[str], steps: Sequence[int], shares: Sequence[float], data: Path
+) -> list[Table]:
     """Return the table of the recordings."""
     table = Table(
         "fine_tuning",
         "Trained on from the model of the package",
-        ("recording", "steps"),
+        ("recording", "steps", "start share"),
         ("frames", "CPU s", "learned", "later", "other", "mirrored %", "judge"),
         _LEGEND,
         bars("later", "other"),
@@ -220,15 +233,15 @@ def benchmark(names: Sequence[str], steps: Sequence[int], data: Path) -> list[Ta
             known = [m for m in mirrored if np.isfinite(m)]
             return shown | {"mirrored %": known[0]}
 
-        table.add((name, "0"), figures(start))
-        for count in (*steps, AUTOMATIC):
+        table.add((name, "0", ""), figures(start))
+        for recipe in recipes(steps, shares):
             began = time.process_time()
-            model, better = tuned(start, learned, count, layout)
+            model, better = tuned(start, learned, recipe, layout)
             used = {"CPU s": time.process_time() - began, "judge": float(better)}
             taken = model.provenance["step"]
-            title = f"{taken}, default" if count == AUTOMATIC else str(count)
+            title = f"{taken}, default" if recipe.steps == AUTOMATIC else str(taken)
             frames = {"frames": float(model.provenance["frames"])}
-            table.add((name, title), frames | used | figures(model))
+            table.add((name, title, str(recipe.start_share)), frames | used | figures(model))
     return [table]
 
 
@@ -238,10 +251,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("recordings", nargs="*", help=f"of {', '.join(RECORDINGS)} (default: all)")
     parser.add_argument("--data", type=Path, required=True, help="has cmu/, pose2sim/, scenes/")
     parser.add_argument("--steps", type=int, nargs="*", default=list(STEPS))
+    parser.add_argument("--shares", type=float, nargs="*", default=list(SHARES))
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     args = parser.parse_args(argv)
     names = args.recordings or RECORDINGS
-    print_tables(lambda: benchmark(names, args.steps, args.data), args.output)
+    print_tables(lambda: benchmark(names, args.steps, args.shares, args.data), args.output)
 
 
 if __name__ == "__main__":

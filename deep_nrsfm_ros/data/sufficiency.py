@@ -66,8 +66,13 @@ class Sufficiency:
         )
 
 
-def assess_sufficiency(dataset: Dataset) -> Sufficiency:
-    """Return whether a model can be learned from a dataset; deterministic, within a second."""
+def assess_sufficiency(dataset: Dataset, *, has_start: bool = False) -> Sufficiency:
+    """Return whether a model can be learned from a dataset; deterministic, within a second.
+
+    Args:
+        dataset: the frames.
+        has_start: whether the training starts from a model, which has learned depth elsewhere.
+    """
     counts = dataset.visible.sum(0) >= max(1, _MIN_VISIBLE_SHARE * len(dataset))
     frames, keypoints = len(dataset), int(counts.sum())
     if keypoints < 4:
@@ -110,7 +115,7 @@ def assess_sufficiency(dataset: Dataset) -> Sufficiency:
     deformation = float(np.sqrt(max(0.0, 1 - (values[:3] ** 2).sum())))
     figures = (frames, keypoints, tuple(values.tolist()), span, deformation)
     refusal = _flatness(values)
-    warnings = () if refusal else _warnings(frames, span, deformation)
+    warnings = () if refusal else _warnings(frames, span, deformation, has_start)
     return Sufficiency(*figures, refusal, warnings)
 
 
@@ -170,7 +175,7 @@ def _flatness(values: Floats) -> str:
     return ""
 
 
-def _warnings(frames: int, span: float, deformation: float) -> tuple[str, ...]:
+def _warnings(frames: int, span: float, deformation: float, has_start: bool) -> tuple[str, ...]:
     """Return a sentence for each figure that may make the model poor."""
     warnings = []
     if frames < _FEW_FRAMES:
@@ -179,11 +184,16 @@ def _warnings(frames: int, span: float, deformation: float) -> tuple[str, ...]:
             "thousands for a model of other frames too"
         )
     if span < _NARROW:
+        views = f"the views span only {span:.0f} degrees around their mean"
+        if span < 1:  # deformation hides a rotation that small, or looks like one
+            views = "the keypoints show no view from another side"
         warnings.append(
-            f"the views span only {span:.0f} degrees around their mean, so that depth rests on "
-            "deformation alone and may come out mirrored; record the object from more sides, "
-            "start from a model of such an object (--from, train.from), or let the layout help "
-            "(bone_length_weight, handedness_weight)"
+            f"{views}, so that depth rests on the model that the training starts from; record the "
+            "object from more sides to learn its depth"
+            if has_start
+            else f"{views}, so that depth rests on deformation alone and may come out mirrored; "
+            "record the object from more sides, start from a model of such an object (--from, "
+            "train.from), or let the layout help (bone_length_weight, handedness_weight)"
         )
     if deformation < _RIGID:
         warnings.append(

@@ -82,6 +82,14 @@ class Recipe:
         low=0,
         high=10_000,
     )
+    start_share: float = option(
+        0.6,
+        "share of the model that a training starts from in the result, whose weights are the mean "
+        "of its and the trained ones; without effect where keypoints differ; 0 = the trained "
+        "weights alone, which fit frames like those of the training more closely, 0.6 typical",
+        low=0.0,
+        high=1.0,
+    )
     paper_initialisation: bool = option(
         False,
         "initialise the weights as the paper's code does: random biases, and the scale of weights "

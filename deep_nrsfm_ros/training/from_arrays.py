@@ -77,13 +77,14 @@ def train(
         layout = find_layout("layout", layout)
     seen = from_arrays(points, confidence, layout)
     curated = curate(Dataset(seen.points, seen.confidence > 0, layout, "arrays"))
-    sufficiency = assess_sufficiency(curated.dataset)
+    origin = _origin(start, layout)
+    sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
     if sufficiency.refusal:
         raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
-    for warning in (layout.warning, *curated.warnings, *sufficiency.warnings):
+    missing = "" if origin else layout.warning  # a start passes its handedness on
+    for warning in (missing, *curated.warnings, *sufficiency.warnings):
         if warning:
             warnings.warn(warning, stacklevel=2)
-    origin = _origin(start, layout)
     rival = origin or _shipped(layout)
     frames = split(curated.dataset, Curation().held_out if rival else 0.0)
     preset, setup = PRESETS["default"]._replace(recipe=recipe or Recipe()), DEFAULT_SETUP

@@ -79,11 +79,11 @@ class Figures(NamedTuple):
 
 
 IN_WORDS = {
+    "misfit": "its keypoints and bones are off by {:.1%} of the size of the object",
     "mirrored_share": "{:.1%} of its frames are mirrored against their neighbours",
     "front_disagreement": "in {:.1%} of the frames its front is behind",
     "opposed": "it lifts {:.1%} of the frames to the mirror image of the other's",
     "bone_variation": "its bones vary by {:.1%} of their lengths",
-    "misfit": "its keypoints and bones are off by {:.1%} of the size of the object",
 }
 """The figures by which the rule decides, in words."""
 
@@ -124,7 +124,7 @@ class Judgement(NamedTuple):
     Attributes:
         doubt: one sentence on why it should not replace the one at hand, and what would help; ""
             if it should.
-        summary: figures of both in words.
+        summary: a sentence that calls the model better, with the figures of both.
         figures: of the new model.
         rival: name of the model at hand; "" where there is none with its keypoints.
         rival_figures: its figures.
@@ -170,15 +170,16 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
         return Judgement(f"{error}; {_advice(model, '')} would help", "", unknown)
     where = "held-out" if frames.held_out is not frames.training else "training"
     name = rival.name if rival is not None and old else ""
-    than = f"compared with model {name!r} on " if name else "on "
-    than += f"{len(frames.held_out)} {where} frames"
+    on = f"on {len(frames.held_out)} {where} frames"
+    than = f"compared with model {name!r} {on}" if name else on
     shown = [each for each in IN_WORDS if each in _known(new) and (old or each != "opposed")]
     summary = "; ".join(_in_words(each, new, old) for each in shown)
     doubt = ""
     if worse := worse_figures(new, old):
         reasons = "; ".join(_in_words(each, new, old) for each in worse)
         doubt = f"{than}, {reasons}; {_advice(model, name)} would help"
-    return Judgement(doubt, f"{than}, {summary}", new, name, old)
+    verdict = f"is better than model {name!r} {on}" if name else f"has no other beside it; {on}"
+    return Judgement(doubt, f"the new model {verdict}: {summary}", new, name, old)
 
 
 def worse_figures(new: Figures, old: Figures | None) -> list[str]:

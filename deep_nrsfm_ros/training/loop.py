@@ -33,7 +33,7 @@ from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
 from deep_nrsfm_ros.training.progress import Clock, Progress
-from deep_nrsfm_ros.training.schedule import with_steps
+from deep_nrsfm_ros.training.schedule import has_other_keypoints, with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
@@ -209,6 +209,8 @@ class _Loop:
                 no_improvement=self.best.patience_exceeded,
             )
         self.best.restore_best(trainer)
+        if (start := self.setup.start) is not None and not has_other_keypoints(start):
+            trainer.average_with_start(self.preset.recipe.start_share)
         if trainer.end_reason:
             trainer.mirrored_share = self.mirror.share(trainer.net)
         if not self.group.rank:

@@ -183,15 +183,24 @@ def _options_for(path: Path, options: ReadOptions) -> ReadOptions:
     return dataclasses.replace(options, topic="", mapping=None)
 
 
-def prepare(curation: Curation, dataset: Dataset, reporter: Reporter) -> Prepared:
+def prepare(
+    curation: Curation, dataset: Dataset, reporter: Reporter, *, has_start: bool = False
+) -> Prepared:
     """Return the curated dataset with its sufficiency, and report what was left out.
 
-    Raises ValueError where no model can be learned from what is left.
+    Args:
+        curation: what to leave out.
+        dataset: all frames.
+        reporter: takes progress and warnings.
+        has_start: whether the training starts from a model.
+
+    Raises:
+        ValueError: no model can be learned from what is left.
     """
     curated = curate(dataset, curation, reporter.curating)
     if curated.summary:
         reporter.say(curated.summary)
-    sufficiency = assess_sufficiency(curated.dataset)
+    sufficiency = assess_sufficiency(curated.dataset, has_start=has_start)
     if sufficiency.refusal:
         raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
     for warning in (*curated.warnings, *sufficiency.warnings):

@@ -82,7 +82,7 @@ def run(
     if not config.data.cmu:
         source, _ = find_layouts(config, COMMAND_LINE)
         dataset = check_dataset(dataset, source, config.data.image_size, reporter)
-    prepared = prepare(config.curation, dataset, reporter)
+    prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
     try:
         with _record(config) as checkpoint:
             return _train_and_save(config, prepared, checkpoint, reporter, should_stop)

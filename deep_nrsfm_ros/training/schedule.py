@@ -35,9 +35,17 @@ def with_steps(recipe: Recipe, frames: int, start: Network | None) -> Recipe:
     wanted = FROM_RANDOM
     if start is not None:
         wanted = max(frames // _FRAMES_A_STEP, _FEWEST)
-        if np.array_equal(start.L, np.eye(start.p)):
+        if has_other_keypoints(start):
             wanted *= _OTHER_KEYPOINTS
     return dataclasses.replace(recipe, steps=min(wanted, FROM_RANDOM))
+
+
+def has_other_keypoints(start: Network) -> bool:
+    """Return whether a start, as `fine_tuning.start_from` returns it, lacks its whitening.
+
+    It does where its keypoints are not those of its model, or where the model has none.
+    """
+    return np.array_equal(start.L, np.eye(start.p))
 
 
 def learning_rate(recipe: Recipe, step: float, time_fraction: float = 0.0) -> float:

@@ -162,6 +162,20 @@ class Trainer:
         """
         return math.hypot(*self.group.mean(self.measure()))
 
+    @torch.no_grad()
+    def average_with_start(self, share: float) -> None:
+        """Set the weights to the weighted mean of those of the start and the trained ones.
+
+        The mean keeps most of what the training has gained on its frames, and on other frames most
+        of what the start could do.
+
+        Args:
+            share: weight of the start, 0 to 1.
+
+        Source: Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022.
+        """
+        self.weights.lerp_(weight_vector(self.initial), share)
+
     def state(self) -> dict[str, Tensor]:
         """Return all that `restore` needs, as named tensors."""
         tensors = {name: torch.tensor(getattr(self, name)) for name in _COUNTS}

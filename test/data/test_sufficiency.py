@@ -154,3 +154,12 @@ def test_unit_and_place_do_not_matter(scale: float, x: float, y: float) -> None:
     before, after = (assess_sufficiency(dataset(X)) for X in (W, scale * (W + [x, y])))
     np.testing.assert_allclose(before.spectrum, after.spectrum, atol=2e-3)
     assert before.refusal == after.refusal
+
+
+def test_a_start_is_not_recommended_to_a_training_that_has_one() -> None:
+    narrow = dataset(noisy(seen_from(shapes(500, 0.0), 10.0), 0.01))
+    (alone,) = (w for w in assess_sufficiency(narrow).warnings if "views" in w)
+    (helped,) = (w for w in assess_sufficiency(narrow, has_start=True).warnings if "views" in w)
+    assert "start from a model" in alone and "may come out mirrored" in alone
+    assert "depth rests on the model that the training starts from" in helped
+    assert "--from" not in helped

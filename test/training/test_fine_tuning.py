@@ -38,8 +38,14 @@ def stretched(figure: Any) -> np.ndarray:
     ).astype("f4")
 
 
-def tuned(source: Model, layout: KeypointLayout, points: np.ndarray, steps: int = 100) -> Trainer:
-    preset = Preset(source.network.architecture, source.normaliser, RECIPE)
+def tuned(
+    source: Model,
+    layout: KeypointLayout,
+    points: np.ndarray,
+    steps: int = 100,
+    recipe: Recipe = RECIPE,
+) -> Trainer:
+    preset = Preset(source.network.architecture, source.normaliser, recipe)
     calls = iter(range(10**6))
     return train(
         np.ascontiguousarray(points),
@@ -82,6 +88,32 @@ def test_it_ends_better_on_the_new_data_than_its_source(
     assert error(learned(after), stretched) < 0.7 * error(source.network, stretched)
     fresh = train(stretched, np.ones(stretched.shape[:2], bool), after.preset)
     assert sum(after.measure()) < sum(fresh.measure())
+
+
+def test_the_result_is_the_mean_of_start_and_trained_weights(
+    source: Model, figure: Any, stretched: np.ndarray
+) -> None:
+    shares = (0.0, 0.25, 1.0)
+    recipes = [dataclasses.replace(RECIPE, start_share=share) for share in shares]
+    trained, mixed, same = (
+        tuned(source, figure.layout, stretched, 3, recipe).weights for recipe in recipes
+    )
+    assert not np.allclose(trained, same)
+    np.testing.assert_allclose(mixed, 0.75 * trained + 0.25 * same, atol=1e-6)
+    start = tuned(source, figure.layout, stretched, 0)
+    np.testing.assert_array_equal(same, start.weights)
+
+
+def test_a_start_with_other_keypoints_has_no_share_in_the_result(
+    source: Model, figure: Any
+) -> None:
+    layout = KeypointLayout("part", figure.layout.keypoints[:8])
+    points = figure.points[:200, :8]
+    trained, mixed = (
+        tuned(source, layout, points, 3, dataclasses.replace(RECIPE, start_share=share)).weights
+        for share in (0.0, 0.5)
+    )
+    np.testing.assert_array_equal(trained, mixed)
 
 
 def test_the_order_of_the_keypoints_does_not_matter(source: Model, figure: Any) -> None:

@@ -76,6 +76,8 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
     for rival in (good, bad):
         judgement = judge(frames, good, rival)
         assert judgement.doubt == "" and judgement.rival == rival.name
+        better = f"the new model is better than model {rival.name!r} on 60 held-out frames: "
+        assert str(judgement).startswith(f"{better}its keypoints and bones are off by ")
         assert not judgement.record()["doubtful"]
 
 
@@ -84,7 +86,8 @@ def test_mirrored_frames_are_seen_without_another_model(
 ) -> None:
     from deep_nrsfm_ros.training import judge as module
 
-    assert not judge(frames, good, None).doubt
+    alone = judge(frames, good, None)
+    assert not alone.doubt and str(alone).startswith("the new model has no other beside it; on 60")
     lift = module._lift
 
     def half_mirrored(model: Model, data: Dataset) -> Any:

@@ -73,12 +73,13 @@ def test_errors_are_of_the_frames_that_have_a_shape_and_a_truth(
     assert np.isnan(fine_tuning.errors(start, unknown)).all()
 
 
-def test_a_row_for_each_number_of_steps_and_the_default(tmp_path: Path, start: Model) -> None:
-    (table,) = fine_tuning.benchmark(["clip"], [1], tmp_path)
+def test_a_row_for_each_recipe(tmp_path: Path, start: Model) -> None:
+    (table,) = fine_tuning.benchmark(["clip"], [1], [0.0], tmp_path)
     assert [row.labels for row in table.rows] == [
-        ("clip", "0"),
-        ("clip", "1"),
-        ("clip", "30, default"),
+        ("clip", "0", ""),
+        ("clip", "1", "0.6"),
+        ("clip", "30, default", "0.0"),
+        ("clip", "30, default", "0.6"),
     ]
     later = fine_tuning.read("clip", tmp_path)[1]
     first, *others = (row.figures for row in table.rows)
