@@ -124,7 +124,7 @@ def test_stopped_demo_leaves_nothing_behind(
         line = process.stdout.readline()
         assert line, said
         said += line
-    time.sleep(2)
+    time.sleep(1)
     process.send_signal(number)
     said += process.communicate(timeout=20)[0]
     assert process.returncode == 130 and "Traceback" not in said, said
