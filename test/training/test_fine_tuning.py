@@ -21,7 +21,7 @@ from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.loop import Callbacks, Setup, train
 from deep_nrsfm_ros.training.trainer import Trainer
 
-RECIPE = Recipe(steps=100, batch=64, learning_rate=1e-3)
+RECIPE = Recipe(steps=100, batch=64, learning_rate=1e-3, start_share=0.0)
 LIGHT = "light"  # a keypoint that no model knows
 
 
