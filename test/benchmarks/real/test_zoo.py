@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.real import zoo
+from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 
 
 @pytest.fixture
@@ -43,7 +44,18 @@ def test_right_shapes_have_no_error_and_a_reflection_of_all_is_forgiven(fly: Pat
         assert shown["PA %"] == pytest.approx(0, abs=1e-3)
         assert shown["mirrored %"] == 0
         assert shown["reprojection %"] == pytest.approx(10)
-        assert shown["rigid PA %"] > 30
+        assert shown["rigid PA %"] > 30 and shown["true mean PA %"] > 30
+
+
+def test_the_rigid_shape_is_found_from_images_of_different_scales_alone() -> None:
+    rng = np.random.default_rng(0)
+    S = rng.normal(0, 1, (12, 3))
+    points = (S @ random_cameras(40, rng)) * rng.uniform(0.5, 2, (40, 1, 1))
+    points[3, 5] = np.nan  # a frame that is left out
+    training = zoo._dataset(points, zoo._layout("fly12"), "made")
+    found = zoo.rigid_factorised(training)[None]
+    errors = [zoo.relative_distance(found * mirror, S[None]) for mirror in ([1, 1, 1], [1, 1, -1])]
+    assert min(errors) < 0.01
 
 
 def test_photographs_have_no_truth_and_few_points_are_left_out(tmp_path: Path) -> None:
