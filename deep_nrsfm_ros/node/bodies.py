@@ -6,7 +6,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,9 +78,15 @@ class BodyOptions:
 class _Body:
     """The topics of one object under one prefix, and the lengths of its bones."""
 
-    def __init__(self, node: Node, prefix: str) -> None:
-        """Create the publishers."""
-        self.node = node
+    def __init__(self, node: Node, prefix: str, rename: Callable[[str], str]) -> None:
+        """Create the publishers.
+
+        Args:
+            node: owns them.
+            prefix: of their topics.
+            rename: returns the name of a joint or an angle of the layout as the topics have it.
+        """
+        self.node, self.rename = node, rename
         self._names: tuple[str, ...] = ()
         self._titles: tuple[str, ...] = ()
         quiet: Any = {"event_callbacks": publishing.NO_EVENT_CALLBACKS}
@@ -90,10 +95,10 @@ class _Body:
         self.position = node.create_publisher(PointStamped, f"{prefix}/position", 10, **quiet)
         self.velocity = node.create_publisher(TwistStamped, f"{prefix}/velocity", 10, **quiet)
 
-    def titles(self, names: tuple[str, ...], rename: Callable[[str], str]) -> tuple[str, ...]:
+    def titles(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the names as this object's topics have them."""
         if names is not self._names:
-            self._names, self._titles = names, tuple(map(rename, names))
+            self._names, self._titles = names, tuple(map(self.rename, names))
         return self._titles
 
     def close(self) -> None:
@@ -103,7 +108,10 @@ class _Body:
 
 
 class _Lengths:
-    """The mean offsets of the joints of one object, and those of its last URDF."""
+    """The mean offsets of the joints of one object, and those of its last URDF.
+
+    Every few seconds they are compared.
+    """
 
     def __init__(self) -> None:
         """Start without lengths."""
@@ -122,6 +130,7 @@ class _Lengths:
         if self._published is not None:
             if seconds < self._last + _URDF_PERIOD:
                 return False
+            self._last = seconds
             old, new = (np.linalg.norm(o, axis=1) for o in (self._published, self.offsets))
             if (np.abs(new - old) <= _URDF_CHANGE * np.maximum(old, 1e-9)).all():
                 return False
@@ -308,12 +317,12 @@ class BodyPublishers:
                 bodies = self._bodies[name] = self._create_bodies(name)
             lengths = self._lengths.setdefault(name, _Lengths())
             due = lengths.update(offsets[i], seconds)
-            for body, rename in zip(bodies, self._renames(name), strict=True):
+            for body in bodies:
                 if due and lengths.offsets is not None:
-                    text = urdf(tree, lengths.offsets, topic_name(name), rename)
+                    text = urdf(tree, lengths.offsets, topic_name(name), body.rename)
                     self._outbox.add(body.urdf, String(data=text))
                 if body.angles.get_subscription_count():
-                    titles = body.titles(tree.angle_names, rename)
+                    titles = body.titles(tree.angle_names)
                     angles = body_messages.angles(header, titles, pose.angles[i])
                     self._outbox.add(body.angles, angles)
                 if velocities is None:
@@ -338,16 +347,14 @@ class BodyPublishers:
             stamped = self._ids_message(header=publishing.to_header(header), ids=ids)
             self._outbox.add(self._ids, stamped)
 
-    def _renames(self, name: str) -> list[Callable[[str], str]]:
-        """Return the functions that rename joints for each prefix of an object's topics."""
-        renames: list[Callable[[str], str]] = [str] if self._options.per_object else []
-        return [*renames, rep155_name(topic_name(name))] if self._options.humans else renames
-
     def _create_bodies(self, name: str) -> list[_Body]:
         """Create the topics of an object."""
-        prefixes = [f"~/{topic_name(name)}"] if self._options.per_object else []
-        prefixes += [f"{HUMANS}/{topic_name(name)}"] if self._options.humans else []
-        return [*map(partial(_Body, self._node), prefixes)]
+        own, bodies = topic_name(name), []
+        if self._options.per_object:
+            bodies.append(_Body(self._node, f"~/{own}", str))
+        if self._options.humans:
+            bodies.append(_Body(self._node, f"{HUMANS}/{own}", rep155_name(own)))
+        return bodies
 
     def forget(self) -> None:
         """Forget all objects and destroy their topics."""
