@@ -10,6 +10,7 @@ from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import block_matrix
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus, image_scales
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
+from deep_nrsfm_ros.training.few_frames import MAX_SPREAD
 
 
 def images(modes: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -52,6 +53,11 @@ def test_few_modes_without_noise_are_found_exactly() -> None:
     found = consensus(W)
     assert found.solutions == 1
     assert shape_errors(found.shapes, shapes).proper < 0.01
+
+
+def test_one_solution_alone_is_no_agreement() -> None:
+    W = np.random.default_rng(0).standard_normal((30, 10, 2))
+    assert consensus(W).spread > MAX_SPREAD
 
 
 def test_scales_of_images_are_found_where_they_differ() -> None:

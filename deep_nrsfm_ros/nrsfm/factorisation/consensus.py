@@ -9,7 +9,8 @@
 2. From each of these, EM-PPCA refines cameras and shapes with 3, 5, 8 and 12 modes. Where 2 or 3
    modes leave no noise, the object has no more: the likelier of these two models is the result.
 3. All solutions meet the images after back-projection, so they differ in depth alone. Solutions far
-   from the median are left out. The result is the weighted mean of the others.
+   from the median are left out. The result is the weighted mean of the others. Where EM-PPCA went
+   elsewhere, the solutions of step 1 count alone, if there are several.
 
 The errors of depth of the solutions are partly independent, so that the mean is better than each:
 on pickup, yoga and face_mocap by 15 to 50 %.
@@ -104,8 +105,10 @@ def consensus(W: Floats, before_each: Callable[[], None] = lambda: None) -> Cons
     kept = distance < DISAGREEMENT
     if not exact and kept[len(starts) :].mean() >= 0.5:
         middle = np.median(depth[kept], 0)
-    else:  # EM went elsewhere each time: no agreement but that of the starts
+    elif exact or len(starts) > 1:  # EM went elsewhere each time: no agreement but of the starts
         kept = np.arange(len(depth)) < len(starts)
+    else:  # Nothing agrees with the only start: the spread of all says so.
+        kept = np.ones(len(depth), bool)
     depth, solutions = depth[kept], [s for s, good in zip(solutions, kept, strict=True) if good]
     for _ in range(5):
         distance = np.sqrt(((depth - middle) ** 2).mean((1, 2)))
