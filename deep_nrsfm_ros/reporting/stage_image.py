@@ -28,6 +28,7 @@ _SHADOW = (213, 217, 221)
 _DARK, _WORD, _ACCENT = (32, 38, 43), (70, 78, 84), (242, 142, 43)
 _DISTANCE = 4.2  # metres from the viewer to the middle of the room
 _PITCH = 0.22  # radians above the floor
+_EDGE = 8  # pixels beside a person
 
 
 class Room:
@@ -63,6 +64,12 @@ class Room:
         zoom = self.zoom / np.maximum(0.1, 1 - nearness / _DISTANCE)
         width, height = self.size
         return np.stack([width / 2 + zoom * across, height / 2 - zoom * up, nearness], -1)
+
+    def hold(self, points: Floats) -> None:
+        """Make all smaller where world points (..., 3) are not in the picture; NaN is ignored."""
+        half = np.array(self.size) / 2
+        beyond = np.abs(self.project(points)[..., :2] - half) / (half - _EDGE)
+        self.zoom /= max(1.0, float(np.nanmax(beyond, initial=1.0)))
 
     def draw(self, view: StageView, frame: int) -> Image.Image:
         """Return the floor, the ground truth in grey and the lifted person of one frame."""
@@ -148,6 +155,7 @@ def draw_picture(stage: Stage, path: Path, fraction: float = 0.5) -> None:
             ((0.0, "as the camera sees it"), (math.pi / 2, "from its right"))
         ):
             room = Room(stage, (width, low), _yaw_of(stage, view) + angle)
+            room.hold(np.concatenate([view.shapes[frame], view.truth[frame]]))
             y = 76 + top + row * (low + 26)
             pen.text((left, y), words, _WORD, _font(15))
             image.paste(room.draw(view, frame), (left, y + 20))

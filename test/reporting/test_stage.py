@@ -109,6 +109,18 @@ def test_the_person_is_within_the_picture(stage: Stage) -> None:
     assert (np.abs(image - [214, 39, 40]).sum(2) < 30).any()  # the right side
 
 
+def test_a_picture_holds_whoever_stands_far_beside(stage: Stage) -> None:
+    room, near = Room(stage, (300, 360), 0.4), stage.views[0].shapes[0]
+    zoom = room.zoom
+    room.hold(near)
+    assert room.zoom == zoom
+    far = np.concatenate([near + [1.5, 0.5, 0], np.full((1, 3), np.nan)])
+    room.hold(far)
+    pixels = room.project(far)[:-1, :2]
+    assert (pixels > 0).all() and (pixels < [300, 360]).all()
+    assert pixels.min() < 10 or (pixels.max(0) > [290, 350]).any()  # no smaller than it must be
+
+
 @pytest.mark.parametrize("suffix", ["webp", "gif"])
 def test_animation_moves(stage: Stage, tmp_path: Path, suffix: str) -> None:
     images = list(islice(animation_frames(stage, stage.views[1], 90, 0.5), 3))
