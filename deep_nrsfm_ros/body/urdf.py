@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from html import escape
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,7 @@ def urdf(
     for i, parent in enumerate(tree.parents):
         if parent >= 0 and np.linalg.norm(offsets[i]) > 1e-6:
             visuals[parent] += _bone(offsets[i], radius)
-    lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(name)}>"]
+    lines = ['<?xml version="1.0"?>', f"<robot name={_quoted(name)}>"]
     for i, joint in enumerate(tree.joints):
         link = rename(joint.name)
         if tree.parents[i] >= 0:
@@ -86,14 +86,22 @@ def urdf(
                 angle, last = rename(tree.angle_names[column]), column == columns[-1]
                 child = link if last else angle
                 if not last:
-                    lines.append(f"  <link name={quoteattr(child)}/>")
+                    lines.append(f"  <link name={_quoted(child)}/>")
                 lines += _joint(angle, above, child, xyz, tree.angle_axes[column])
                 above, xyz = child, "0 0 0"
             if not columns:
                 lines += _joint(link, above, link, xyz, None)
-        lines.append(f"  <link name={quoteattr(link)}>")
+        lines.append(f"  <link name={_quoted(link)}>")
         lines += [*visuals[i], "  </link>"]
     return "\n".join([*lines, "</robot>", ""])
+
+
+def _quoted(text: str) -> str:
+    """Return the value of an attribute in XML.
+
+    xml.sax.saxutils.quoteattr imports a web client, and the lifter starts later by that.
+    """
+    return f'"{escape(text)}"'
 
 
 def _numbers(values: Any) -> str:
@@ -105,9 +113,9 @@ def _joint(name: str, parent: str, child: str, xyz: str, axis: Floats | None) ->
     """Return the lines of a joint about an axis, or of a fixed one."""
     kind = '"fixed"' if axis is None else '"revolute"'
     lines = [
-        f"  <joint name={quoteattr(name)} type={kind}>",
-        f"    <parent link={quoteattr(parent)}/>",
-        f"    <child link={quoteattr(child)}/>",
+        f"  <joint name={_quoted(name)} type={kind}>",
+        f"    <parent link={_quoted(parent)}/>",
+        f"    <child link={_quoted(child)}/>",
         f'    <origin xyz="{xyz}" rpy="0 0 0"/>',
     ]
     if axis is not None:
