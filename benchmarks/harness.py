@@ -68,6 +68,7 @@ class Session:
 
     def preset(self, name: str, seed: int, **recipe: Any) -> Preset:
         """Return the preset `name` with the seed and other fields of the recipe replaced."""
+        recipe["start_share"] = 0.0  # without effect, as no training starts from a model
         if self.steps:
             recipe["steps"] = self.steps
         base = PRESETS[name]
@@ -158,8 +159,17 @@ def _mocap(selection: TrialSelection, one_camera: bool) -> Dataset:
 
 
 def _hash(dataset: Dataset, preset: Preset) -> str:
-    """Return a hash of dataset, preset and version, ten digits."""
-    digest = hashlib.sha256(f"{__version__} {preset}".encode())
+    """Return a hash of dataset, preset and version, ten digits.
+
+    Options that are off do not enter, so that a new one keeps the trainings that are there.
+    """
+    options = [
+        f"{type(part).__name__}.{name}={value}"
+        for part in preset
+        for name, value in dataclasses.asdict(part).items()
+        if value
+    ]
+    digest = hashlib.sha256(f"{__version__} {options}".encode())
     digest.update(dataset.points.tobytes())
     digest.update(dataset.visible.tobytes())
     return digest.hexdigest()[:10]

@@ -80,7 +80,7 @@ def test_reads_the_protocols_split(session: Session) -> None:
 
 def test_preset_has_seed_steps_and_options(session: Session) -> None:
     assert session.preset("paper", 7, noise=0.1).recipe == dataclasses.replace(
-        PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1
+        PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1, start_share=0.0
     )
     whole = dataclasses.replace(session, steps=None)
     assert whole.preset("default", 0).recipe.steps == FROM_RANDOM
@@ -156,6 +156,18 @@ def test_another_training_is_another(
     session.trained("a title", dataset, preset)
     session.trained("a title", *change(dataset, preset))
     assert len(list(session.output.glob("models/a-title-*"))) == 2
+
+
+def test_a_new_option_that_is_off_keeps_the_trainings_that_are_there(
+    dataset: Dataset, preset: Preset
+) -> None:
+    longer = dataclasses.make_dataclass(
+        "Recipe", [("new", float, 0.0)], bases=(type(preset.recipe),), frozen=True
+    )
+    fields = dataclasses.asdict(preset.recipe)
+    found = {new: preset._replace(recipe=longer(**fields, new=new)) for new in (0.0, 0.5)}
+    assert harness._hash(dataset, found[0.0]) == harness._hash(dataset, preset)
+    assert harness._hash(dataset, found[0.5]) != harness._hash(dataset, preset)
 
 
 def test_across_gives_both_errors_of_every_test(
