@@ -231,7 +231,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         if result := run(parse(arguments, reporter.say), reporter, should_stop):
             report_end(result, reporter)
     except CancelledError:
-        reporter.end("cancelled", "cancelled before anything was learned; nothing was written")
+        reporter.end("cancelled", "nothing had been learned; nothing was written")
     except (ValueError, OSError) as error:
         reporter.end("failed", str(error))
         sys.exit(2)

@@ -202,7 +202,7 @@ def _train(
 def _ending(trainer: Trainer, path: Path, model: Model, checkpoint: Path) -> tuple[str, str]:
     """Return the state and the message with which the training ends; remove a used checkpoint."""
     if not trainer.end_reason:
-        message = "cancelled; the model holds what was learned so far"
+        message = f"{path} holds what was learned so far"
         return "cancelled", message + (", --resume goes on" if checkpoint.exists() else "")
     checkpoint.unlink(missing_ok=True)
     message, steps = f"{path} {json.dumps(model.quality)}", trainer.preset.recipe.steps
