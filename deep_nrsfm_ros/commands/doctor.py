@@ -222,8 +222,12 @@ def arguments() -> argparse.ArgumentParser:
 
     parser = argparse.ArgumentParser(prog=program_name("doctor"), description=__doc__)
     parser.add_argument("--model", default=SHIPPED, help="model to lift with (default: human)")
-    parser.add_argument("--models-dir", type=Path, default=default_models_dir())
-    parser.add_argument("--timeout", type=float, default=30.0, help="seconds for an answer")
+    parser.add_argument(
+        "--models-dir", type=Path, default=default_models_dir(), help="folder of your own models"
+    )
+    parser.add_argument(
+        "--timeout", type=float, default=30.0, help="seconds for an answer (default: 30)"
+    )
     return parser
 
 
