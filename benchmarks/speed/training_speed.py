@@ -41,9 +41,10 @@ CASES = {"default": ("default", 0.0), "default, bones": ("default", 1.0), "paper
 
 
 def preset(name: str, batch: int) -> Preset:
-    """Return the preset `name` with the batch size `batch`."""
+    """Return the preset `name` with the batch size `batch` and the optimiser of plain torch."""
     base = PRESETS[name]
-    return base._replace(recipe=dataclasses.replace(base.recipe, batch=batch))
+    recipe = dataclasses.replace(base.recipe, batch=batch, optimiser="adam")
+    return base._replace(recipe=recipe)
 
 
 def frames(f: int) -> FrameStore:

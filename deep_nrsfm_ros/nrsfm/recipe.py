@@ -22,16 +22,26 @@ class Recipe:
 
     steps: int = option(
         AUTOMATIC,
-        "gradient steps of the training; -1 = 30000 from random weights; where it starts from a "
+        "gradient steps of the training; -1 = 10000 from random weights; where it starts from a "
         "model of the same keypoints a third of the number of frames, at least 30, of other "
-        "keypoints ten times as many, at most 30000; 0 = keep the network of the model to start "
+        "keypoints ten times as many, at most 10000; 0 = keep the network of the model to start "
         "from and learn only its error covariance and bones anew",
         low=AUTOMATIC,
         high=10_000_000,
     )
     batch: int = option(64, "frames of each gradient step", low=1, high=65536)
+    optimiser: str = option(
+        "automatic",
+        "how the weights follow the gradient: adam as in the paper; soap = Adam in the axes in "
+        "which the gradient's second moment is diagonal, in fewer steps; automatic = soap from "
+        "random weights, adam where the training starts from a model",
+        choices=("automatic", "soap", "adam"),
+    )
     learning_rate: float = option(
-        3e-3, "learning rate of Adam at the first step; 0.001 to 0.003 typical", low=1e-7, high=1.0
+        3e-3,
+        "learning rate of Adam at the first step, soap takes twice as much; 0.001 to 0.003 typical",
+        low=1e-7,
+        high=1.0,
     )
     schedule: str = option(
         "cosine",
@@ -68,11 +78,21 @@ class Recipe:
         high=0.9,
     )
     reference: str = option(
-        "repair",
+        "automatic",
         "known shapes of the cycle loss that are made of frames of nearly the same shape, not by "
-        "the network: repair = while frames are mirrored, always = from a fifth of the steps on, "
+        "the network: always = from a fifth of the steps on, repair = while frames are mirrored, "
+        "automatic = always from random weights, repair where the training starts from a model, "
         "off = never; without effect where cycle is 0 or frames show one side only",
-        choices=("repair", "always", "off"),
+        choices=("automatic", "repair", "always", "off"),
+    )
+    error_scale: float = option(
+        4.0,
+        "variance of the network's errors that the model is given, relative to that on the "
+        "training frames: motions that the training lacks have larger errors; 1 = as on the "
+        "training frames, 4 typical; without effect where the training starts from a model or "
+        "learns its last step from virtual people",
+        low=0.01,
+        high=100.0,
     )
     few_frames: int = option(
         1000,
@@ -175,9 +195,11 @@ PRESETS: dict[str, Preset] = {
         Recipe(
             steps=200_000,
             batch=32,
+            optimiser="adam",
             learning_rate=1e-3,
             schedule="exponential",
             cycle=0.0,
+            error_scale=1.0,
             few_frames=0,
             paper_initialisation=True,
             seeds=1,

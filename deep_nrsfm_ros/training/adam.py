@@ -58,6 +58,11 @@ class Adam:
 
     def restore(self, moments: Mapping[str, Tensor]) -> None:
         """Take over saved moments; those that are not among them keep their values."""
-        with torch.no_grad():
-            for name in self.moments.keys() & moments.keys():
-                self.moments[name].copy_(moments[name])
+        take_over(self.moments, moments)
+
+
+@torch.no_grad()
+def take_over(own: Mapping[str, Tensor], saved: Mapping[str, Tensor]) -> None:
+    """Copy saved tensors to those of the same name; others keep their values."""
+    for name in own.keys() & saved.keys():
+        own[name].copy_(saved[name])

@@ -67,6 +67,8 @@ def finish(
     else:
         lengths = bone_lengths(lift, W, pairs, covariance, rng)
         correlation = np.zeros((0, 0), np.float32)
+    if people is None and trainer.from_random:
+        covariance *= trainer.preset.recipe.error_scale
     provenance = _provenance(trainer, source)
     if people is not None:
         provenance["last_step"] = {"data": people.source, "frames": len(people)}

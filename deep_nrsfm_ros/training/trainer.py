@@ -27,6 +27,7 @@ from deep_nrsfm_ros.training.gradient_function import (
     with_weights,
 )
 from deep_nrsfm_ros.training.schedule import learning_rate
+from deep_nrsfm_ros.training.soap import Soap
 
 
 class Trainer:
@@ -47,6 +48,7 @@ class Trainer:
         end_reason: why the training has ended; "" if it was stopped or goes on.
         mirrored_share: share of frames with mirrored depth at the end, 0 to 0.5; NaN unknown.
         known: shapes of the frames by factorisation that the network is taught; None: none.
+        from_random: whether the training began with random weights.
         total_frames: frames of all processes.
         cpu_seconds: processor time of this process in steps.
     """
@@ -83,6 +85,7 @@ class Trainer:
         self.end_reason = ""
         self.mirrored_share = math.nan
         self.known: Consensus | None = None
+        self.from_random = start is None
         device = frames.device
         initial = start or initialise(
             architecture,
@@ -99,7 +102,10 @@ class Trainer:
         # One tensor of all weights, since Adam on fifty tensors takes twice as long.
         self.weights = weight_vector(self.initial)
         self.net = with_weights(self.initial, self.weights)
-        self.optimiser = Adam(self.weights)
+        self.optimiser: Adam | Soap = Adam(self.weights)
+        if recipe.optimiser == "soap" or (recipe.optimiser == "automatic" and self.from_random):
+            shapes = [weight.shape for _, weight in self.initial.trainable_weights()]
+            self.optimiser = Soap(self.weights, shapes, group)
         self.objective = Objective(normaliser, recipe, layout_loss=layout_loss)
         self.gradient_function = GradientFunction(self.objective, self.net, self.batch)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
@@ -183,7 +189,7 @@ class Trainer:
         if self.shapes is not None:
             tensors["shapes"] = self.shapes
         moments = self.optimiser.moments
-        return tensors | {f"adam.{key}": value for key, value in moments.items()}
+        return tensors | {f"moments.{key}": value for key, value in moments.items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Set the trainer to a saved state.
@@ -206,9 +212,9 @@ class Trainer:
             self.shapes = tensors["shapes"].to(device)
         self.optimiser.restore(
             {
-                name.removeprefix("adam."): value
+                name.removeprefix("moments."): value
                 for name, value in tensors.items()
-                if name.startswith("adam.")
+                if name.startswith("moments.")
             }
         )
         self.probe = self.sample(1024)
