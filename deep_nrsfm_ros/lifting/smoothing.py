@@ -37,8 +37,8 @@ class SmoothingOptions:
     enabled: bool = option(
         False,
         "whether shapes and rotations are filtered over time after the correction (One-Euro "
-        "filter), each object by its identity and the stamps of its messages: half of the jitter "
-        "that history.* leaves, at a lag of about 40 ms at walking speed",
+        "filter), each object by its identity and the stamps of its messages: less jitter than "
+        "history.* leaves, by half for people at rest, at a lag of about 40 ms at walking speed",
     )
     min_cutoff: float = option(
         0.2,
