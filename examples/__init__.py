@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Examples: what to put before the lifter."""
+"""Examples of publishers, subscribers and users of the library."""
