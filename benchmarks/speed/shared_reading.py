@@ -73,11 +73,17 @@ def read_share(bag: Path, share: Share) -> float:
     return time.process_time() - began
 
 
+def large_training(bag: Path, frames: int, folder: Path) -> list[str]:
+    """Return the arguments of the program `train` for a bag of `repeated_frames`."""
+    words = ["--bag", str(bag), "--object", HUMAN17.name, "--from", "none", "--name", "large"]
+    words += ["--steps", "300", "--seeds", "1", "--threads", "1"]
+    return [*words, "--max-frames", str(frames), "--output", str(folder)]
+
+
 def train(bag: Path, frames: int, folder: Path) -> tuple[float, float]:
     """Train on a bag by the program; return peak resident memory in MiB and seconds of CPU time."""
-    command = [sys.executable, "-m", "deep_nrsfm_ros", "train", "--bag", str(bag), "--from", "none"]
-    command += ["--steps", "300", "--seeds", "1", "--threads", "1", "--name", "large"]
-    command += ["--max-frames", str(frames), "--output", str(folder)]
+    words = large_training(bag, frames, folder)
+    command = [sys.executable, "-m", "deep_nrsfm_ros", "train", *words]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)

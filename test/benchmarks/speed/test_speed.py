@@ -23,6 +23,7 @@ from benchmarks.speed import (
     latency,
     latency_breakdown,
     round_trip,
+    shared_reading,
     time_to_error,
     training_scale,
     training_speed,
@@ -31,11 +32,15 @@ from benchmarks.speed import (
     timing as speed,
 )
 from benchmarks.table import Table
+from deep_nrsfm_ros.commands.train import parser
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import initialise
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS
+from deep_nrsfm_ros.training.config import TrainingConfig
+from deep_nrsfm_ros.training.preparation import read_data
+from deep_nrsfm_ros.training.reporter import Reporter
 
 
 @pytest.fixture
@@ -194,6 +199,15 @@ def test_bag_reading_gives_the_share_of_rosbags(tmp_path: Path) -> None:
     for bare, ours in zip(found[::2], found[1::2], strict=True):
         share = float(ours["messages/s"]) / float(bare["messages/s"])
         assert float(ours["share"]) == pytest.approx(share)
+
+
+def test_the_large_training_reads_the_bag_that_is_made_for_it(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    write_bag(bag, shared_reading.TOPIC, shared_reading.repeated_frames(60, 20))
+    words = shared_reading.large_training(bag, 60, tmp_path)
+    config = TrainingConfig.from_arguments(parser().parse_args(words))
+    dataset = read_data(config, Reporter(True, lambda: False))
+    assert dataset.visible.all() and dataset.points.shape == (60, 17, 2)
 
 
 def test_both_readers_read_every_message(tmp_path: Path) -> None:
