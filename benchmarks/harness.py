@@ -37,8 +37,6 @@ SNAPSHOTS = 10
 """Snapshots kept of each training, evenly spaced; the last is its result."""
 CHECKPOINT_SECONDS = 30.0
 """Seconds between checkpoints."""
-EARLIER = {"optimiser": "adam", "steps": 30_000, "reference": "repair", "error_scale": 1.0}
-"""The default recipe that most tables of docs/results.md were made by (`--earlier-recipe`)."""
 LIFTING_LEGEND = {
     "network alone": "one pass of the network",
     "back-projected": "one pass, then moved onto the keypoints within the image plane",
@@ -62,7 +60,7 @@ class Session:
     batches: int = 2  # of 500 frames, on which the baselines are solved; 0: all
     one_camera: bool = False  # for all frames of a trial, not one for each frame
     baselines: tuple[str, ...] | None = None  # words, of which a baseline's name has one; None: all
-    earlier: bool = False  # the default recipe is that of `EARLIER`
+    error_scale: float | None = None  # instead of that of the presets
 
     def mocap(self, subjects: Sequence[str], split: str) -> Dataset:
         """Return the dataset of the trials "train", "held-out" or "all" of CMU subjects."""
@@ -71,11 +69,11 @@ class Session:
 
     def preset(self, name: str, seed: int, **recipe: Any) -> Preset:
         """Return the preset `name` with the seed and other fields of the recipe replaced."""
-        if self.earlier and name == "default":
-            recipe = EARLIER | recipe
         recipe["start_share"] = 0.0  # without effect, as no training starts from a model
         if self.steps:
             recipe["steps"] = self.steps
+        if self.error_scale:
+            recipe["error_scale"] = self.error_scale
         base = PRESETS[name]
         changed = dataclasses.replace(base.recipe, seed=seed, **recipe)
         return base._replace(recipe=with_steps(changed, 0, None))
@@ -250,9 +248,7 @@ def run_program(
         help="only those whose name has one of these words, e.g. rigid Simple; none: none",
     )
     parser.add_argument(
-        "--earlier-recipe",
-        action="store_true",
-        help="train the default recipe as it was with Adam and 30000 steps",
+        "--error-scale", type=float, help="of each training (default: the preset's)"
     )
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     args = parser.parse_args(argv)
@@ -261,6 +257,6 @@ def run_program(
         *(args.data, args.output, tuple(args.subjects), tuple(args.seeds)),
         *(args.steps, args.stride, args.batches),
         baselines=None if args.baselines is None else tuple(args.baselines),
-        earlier=args.earlier_recipe,
+        error_scale=args.error_scale,
     )
     print_tables(lambda: [benchmark(session)], session.output)

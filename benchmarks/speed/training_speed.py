@@ -41,10 +41,9 @@ CASES = {"default": ("default", 0.0), "default, bones": ("default", 1.0), "paper
 
 
 def preset(name: str, batch: int) -> Preset:
-    """Return the preset `name` with the batch size `batch` and the optimiser of plain torch."""
+    """Return the preset `name` with the batch size `batch`."""
     base = PRESETS[name]
-    recipe = dataclasses.replace(base.recipe, batch=batch, optimiser="adam")
-    return base._replace(recipe=recipe)
+    return base._replace(recipe=dataclasses.replace(base.recipe, batch=batch))
 
 
 def frames(f: int) -> FrameStore:

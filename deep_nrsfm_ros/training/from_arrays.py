@@ -57,7 +57,7 @@ def train(
         start: model to start from, its name or its file. "" is a model that comes with the package
             and has most keypoints of the layout, if there is one; "none" is random weights.
         recipe: steps, seed and all else of the training; None stands for the defaults: from a
-            model of the same keypoints a step for each three frames, from random weights 10000
+            model of the same keypoints a step for each three frames, from random weights 30000
             steps, which take minutes. `Recipe(steps=3000, seed=1)` is a first look.
         on_progress: called every few seconds, and at the end.
 

@@ -202,12 +202,12 @@ def _search_network(L: NDArray[np.float32], L_inverse: NDArray[np.float32]) -> N
 
 
 class Teacher:
-    """Reference shapes as the known shapes of the cycle loss.
+    """Reference shapes as the known shapes of the cycle loss, where frames are mirrored.
 
     The test is made after the screening and at each tenth of the steps. A network that mirrors
-    more than `REPAIRED`, or that is taught always, is taught until the next test: images of the
-    reference shapes from random cameras must be lifted as these shapes. They take the place of the
-    network's own shapes, which repeat its mistakes.
+    more than `REPAIRED` is taught until the next test: images of the reference shapes from random
+    cameras must be lifted as these shapes. They take the place of the network's own shapes, which
+    repeat its mistakes.
 
     Attributes:
         known: (m, p, 3) the reference shapes in the network's axes while it is taught, else None.
@@ -249,8 +249,7 @@ class Teacher:
     def _lesson(self, trainer: Trainer) -> Tensor | None:
         """Return the reference shapes to teach until the next test, None for none."""
         share = self.check.share(trainer.net)
-        always = self.mode == "always" or (self.mode == "automatic" and trainer.from_random)
-        always = always and trainer.progress >= FIRST_LESSON
+        always = self.mode == "always" and trainer.progress >= FIRST_LESSON
         if math.isnan(share) or not (share > REPAIRED or always):
             return None
         known = self.check.known_shapes(trainer.net)

@@ -11,7 +11,7 @@ import numpy as np
 from deep_nrsfm_ros.nrsfm.network import Network
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Recipe
 
-FROM_RANDOM = 10_000
+FROM_RANDOM = 30_000
 """Steps of a training from random weights, and the most of one that starts from a model."""
 _FRAMES_A_STEP = 3  # of a training that starts from a model: each frame is seen 21 times
 _FEWEST = 30

@@ -103,7 +103,7 @@ class Trainer:
         self.weights = weight_vector(self.initial)
         self.net = with_weights(self.initial, self.weights)
         self.optimiser: Adam | Soap = Adam(self.weights)
-        if recipe.optimiser == "soap" or (recipe.optimiser == "automatic" and self.from_random):
+        if recipe.optimiser == "soap":
             shapes = [weight.shape for _, weight in self.initial.trainable_weights()]
             self.optimiser = Soap(self.weights, shapes, group)
         self.objective = Objective(normaliser, recipe, layout_loss=layout_loss)

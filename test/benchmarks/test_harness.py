@@ -84,10 +84,8 @@ def test_preset_has_seed_steps_and_options(session: Session) -> None:
     )
     whole = dataclasses.replace(session, steps=None)
     assert whole.preset("default", 0).recipe.steps == FROM_RANDOM
-    earlier = dataclasses.replace(whole, earlier=True)
-    recipe = earlier.preset("default", 0, reference="off").recipe
-    assert (recipe.optimiser, recipe.steps, recipe.reference) == ("adam", 30_000, "off")
-    assert earlier.preset("paper", 0) == whole.preset("paper", 0)
+    scaled = dataclasses.replace(whole, error_scale=2.0)
+    assert scaled.preset("default", 0).recipe.error_scale == 2
 
 
 def test_snapshots_are_those_of_one_uninterrupted_training(

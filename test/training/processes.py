@@ -23,7 +23,7 @@ from deep_nrsfm_ros.training.trainer import Trainer
 PRESET = Preset(
     Architecture(widths=(64, 32, 16)),
     Normaliser(),
-    Recipe(steps=300, batch=65, learning_rate=5e-3, seeds=2, screening=20),
+    Recipe(steps=300, batch=65, learning_rate=1e-2, seeds=2, screening=20),
 )
 
 

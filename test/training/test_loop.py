@@ -201,7 +201,7 @@ def test_stopping_before_anything_is_learned_leaves_no_checkpoint(
 def test_screening_goes_on_with_the_lowest_cycle_error_and_mirrored_share(figure: Any) -> None:
     frames = FrameStore.of(figure.points, np.ones(figure.points.shape[:2], bool))
     chosen = set()
-    for seed in (3, 8):
+    for seed in (3, 4):
         preset = small(**SCREENED, seed=seed)
         cycle = {}
         for candidate in range(3 * seed, 3 * seed + 3):
