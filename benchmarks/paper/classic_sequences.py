@@ -32,7 +32,7 @@ Floats = NDArray[Any]
 RANKS = (2, 3, 4, 5, 6, 7, 8)
 """Ranks K to choose from."""
 STEPS = 10_000
-"""Of a training, a third of the default: there are few frames."""
+"""Steps of a training."""
 SEQUENCES = ("drink", "pickup", "face_mocap", "yoga", "dance", "shark")
 BASELINES: dict[str, Any] = {
     "Simple (Dai et al.)": block_matrix,

@@ -30,7 +30,7 @@ CHAIR_CORE = (0, 1, 2, 3, 4, 5, 17, 18, 19, 20)
 OBJECTS, CAMERAS = 400, 5
 """Objects of a category, and random cameras of each object: 2000 images, as in the paper."""
 STEPS = 10_000
-"""Of a training, a third of the default: there are few images."""
+"""Steps of a training."""
 # Kong and Lucey, "Deep Interpretable Non-Rigid Structure from Motion", arXiv 1902.10840, Table 2.
 PAPER = {
     "Deep NRSfM": {"bed": 0.23, "chair": 1.15, "sofa": 0.35, "table": 0.81},
