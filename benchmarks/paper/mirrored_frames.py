@@ -20,7 +20,7 @@ from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, figures
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.model_files.model_file import Model
-from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.loop import Setup, train
@@ -37,6 +37,7 @@ _RECIPES: dict[str, dict[str, Any]] = {
     "one seed, repaired": {"seeds": 1, "reference": "repair"},
     "default": {},
     "default, reference always": {"reference": "always"},
+    "fast": {},
 }
 _PAPER = "paper"  # with its repair
 _REPAIR_SHARE = 0.1  # of the steps of the paper's network
@@ -46,6 +47,7 @@ _LEGEND = {
     "one seed, repaired": "the default recipe with --seeds 1",
     "default": "the default recipe: up to 3 seeds, the first that mirrors no frame",
     "default, reference always": "the default recipe with --reference always",
+    "fast": "--preset fast",
     "paper": "the paper's network and schedule",
     "paper, repaired": "the same, then a tenth of its steps with --cycle 2 --reference always",
 }
@@ -69,7 +71,8 @@ def benchmark(session: Session, recipes: Sequence[str] = (*_RECIPES, _PAPER)) ->
         check = MirrorCheck(frames, session.preset("default", 0).normaliser)
         for seed in session.seeds:
             for name in filter(_RECIPES.__contains__, recipes):
-                preset = session.preset("default", seed, **_RECIPES[name])
+                base = name if name in PRESETS else "default"
+                preset = session.preset(base, seed, **_RECIPES[name])
                 model = session.trained(f"{subject} {name} seed {seed}", dataset, preset)
                 _add(table, session, (subject, name), model, (seed, check))
         if _PAPER not in recipes:
