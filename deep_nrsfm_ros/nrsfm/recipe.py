@@ -33,8 +33,8 @@ class Recipe:
     optimiser: str = option(
         "adam",
         "how the weights follow the gradient: adam as in the paper; soap = Adam in the axes in "
-        "which the gradient's second moment is diagonal, in a third of the steps; measured on people "
-        "who are seen from all sides",
+        "which the gradient's second moment is diagonal, in a third of the steps; measured on "
+        "people who are seen from all sides",
         choices=("adam", "soap"),
     )
     learning_rate: float = option(
