@@ -96,12 +96,15 @@ def urdf(
     return "\n".join([*lines, "</robot>", ""])
 
 
+_SPACES = {ord(space): f"&#{ord(space)};" for space in "\t\n\r"}  # else read as blanks
+
+
 def _quoted(text: str) -> str:
     """Return the value of an attribute in XML.
 
-    xml.sax.saxutils.quoteattr imports a web client, and the lifter starts later by that.
+    It stands for xml.sax.saxutils.quoteattr, which imports a web client and delays the start.
     """
-    return f'"{escape(text)}"'
+    return f'"{escape(text).translate(_SPACES)}"'
 
 
 def _numbers(values: Any) -> str:

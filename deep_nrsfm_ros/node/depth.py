@@ -106,7 +106,8 @@ class DepthSubscription:
     """Keeps depth messages for a short time, and scales lifted objects with the matching one.
 
     Attributes:
-        problem: why no keypoints of the last period had depth, or why it cannot be believed.
+        problem: why no keypoints of the last period had depth, or why it cannot be believed;
+            "" if neither.
     """
 
     def __init__(self, node: Node, options: DepthOptions, camera: CameraInfoSubscription) -> None:

@@ -209,5 +209,6 @@ PRESETS: dict[str, Preset] = {
         ),
     ),
 }
-"""The default; as good in about half of the time, for objects that are seen from all sides;
-and the paper's network and schedule as its authors released them."""
+"""Presets by name: the default; `fast`, which reaches the default's errors on the training frames
+in about half of the time, for objects that are seen from all sides; `paper`, the network and
+schedule as its authors released them."""

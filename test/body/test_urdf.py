@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import warnings
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -73,6 +74,11 @@ def test_names_are_those_of_rep_155() -> None:
     assert [rename(n) for n in ("left_elbow", "body", "r_y_hip", "right_hip")] == [
         *("l_elbow_x7", "body_x7", "r_y_hip_x7", "r_hip_x7")
     ]
+
+
+@pytest.mark.parametrize("name", ["anna", 'a"b', "it's", "<&>", "a\tb\nc\rd", "\"'&"])
+def test_a_name_is_read_as_it_was_written(name: str) -> None:
+    assert ElementTree.fromstring(urdf(TREE, OFFSETS, name)).get("name") == name
 
 
 def test_names_are_escaped() -> None:
