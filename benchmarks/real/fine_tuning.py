@@ -76,6 +76,7 @@ class Part(NamedTuple):
         confidence: (n, q), 0 where missing.
         truth: (n, k, 3) mm in the camera's axes, NaN where unknown.
         joints: names of the k keypoints of the truth.
+        starts: first frames of the recordings that were joined.
     """
 
     layout: KeypointLayout
@@ -83,6 +84,7 @@ class Part(NamedTuple):
     confidence: Floats
     truth: Floats
     joints: Sequence[str]
+    starts: Sequence[int] = (0,)
 
     def rows(self, rows: slice) -> Part:
         """Return a slice of the frames."""
@@ -95,7 +97,8 @@ def joined(parts: Sequence[Part]) -> Part:
     """Return the frames of all parts, which have one layout and the same joints."""
     arrays = zip(*((part.points, part.confidence, part.truth) for part in parts), strict=True)
     points, confidence, truth = map(np.concatenate, arrays)
-    return Part(parts[0].layout, points, confidence, truth, parts[0].joints)
+    starts = np.cumsum([0, *(len(part.points) for part in parts[:-1])]).tolist()
+    return Part(parts[0].layout, points, confidence, truth, parts[0].joints, starts)
 
 
 def clip(data: Path) -> list[Part]:
@@ -185,7 +188,9 @@ def tuned(start: Model, part: Part, recipe: Recipe, layout: KeypointLayout) -> t
     """Return the model that `train` makes of a part, and whether the judge calls it better."""
     points, confidence = KeypointMap(part.layout, layout)(part.points, part.confidence)
     points, visible = points.astype(np.float32), confidence > 0.1
-    data = curate(Dataset(points, visible, layout, "benchmark")).dataset
+    starts = np.array(part.starts)
+    everything = Dataset(points, visible, layout, "benchmark", sequence_starts=starts)
+    data = curate(everything).dataset
     frames = split(data, Curation().held_out)
     preset = Preset(start.network.architecture, start.normaliser, recipe)
     setup = Setup(start_from(start, layout))

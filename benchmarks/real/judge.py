@@ -113,7 +113,8 @@ def clip(data: Path) -> Scene:
     confidence = np.concatenate([view.confidence for view in views])
     truth = np.concatenate([view.truth for view in views])
     points, confidence = KeypointMap(BODY25B, HUMAN25)(points, confidence)
-    return _curated(HUMAN25, points, confidence > 0.1, truth, _LIMBS)
+    lengths = [len(view.points) for view in views]
+    return _curated(HUMAN25, points, confidence > 0.1, truth, _LIMBS, lengths)
 
 
 def _mocap(subject: str, most: int, yaw: float, data: Path) -> Scene:
@@ -160,7 +161,9 @@ def _views(
         truth.append(turned + recording["t"][view])
     W = np.concatenate(points)
     visible = np.isfinite(W).all(2)
-    return _curated(layout, np.nan_to_num(W), visible, np.concatenate(truth), range(len(layout)))
+    everywhere, lengths = range(len(layout)), [len(view) for view in points]
+    shown = np.nan_to_num(W)
+    return _curated(layout, shown, visible, np.concatenate(truth), everywhere, lengths)
 
 
 def _curated(
@@ -169,9 +172,21 @@ def _curated(
     visible: NDArray[np.bool_],
     truth: Floats,
     joints: Sequence[int],
+    lengths: Sequence[int] = (),
 ) -> Scene:
-    """Return the frames that the program `train` would keep."""
-    curated = curate(Dataset(np.asarray(points, np.float32), visible, layout, "benchmark"))
+    """Return the frames that the program `train` would keep.
+
+    Args:
+        layout: of the keypoints.
+        points: (f, p, 2) of all frames.
+        visible: (f, p) which keypoints are.
+        truth: see `Scene`.
+        joints: see `Scene`.
+        lengths: frames of each view, one after the other; (): unknown.
+    """
+    starts = np.cumsum([0, *lengths])[:-1]
+    seen = np.asarray(points, np.float32)
+    curated = curate(Dataset(seen, visible, layout, "benchmark", sequence_starts=starts))
     return Scene(curated.dataset, truth[curated.frames], joints)
 
 

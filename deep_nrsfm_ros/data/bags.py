@@ -114,6 +114,7 @@ def read_bags(
             read.append(path.name)
             for topic, input_type, decode in topics:
                 before, reader = messages, MessageReader(input_type, decode)
+                builder.begin_sequence()
                 for raw in share.of(bag.messages(topic), len(read) - 1):
                     messages += 1
                     try:

@@ -57,8 +57,9 @@ class Curation:
     held_out: float = option(
         0.1,
         "share of the frames that the training does not use, where there is a model to compare the "
-        "new one with: the last ones of each quarter of the data; 0 = none, the comparison uses "
-        "the frames of the training, 0.1 typical",
+        "new one with: the last ones of each recording or identity, after a gap of half as many "
+        "frames, which nothing uses; 0 = none, the comparison uses the frames of the training, 0.1 "
+        "typical",
         low=0.0,
         high=0.5,
     )

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,8 @@ class Dataset:
         source: where the frames come from, in words, for the provenance of a model.
         shapes: (f, p, 3) float32 ground truth in the axes of the data, or None. Only evaluation
             reads it, training never does.
+        sequence_starts: (s,) int64, ascending from 0, first frames of the sequences: recordings,
+            views or identities, the frames of each in the order of their time. Empty: unknown.
     """
 
     points: NDArray[np.float32]
@@ -38,6 +40,7 @@ class Dataset:
     layout: KeypointLayout
     source: str
     shapes: NDArray[np.float32] | None = None
+    sequence_starts: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __post_init__(self) -> None:
         """Raise ValueError if the shapes of the arrays do not match each other or the layout."""
@@ -48,6 +51,10 @@ class Dataset:
             raise ValueError(f"visible is {self.visible.shape}; points need {(f, p)}")
         if self.shapes is not None and self.shapes.shape != (f, p, 3):
             raise ValueError(f"shapes are {self.shapes.shape}; points need {(f, p, 3)}")
+
+        starts = self.sequence_starts
+        if len(starts) and (starts[0] or starts[-1] >= f or (np.diff(starts) <= 0).any()):
+            raise ValueError(f"sequence_starts must ascend from 0, to a frame of the {f}")
 
     def __len__(self) -> int:
         """Return f, the number of frames."""
@@ -64,7 +71,15 @@ class Dataset:
 
         shapes = None if self.shapes is None else chosen(self.shapes)
         points, visible = chosen(self.points), chosen(self.visible)
-        return Dataset(points, visible, self.layout, self.source, shapes)
+        starts = self.sequence_starts
+        if len(starts):
+            sequence = np.searchsorted(starts, np.arange(len(self))[frames], "right")
+            starts = np.flatnonzero(np.diff(sequence, prepend=-1))
+        return Dataset(points, visible, self.layout, self.source, shapes, starts)
+
+    def as_sequence(self) -> Dataset:
+        """Return the dataset as one sequence, in the order of its frames."""
+        return replace(self, sequence_starts=np.zeros(min(len(self), 1), np.int64))
 
 
 def concatenate(datasets: list[Dataset]) -> Dataset:
@@ -72,7 +87,7 @@ def concatenate(datasets: list[Dataset]) -> Dataset:
 
     Args:
         datasets: at least one, all of the same layout. The result has a ground truth only if
-            all of them have one.
+            all of them have one, and sequences only if all have them.
 
     Raises:
         ValueError: there is no dataset, or the layouts differ.
@@ -83,12 +98,16 @@ def concatenate(datasets: list[Dataset]) -> Dataset:
     if len(layouts) > 1:
         raise ValueError(f"the sources have {len(layouts)} different keypoint layouts; use one")
     shapes = [e.shapes for e in datasets if e.shapes is not None]
+    first = np.cumsum([0, *(len(e) for e in datasets)])
+    has_starts = all(len(e.sequence_starts) or not len(e) for e in datasets)
+    starts = [e.sequence_starts + at for e, at in zip(datasets, first[:-1], strict=True)]
     return Dataset(
         concatenated([e.points for e in datasets]),
         concatenated([e.visible for e in datasets]),
         datasets[0].layout,
         "; ".join(dict.fromkeys(e.source for e in datasets)),
         concatenated(shapes) if len(shapes) == len(datasets) else None,
+        np.concatenate(starts) if has_starts else np.empty(0, np.int64),
     )
 
 
@@ -118,6 +137,11 @@ class DatasetBuilder:
         self._visible: list[NDArray[np.bool_]] = []
         self._unsaved = 0  # objects in them
         self._saved: tuple[list[NDArray[Any]], list[NDArray[Any]]] = ([], [])
+        self._starts: list[int] = []
+
+    def begin_sequence(self) -> None:
+        """Say that the next object is the first of a recording or a topic of it."""
+        self._starts.append(self.count)
 
     def add_serialised(self, known_format: SerialisedFormat, raw: bytes) -> None:
         """Add the objects of a serialised message; messages of one format are read together."""
@@ -178,4 +202,5 @@ class DatasetBuilder:
         self._map_pending()
         self._save()
         points, visible = map(concatenated, self._saved)
-        return Dataset(points, visible, self._map.target, source)
+        starts = np.unique(np.array([at for at in self._starts if at < len(points)], np.int64))
+        return Dataset(points, visible, self._map.target, source, sequence_starts=starts)

@@ -367,7 +367,7 @@ def read_trials(
         S = np.tile(S, (cameras, 1, 1))
         W = S @ random_cameras(len(S), rng)
         source = f"CMU motion capture, subject {path.parent.name}"
-        parts.append(Dataset(W, np.ones(W.shape[:2], bool), layout, source, S))
+        parts.append(Dataset(W, np.ones(W.shape[:2], bool), layout, source, S).as_sequence())
         on_progress(done + 1, len(paths))
     return concatenate(parts)
 

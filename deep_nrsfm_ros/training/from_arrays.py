@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from deep_nrsfm_ros.data.curation import Curation, curate
@@ -35,6 +36,7 @@ def train(
     name: str = "trained",
     start: Model | str = "",
     recipe: Recipe | None = None,
+    sequence_starts: Sequence[int] = (),
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> Model:
     """Train a model on 2D keypoints and return it; `save_model` writes it to a file.
@@ -42,9 +44,9 @@ def train(
     The data are curated as the command `train` does it: frames with few keypoints, near-duplicates
     and outliers are left out. Warnings about the data and the result are Python warnings.
 
-    Where the object has a model, the new one is compared with it without labels, on a tenth of the
-    frames that the training does not use: `provenance["judgement"]` of the result has the figures,
-    and a doubtful model gives a warning with the reason and what would help.
+    Where the object has a model, the new one is compared with it without labels, on the last tenth
+    of each sequence, which the training does not use: `provenance["judgement"]` of the result has
+    the figures, and a doubtful model gives a warning with the reason and what would help.
 
     Args:
         points: (f, p, 2) keypoints of f frames, in any unit, x right and y down. A keypoint at
@@ -59,6 +61,9 @@ def train(
         recipe: steps, seed and all else of the training; None stands for the defaults: from a
             model of the same keypoints a step for each three frames, from random weights 30000
             steps, which take minutes. `Recipe(steps=3000, seed=1)` is a first look.
+        sequence_starts: first frames of the recordings, views or people in the points, the frames
+            of each in the order of their time: (0, 500) where 500 frames of one camera come first.
+            (0,): one recording. (): unknown, each quarter of the frames counts as a sequence.
         on_progress: called every few seconds, and at the end.
 
     Raises:
@@ -76,7 +81,10 @@ def train(
     if isinstance(layout, str):
         layout = find_layout("layout", layout)
     seen = from_arrays(points, confidence, layout)
-    curated = curate(Dataset(seen.points, seen.confidence > 0, layout, "arrays"))
+    starts = np.array(sequence_starts, np.int64)
+    visible = seen.confidence > 0
+    data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
+    curated = curate(data)
     origin = _origin(start, layout)
     sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
     if sufficiency.refusal:

@@ -167,8 +167,11 @@ def _read_inputs(
             reporter.warn(f"{path.name}: {warning}")
         order = np.lexsort((detections.frame, detections.identities))
         order = order[share.rows(len(order))]
+        identities = detections.identities[order]
+        starts = np.flatnonzero(np.append(True, identities[1:] != identities[:-1]))
         points, confidence = to_target(detections.points[order], detections.confidence[order])
-        parts.append(Dataset(points, confidence > 0, keypoint_map.target, f"file {path.name}"))
+        visible, source = confidence > 0, f"file {path.name}"
+        parts.append(Dataset(points, visible, keypoint_map.target, source, sequence_starts=starts))
     if not parts and not may_be_none:
         raise failures[0]
     for failure in failures:

@@ -34,6 +34,9 @@ def dataset(f: int = 4, source: str = "a", truth: bool = True, **changes: Any) -
         ({"visible": np.ones((3, 5), bool)}, r"visible is \(3, 5\).*\(4, 5\)"),
         ({"visible": np.ones((4, 5, 1), bool)}, r"visible is \(4, 5, 1\)"),
         ({"shapes": np.zeros((4, 5, 2))}, r"shapes are \(4, 5, 2\).*\(4, 5, 3\)"),
+        ({"sequence_starts": np.array([1])}, "must ascend from 0"),
+        ({"sequence_starts": np.array([0, 2, 2])}, "must ascend from 0"),
+        ({"sequence_starts": np.array([0, 4])}, "to a frame of the 4"),
         ({"layout": KeypointLayout.numbered(6)}, r"points are \(4, 5, 2\).*\(frames, 6, 2\)"),
     ],
 )
@@ -81,3 +84,13 @@ def test_concatenate_refuses_nothing_and_different_layouts() -> None:
     other = KeypointLayout("other", tuple("abcde"))
     with pytest.raises(ValueError, match="2 different keypoint layouts"):
         concatenate([dataset(), dataset(layout=other)])
+
+
+def test_sequences_go_with_their_frames() -> None:
+    whole = dataset(8, sequence_starts=np.array([0, 3, 5]))
+    assert whole[np.array([1, 2, 5, 7])].sequence_starts.tolist() == [0, 2]
+    assert whole[2:5].sequence_starts.tolist() == [0, 1]
+    assert dataset(8)[2:5].sequence_starts.tolist() == []
+    both = concatenate([whole, dataset(4, sequence_starts=np.array([0]))])
+    assert both.sequence_starts.tolist() == [0, 3, 5, 8]
+    assert concatenate([whole, dataset(4)]).sequence_starts.tolist() == []

@@ -93,6 +93,8 @@ def test_files_are_trained_on_as_bags_are(tmp_path: Path) -> None:
     both = read("--bag", f"{tmp_path}/bag", "--input", f"{tmp_path}/a.npz", *layout)
     np.testing.assert_array_equal(both.points, np.concatenate([points, points]))
     assert both.source == "bags bag; file a.npz"
+    assert both.sequence_starts.tolist() == [0, 6]
+    assert by_identity.sequence_starts.tolist() == [0, 3]
     for named in (("--input", f"{tmp_path}/coco.json"), ("--input", f"{tmp_path}/a.npz")):
         assert read(*named, "--object", "numbered").layout.keypoints[16] == "point_16"
 
