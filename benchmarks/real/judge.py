@@ -283,7 +283,7 @@ def orders(result: Result) -> dict[str, float]:
     """Return how each figure orders the models of a scene: Spearman, and regret of its choice."""
     scores = {c: [getattr(row[0], c) for row in result.figures] for c in COLUMNS}
     ranks = [rank(row[0], result.figures[0][0]) for row in result.figures]
-    scores[ORDER] = [100.0 * each.doubtful + each.score for each in ranks]
+    scores[ORDER] = [100.0 * each.doubtful + 10 * each.at_hand + each.score for each in ranks]
     accuracy: dict[str, float] = {}
     for name, score in scores.items():
         known = not np.isnan(score).any() and np.ptp(score) > 0

@@ -37,6 +37,7 @@ _Lifted = tuple[Floats, Floats, NDArray[np.bool_]]
 
 _MOST_FRAMES = 2000
 _NETWORK_ALONE = LiftingOptions(correction="none", test_time_rotations=1)
+_AS_SHIPPED = LiftingOptions()
 
 
 class Figures(NamedTuple):
@@ -53,6 +54,8 @@ class Figures(NamedTuple):
             mean; mean over bones and held-out frames.
         flatness: share of the size of a held-out shape that lies within the image plane, 0 to 1.
         difference: distance from the shapes of the model compared with, relative to their size.
+        turned: share of all frames whose mirror image it has, lifted with the correction, where it
+            was trained on from the model compared with. NaN for other models.
     """
 
     residual: float
@@ -63,6 +66,7 @@ class Figures(NamedTuple):
     side_difference: float
     flatness: float
     difference: float
+    turned: float = math.nan
 
     @property
     def misfit(self) -> float:
@@ -83,16 +87,27 @@ IN_WORDS = {
     "mirrored_share": "{:.1%} of its frames are mirrored against their neighbours",
     "front_disagreement": "in {:.1%} of the frames its front is behind",
     "opposed": "it lifts {:.1%} of the frames to the mirror image of the other's",
+    "turned": "it has turned {:.1%} of the frames to the mirror image of those of its start",
     "bone_variation": "its bones vary by {:.1%} of their lengths",
 }
 """The figures by which the rule decides, in words."""
 
+_BESIDE = ("opposed", "turned")  # figures that need a model beside it
+
 MORE_WRONG_SIDES = 0.005
-"""Share of mirrored or turned frames by which a model must differ from another to be worse."""
+"""Share of mirrored or turned frames by which a model must differ from another to be worse.
+
+A model that was trained on has the depth of its start, so that no frame of it should be turned.
+"""
 MOST_OPPOSED = 0.05
 """Share of frames with the other's mirror image above which one of both mirrors them."""
 STEADIER_BONES = 0.5
 """Of the other's variation of bones, up to which a model is the one that does not mirror them."""
+SAME_MISFIT = 1.02
+"""Times the other's misfit up to which both fit the held-out frames alike.
+
+The new model is then better: the frames that it has learned, it fits more closely.
+"""
 LOOSER_BONES = 2.5
 """Times the other's variation of bones above which a model has fitted its keypoints too closely.
 
@@ -111,10 +126,13 @@ class Rank(NamedTuple):
 
     Attributes:
         doubtful: whether the rule doubts the model.
-        score: sum of its misfit, and the shares of frames that are turned or opposed.
+        at_hand: whether it is the model at hand, which comes after all that are better.
+        score: sum of its misfit, and the shares of frames that are turned or opposed. Few opposed
+            frames say nothing: which of both models is right is unknown.
     """
 
     doubtful: bool
+    at_hand: bool
     score: float
 
 
@@ -172,7 +190,7 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
     name = rival.name if rival is not None and old else ""
     on = f"on {len(frames.held_out)} {where} frames"
     than = f"compared with model {name!r} {on}" if name else on
-    shown = [each for each in IN_WORDS if each in _known(new) and (old or each != "opposed")]
+    shown = [each for each in IN_WORDS if each in _known(new) and (old or each not in _BESIDE)]
     summary = "; ".join(_in_words(each, new, old) for each in shown)
     doubt = ""
     if worse := worse_figures(new, old):
@@ -209,16 +227,20 @@ def _worse(new: Figures, old: Figures | None) -> list[str]:
     bones, other_bones = _or_zero(new.bone_variation), _or_zero(old.bone_variation)
     if is_opposed:
         return [] if bones < STEADIER_BONES * other_bones else ["opposed"]
+    if _or_zero(new.turned) > MORE_WRONG_SIDES:  # too few for the mean of the bones to tell whose
+        return ["turned"]
     worse = ["bone_variation"] if bones > LOOSER_BONES * other_bones else []
-    return worse + (["misfit"] if new.misfit > old.misfit else [])
+    return worse + (["misfit"] if new.misfit > SAME_MISFIT * old.misfit else [])
 
 
 def rank(new: Figures, old: Figures | None) -> Rank:
     """Return the rank of a model beside the one at hand, if there is one."""
     # The mirror image of a model that turns its frames itself says nothing against another one.
     is_rival_worse = old is not None and old.wrong_sides > new.wrong_sides + MORE_WRONG_SIDES
-    opposed = 0.0 if is_rival_worse else _or_zero(new.opposed)
-    return Rank(bool(worse_figures(new, old)), new.misfit + new.wrong_sides + opposed)
+    is_opposed = _or_zero(new.opposed) > MOST_OPPOSED and not is_rival_worse
+    opposed = new.opposed if is_opposed else 0.0
+    is_doubtful = new is not old and bool(worse_figures(new, old))
+    return Rank(is_doubtful, new is old, new.misfit + new.wrong_sides + opposed)
 
 
 def _or_zero(value: float) -> float:
@@ -240,7 +262,7 @@ def _rounded(figures: Figures) -> dict[str, float]:
 def _in_words(name: str, new: Figures, old: Figures | None) -> str:
     """Return a figure of both models in words."""
     text = IN_WORDS[name].format(getattr(new, name))
-    known = _known(old) if old and name != "opposed" else {}
+    known = _known(old) if old and name not in _BESIDE else {}
     return f"{text} (the other's: {known[name]:.1%})" if name in known else text
 
 
@@ -313,7 +335,7 @@ class Judge:
             self._all = concatenate([kept, _spread(frames.held_out, most)])
         store = FrameStore.of(self._all.points, self._all.visible)
         self._mirror_check = MirrorCheck(store, Normaliser(), _MOST_FRAMES)
-        self._lifted: dict[tuple[int, bool], tuple[Model, _Lifted]] = {}
+        self._lifted: dict[tuple[int, bool, bool], tuple[Model, _Lifted]] = {}
 
     def figures(self, model: Model, other: Model | None = None) -> Figures:
         """Return the figures of a model, whose keypoints are matched by name.
@@ -338,28 +360,32 @@ class Judge:
         variation, difference = _bones(S, visible, layout)
         both = visible & also_visible[sound]
         Y, Z = _unit(S, both), _unit(T[sound], both)
+        is_trained_on = other is not None and _origin(model) == other.name
         return Figures(
             float(np.median(residual[sound])),
             variation,
             test.share if test.tested.mean() >= MIN_TESTED else math.nan,
             _front_disagreement(everything, shown, layout),
-            self._opposed(everything, shown, other or model),
+            self._opposed(model, other or model),
             difference,
             float(np.linalg.norm(X[..., :2], axis=(1, 2)).mean()),
             float(np.linalg.norm(align(Y, Z).aligned - Z, axis=(1, 2)).mean()),
+            self._opposed(model, other, shipped=True) if other and is_trained_on else math.nan,
         )
 
-    def _lift(self, model: Model, *, held_out: bool = False) -> _Lifted:
+    def _lift(self, model: Model, *, held_out: bool = False, shipped: bool = False) -> _Lifted:
         """Return a model's shapes of all or of the held-out frames, which are computed once."""
-        key = id(model), held_out
+        key = id(model), held_out, shipped
         if key not in self._lifted:  # the model is kept: its id is the key
             data = self._held_out if held_out else self._all
-            self._lifted[key] = model, _lift(model, data)
+            options = _AS_SHIPPED if shipped else _NETWORK_ALONE
+            self._lifted[key] = model, _lift(model, data, options)
         return self._lifted[key][1]
 
-    def _opposed(self, S: Floats, visible: NDArray[np.bool_], other: Model) -> float:
+    def _opposed(self, model: Model, other: Model, *, shipped: bool = False) -> float:
         """Return the share of all frames of which `other` has the mirror image."""
-        T, residual, also_visible = self._lift(other)
+        S, _, visible = self._lift(model, shipped=shipped)
+        T, residual, also_visible = self._lift(other, shipped=shipped)
         both, sound = visible & also_visible, np.isfinite(residual)
         aligned = align(_unit(S, both), _unit(T, both), allow_reflection=True)
         return float(aligned.mirrored[sound].mean())
@@ -371,7 +397,12 @@ def _spread(dataset: Dataset, most: int = _MOST_FRAMES) -> Dataset:
     return dataset[np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))]
 
 
-def _lift(model: Model, data: Dataset) -> _Lifted:
+def _origin(model: Model) -> str:
+    """Return the name of the model that a model was trained on from; "" if from none."""
+    return str(model.provenance.get("from", {}).get("model", ""))
+
+
+def _lift(model: Model, data: Dataset, options: LiftingOptions) -> _Lifted:
     """Return shapes (n, p, 3), residuals (n,) and the visible keypoints (n, p) that have a shape.
 
     The shapes are in the axes of the camera and the keypoints in the order of the data, 0 where
@@ -379,7 +410,7 @@ def _lift(model: Model, data: Dataset) -> _Lifted:
     """
     confidence = data.visible.astype(np.float32)
     mapped = KeypointMap(data.layout, model.layout)(data.points, confidence)
-    lifted = lift_all(Lifter(model, _NETWORK_ALONE).lift, *mapped)
+    lifted = lift_all(Lifter(model, options).lift, *mapped)
     sound = np.isfinite(lifted.shapes).all((1, 2)) & np.isfinite(lifted.residual)
     S = np.zeros((*data.visible.shape, 3))
     places = {name: i for i, name in enumerate(model.layout.keypoints)}

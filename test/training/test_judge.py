@@ -13,10 +13,11 @@ import pytest
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.held_out import Split, split
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import initialise
 from deep_nrsfm_ros.training.finish import finish
-from deep_nrsfm_ros.training.judge import Figures, Judge, judge, standings, worse_figures
+from deep_nrsfm_ros.training.judge import Figures, Judge, judge, rank, standings, worse_figures
 from deep_nrsfm_ros.training.trainer import Trainer
 
 GOOD = Figures(
@@ -90,8 +91,8 @@ def test_mirrored_frames_are_seen_without_another_model(
     assert not alone.doubt and str(alone).startswith("the new model has no other beside it; on 60")
     lift = module._lift
 
-    def half_mirrored(model: Model, data: Dataset) -> Any:
-        S, residual, visible = lift(model, data)
+    def half_mirrored(model: Model, data: Dataset, options: LiftingOptions) -> Any:
+        S, residual, visible = lift(model, data, options)
         far = data.points[:, 4, 0] > np.quantile(data.points[:, 4, 0], 0.7)
         S[far] *= [1, 1, -1]
         return S, residual, visible
@@ -131,9 +132,10 @@ def test_a_rival_of_another_object_is_none(frames: Split, good: Model) -> None:
     ("change", "worse"),
     [
         ({}, []),
-        ({"residual": 0.051}, ["misfit"]),
+        ({"residual": 0.051}, []),  # alike
+        ({"residual": 0.053}, ["misfit"]),
         ({"residual": 0.04, "bone_variation": 0.049}, []),
-        ({"residual": 0.04, "bone_variation": 0.051}, ["misfit"]),
+        ({"residual": 0.04, "bone_variation": 0.053}, ["misfit"]),
         ({"residual": 0.0, "bone_variation": 0.11}, ["bone_variation", "misfit"]),
         ({"mirrored_share": 0.01}, ["mirrored_share"]),
         ({"mirrored_share": math.nan, "front_disagreement": math.nan}, []),
@@ -141,6 +143,10 @@ def test_a_rival_of_another_object_is_none(frames: Split, good: Model) -> None:
         ({"front_disagreement": 0.2, "opposed": 0.3}, ["front_disagreement"]),
         ({"residual": 0.01, "opposed": 0.06}, ["opposed"]),
         ({"residual": 0.09, "opposed": 0.3, "bone_variation": 0.01}, []),  # the other is folded
+        ({"residual": 0.01, "opposed": 0.04}, []),
+        ({"residual": 0.01, "turned": 0.006}, ["turned"]),  # no frame of a start should be
+        ({"residual": 0.01, "turned": 0.004}, []),
+        ({"residual": 0.01, "turned": 0.006, "bone_variation": 0.01}, ["turned"]),
         ({"side_difference": 9.0, "flatness": 0.0, "difference": 9.0}, []),
     ],
 )
@@ -154,6 +160,28 @@ def test_the_mirror_image_of_a_mirrored_model_is_no_fault() -> None:
     assert worse_figures(GOOD._replace(opposed=0.95), GOOD) == ["opposed"]
     assert worse_figures(GOOD._replace(mirrored_share=0.2), None) == ["mirrored_share"]
     assert worse_figures(GOOD._replace(mirrored_share=0.04), None) == []
+
+
+def test_few_opposed_frames_do_not_change_the_order() -> None:
+    assert rank(GOOD._replace(opposed=0.04), GOOD) == rank(GOOD._replace(), GOOD)
+    assert rank(GOOD._replace(opposed=0.06), GOOD) > rank(GOOD._replace(), GOOD)
+
+
+def test_models_that_are_better_come_before_the_one_at_hand() -> None:
+    assert rank(GOOD._replace(residual=0.051), GOOD) < rank(GOOD, GOOD)
+    assert rank(GOOD._replace(residual=0.053), GOOD) > rank(GOOD, GOOD)
+
+
+def test_frames_that_a_training_has_turned_are_seen_beside_its_start_alone(
+    frames: Split, good: Model
+) -> None:
+    tuned = dataclasses.replace(good, provenance=good.provenance | {"from": {"model": "good"}})
+    court, other = Judge(frames), dataclasses.replace(good, name="other")
+    assert court.figures(tuned, good).turned == 0
+    mirrored = dataclasses.replace(good, object_frame=-good.object_frame, name="good")
+    assert court.figures(tuned, mirrored).turned == 1
+    assert math.isnan(court.figures(tuned, other).turned)
+    assert math.isnan(court.figures(good, good).turned)
 
 
 def test_standings_have_the_best_first_and_doubtful_ones_last(
