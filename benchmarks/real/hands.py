@@ -29,7 +29,7 @@ from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
-from deep_nrsfm_ros.nrsfm.recipe import PRESETS
+from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights
 
 Float32 = NDArray[np.float32]
 
@@ -159,16 +159,22 @@ def rigid_errors(hand: Labelled) -> dict[str, float]:
     return _shown(shapes, hand)
 
 
-def train(folder: Path, collections: Sequence[str], steps: int, seed: int) -> tuple[Model, float]:
+def train(
+    folder: Path, collections: Sequence[str], steps: int, seed: int, handedness_weight: float
+) -> tuple[Model, float]:
     """Return a model of right hands of some collections, and the seconds that it took."""
+    from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
     from deep_nrsfm_ros.training.finish import finish
+    from deep_nrsfm_ros.training.loop import Setup
     from deep_nrsfm_ros.training.loop import train as run
 
     began = time.process_time()
     points = np.concatenate([collection(folder, name) for name in collections])
     default = PRESETS["default"]
     recipe = dataclasses.replace(default.recipe, steps=steps, seed=seed)
-    trainer = run(points, np.ones(points.shape[:2], bool), default._replace(recipe=recipe))
+    weights, visible = LayoutLossWeights(0.0, handedness_weight), np.ones(points.shape[:2], bool)
+    loss = LayoutLoss(weights, preset("hand21")) if handedness_weight else None
+    trainer = run(points, visible, default._replace(recipe=recipe), Setup(layout_loss=loss))
     source = f"hands detected by MediaPipe and OpenPose: {', '.join(collections)}"
     model = finish(trainer, "hand21", preset("hand21"), source)
     return model, time.process_time() - began
@@ -202,6 +208,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--model", help="name or file of a model, instead of a training")
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--handedness-weight", type=float, default=1.0, help="of the layout's front; 0: off"
+    )
     args = parser.parse_args(argv)
 
     def tables() -> list[Table]:
@@ -209,7 +218,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             path = Path(args.model)
             row = (args.model, 0.0, load_model(path if path.suffix == MODEL_SUFFIX else args.model))
         else:
-            model, seconds = train(args.data, args.collections, args.steps, args.seed)
+            model, seconds = train(
+                args.data, args.collections, args.steps, args.seed, args.handedness_weight
+            )
             save_model(args.output / f"hand21{MODEL_SUFFIX}", model)
             row = (", ".join(args.collections), seconds / 60, model)
         return [benchmark([row], labelled(args.data))]
