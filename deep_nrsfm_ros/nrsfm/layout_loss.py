@@ -34,14 +34,23 @@ class LayoutLoss:
         weights: of the terms; at least one is not zero.
     """
 
-    def __init__(self, weights: LayoutLossWeights, layout: KeypointLayout) -> None:
+    def __init__(
+        self, weights: LayoutLossWeights, layout: KeypointLayout, *, mirrored_axes: bool = False
+    ) -> None:
         """Take edges, their partners on the other side and the handedness from the layout.
+
+        Args:
+            weights: of the terms.
+            layout: of the shapes.
+            mirrored_axes: whether the network's axes are a reflection of the object's, as they may
+                be in a model that a training starts from.
 
         Raises:
             ValueError: a weight is set, and the layout has nothing for its term.
         """
         weights.check(layout)
         self.weights = weights
+        self._side = -1.0 if mirrored_axes else 1.0  # of the plane on which the front belongs
         p, edges = len(layout), layout.edge_indices()
         partners = layout.partners() or range(p)
         places = {frozenset(edge): i for i, edge in enumerate(edges)}
@@ -78,7 +87,7 @@ class LayoutLoss:
         """Return by how much keypoints fail to be in front, in RMS radii; `handedness.votes`."""
         left, up, front = _product(S, self._corners).chunk(3, -1)  # (b, 3, votes), from the right
         normal = torch.linalg.cross(left, up, dim=1)
-        heights = (front * normal).sum(1) / normal.norm(dim=1).clamp(min=1e-6)
+        heights = self._side * (front * normal).sum(1) / normal.norm(dim=1).clamp(min=1e-6)
         X = S - S.mean(1, keepdim=True)
         radius = (X * X).sum(-1).mean(1, keepdim=True).add(1e-12).sqrt()
         return torch.relu(_FRONT_MARGIN - heights / radius).mean()

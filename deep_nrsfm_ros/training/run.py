@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 from safetensors import SafetensorError
 
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -171,7 +172,8 @@ def _train(
 ) -> Trainer:
     """Return the trainer after the training loop; this process has left its group then."""
     weights = config.layout_loss
-    start = start_from(load_once(Path(config.start)), dataset.layout) if config.start else None
+    origin = load_once(Path(config.start)) if config.start else None
+    start = start_from(origin, dataset.layout) if origin else None
     weights.check(dataset.layout, COMMAND_LINE)
     import torch  # takes seconds; a wrong configuration is refused without it
 
@@ -180,6 +182,10 @@ def _train(
 
     if config.output.threads:
         torch.set_num_threads(config.output.threads)
+    loss = None
+    if weights != LayoutLossWeights():
+        is_mirrored = origin is not None and bool(np.linalg.det(origin.object_frame) < 0)
+        loss = LayoutLoss(weights, dataset.layout, mirrored_axes=is_mirrored)
     group = join()
     trainer = train(
         dataset.points,
@@ -187,7 +193,7 @@ def _train(
         config.preset,
         Setup(
             start,
-            LayoutLoss(weights, dataset.layout) if weights != LayoutLossWeights() else None,
+            loss,
             config.limits,
             group,
             own_frames=not config.data.cmu,

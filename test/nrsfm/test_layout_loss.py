@@ -127,6 +127,15 @@ def test_a_sound_body_costs_nothing_and_its_mirror_image_does() -> None:
     assert bones(one_leg_long) > 0.01 and front(one_leg_long) == 0
 
 
+def test_axes_that_are_mirrored_have_the_front_on_the_other_side() -> None:
+    weights, M, S = LayoutLossWeights(handedness_weight=1.0), cameras(0), shapes(0)
+    plain = LayoutLoss(weights, ANIMAL)
+    mirrored = LayoutLoss(weights, ANIMAL, mirrored_axes=True)
+    reflection = torch.tensor([1.0, 1.0, -1.0])
+    torch.testing.assert_close(mirrored(S * reflection, M), plain(S, M))
+    assert not torch.isclose(mirrored(S, M), plain(S, M))
+
+
 def test_the_gradient_is_that_of_small_changes() -> None:
     S, M, loss = shapes(0), cameras(0), LayoutLoss(LayoutLossWeights(3.0, 1.0, 0.5), ANIMAL)
     change = torch.from_numpy(np.random.default_rng(1).standard_normal(S.shape))
