@@ -35,9 +35,9 @@ from deep_nrsfm_ros.node import lifter
 from deep_nrsfm_ros.node.bodies import BodyPublishers
 
 PEOPLE, RATE = 5, 30.0
-SWITCHED_OFF, SILENT, OWN, ALL = (
+SWITCHED_OFF, SILENT, OWN, ALL, UNLIMITED = (
     *("without the code for joints", "nobody listens"),
-    *("~/joints, ~/joint_states, ~/tracks", "all of it"),
+    *("~/joints, ~/joint_states, ~/tracks", "all of it", "all of it, no limit"),
 )
 LEGEND = {
     "us": f"CPU time of all threads of the node for a message of {PEOPLE} people, model human",
@@ -49,7 +49,9 @@ LEGEND = {
     "last us": "the same until the last topic is",
     OWN: "with a subscriber to each, in another process",
     ALL: "these, ~/markers, ~/objects, and joint_states, urdf, position and velocity of each "
-    "person (body.humans); without /tf, whose package is not on PyPI",
+    "person (body.humans), the last two at most ten times a second; without /tf, whose package is "
+    "not on PyPI",
+    UNLIMITED: "the same with body.motion_rate 0: position and velocity with each message",
 }
 _KINDS = {
     "joint_states": JointState,
@@ -57,7 +59,7 @@ _KINDS = {
     "position": PointStamped,
     "velocity": TwistStamped,
 }
-_ALL = "body.humans:=true"
+_SETTINGS = {ALL: ("body.humans:=true",), UNLIMITED: ("body.humans:=true", "body.motion_rate:=0.0")}
 _PAIRS = 4  # rounds of the two first rows, which hardly differ, for each of the others
 
 
@@ -166,7 +168,7 @@ class Lifter:
 
 def measure(rounds: int, calls: int) -> dict[str, Costs]:
     """Return the median costs of a message for each row."""
-    costs: dict[str, list[Costs]] = {name: [] for name in (SWITCHED_OFF, SILENT, OWN, ALL)}
+    costs: dict[str, list[Costs]] = {name: [] for name in (SWITCHED_OFF, SILENT, OWN)}
     off = mock.patch.object(BodyPublishers, "has_subscriber", return_value=False)
     silent = Lifter()
     silent.lift(calls)
@@ -181,15 +183,15 @@ def measure(rounds: int, calls: int) -> dict[str, Costs]:
         for _ in range(rounds):
             costs[OWN].append(silent.lift(calls))
     silent.close()
-    everything = Lifter(_ALL)
-    everything.lift(2)
-    with listener(everything=True):
-        own = [b.angles for bodies in everything.node._bodies._bodies.values() for b in bodies]
-        everything.wait_for((everything.node._markers, *own))
-        everything.lift(calls)
-        for _ in range(rounds):
-            costs[ALL].append(everything.lift(calls))
-    everything.close()
+    for name, settings in _SETTINGS.items():
+        everything = Lifter(*settings)
+        everything.lift(2)
+        with listener(everything=True):
+            own = [b.angles for bodies in everything.node._bodies._bodies.values() for b in bodies]
+            everything.wait_for((everything.node._markers, *own))
+            everything.lift(calls)
+            costs[name] = [everything.lift(calls) for _ in range(rounds)]
+        everything.close()
     return {name: Costs(*np.median(each, 0).tolist()) for name, each in costs.items()}
 
 

@@ -7,6 +7,7 @@ stamp is replaced by the time of receipt, moved to the clock of the topic's othe
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -37,6 +38,33 @@ class Moment(NamedTuple):
     seconds: float
     period: float = 0.0
     restarted: bool = False
+
+
+class RateLimit:
+    """Chooses messages of a topic, at most some a second on average."""
+
+    def __init__(self, rate: float) -> None:
+        """Start with no message chosen.
+
+        Args:
+            rate: in Hz; 0: all messages are chosen.
+        """
+        self._interval = 1 / rate if rate else 0.0
+        self._next = -math.inf
+
+    def is_due(self, moment: Moment) -> bool:
+        """Return whether the message of a moment is chosen.
+
+        A message up to half an interval early is in time: three intervals of a stream of 30 Hz may
+        be a little shorter than 0.1 s. After a gap nothing is made up for, and where time jumps
+        back the choice begins anew.
+        """
+        seconds, step = moment.seconds, self._interval
+        if self._next - 2 * step < seconds < self._next - moment.period / 2:
+            return False
+        is_regular = self._next - step <= seconds <= self._next + step
+        self._next = (self._next if is_regular else seconds) + step
+        return True
 
 
 class TopicClock:

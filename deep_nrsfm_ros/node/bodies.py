@@ -25,7 +25,7 @@ from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.serialised import Header
-from deep_nrsfm_ros.messages.stamps import Moment
+from deep_nrsfm_ros.messages.stamps import Moment, RateLimit
 from deep_nrsfm_ros.node import body_messages, publishing
 from deep_nrsfm_ros.node.message_types import message_class
 
@@ -65,6 +65,14 @@ class BodyOptions:
         "installed",
         read_only=True,
     )
+    motion_rate: float = option(
+        10.0,
+        "most messages a second on the topics position and velocity of each object, in Hz; angles "
+        "go out with each message of keypoints; 0 = with each message, 10 typical",
+        low=0.0,
+        high=1000.0,
+        read_only=True,
+    )
     velocity_time: float = option(
         0.1,
         "time constant in s of the low-pass of velocities, which is their lag (and half an "
@@ -78,15 +86,19 @@ class BodyOptions:
 class _Body:
     """The topics of one object under one prefix, and the lengths of its bones."""
 
-    def __init__(self, node: Node, prefix: str, rename: Callable[[str], str]) -> None:
+    def __init__(
+        self, node: Node, prefix: str, rename: Callable[[str], str], motion_rate: float
+    ) -> None:
         """Create the publishers.
 
         Args:
             node: owns them.
             prefix: of their topics.
             rename: returns the name of a joint or an angle of the layout as the topics have it.
+            motion_rate: most messages a second of position and velocity, in Hz; 0: no limit.
         """
         self.node, self.rename = node, rename
+        self.motion_limit = RateLimit(motion_rate)
         self._names: tuple[str, ...] = ()
         self._titles: tuple[str, ...] = ()
         quiet: Any = {"event_callbacks": publishing.NO_EVENT_CALLBACKS}
@@ -325,7 +337,7 @@ class BodyPublishers:
                     titles = body.titles(tree.angle_names)
                     angles = body_messages.angles(header, titles, pose.angles[i])
                     self._outbox.add(body.angles, angles)
-                if velocities is None:
+                if velocities is None or not body.motion_limit.is_due(scene.moment):
                     continue
                 if body.position.get_subscription_count():
                     position = body_messages.position(header, pose.origins[i, 0])
@@ -349,11 +361,11 @@ class BodyPublishers:
 
     def _create_bodies(self, name: str) -> list[_Body]:
         """Create the topics of an object."""
-        own, bodies = topic_name(name), []
+        own, bodies, rate = topic_name(name), [], self._options.motion_rate
         if self._options.per_object:
-            bodies.append(_Body(self._node, f"~/{own}", str))
+            bodies.append(_Body(self._node, f"~/{own}", str, rate))
         if self._options.humans:
-            bodies.append(_Body(self._node, f"{HUMANS}/{own}", rep155_name(own)))
+            bodies.append(_Body(self._node, f"{HUMANS}/{own}", rep155_name(own), rate))
         return bodies
 
     def forget(self) -> None:

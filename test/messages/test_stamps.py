@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.messages.stamps import TopicClock, one_clock
+from deep_nrsfm_ros.messages.stamps import Moment, RateLimit, TopicClock, one_clock
 
 SECOND = 1_000_000_000
 WALL = 1_700_000_000 * SECOND
@@ -125,3 +125,24 @@ def test_a_topic_that_never_has_stamps_is_no_problem() -> None:
     clock = TopicClock()
     assert [clock(0, i * SECOND).seconds for i in range(3)] == [0, 1, 2]
     assert not clock.warning
+
+
+@pytest.mark.parametrize(("hertz", "rate", "expected"), [(30, 10, 101), (25, 10, 101), (5, 10, 51)])
+def test_a_rate_limit_keeps_the_rate_on_average(hertz: int, rate: int, expected: int) -> None:
+    """Stamps jitter by a millisecond, as a camera's do."""
+    noise = np.random.default_rng(0).uniform(-0.001, 0.001, 10 * hertz + 1)
+    limit = RateLimit(rate)
+    due = [limit.is_due(Moment(i / hertz + x, 1 / hertz)) for i, x in enumerate(noise)]
+    assert due[0] and abs(sum(due) - expected) <= 1
+
+
+def test_a_rate_limit_of_zero_chooses_all_messages() -> None:
+    limit = RateLimit(0)
+    assert all(limit.is_due(Moment(second)) for second in (1.0, 1.0, 1.001, 0.5, 7.0))
+
+
+@pytest.mark.parametrize("second", [100.0, 0.0])
+def test_after_a_jump_of_time_a_message_is_due_and_the_next_is_not(second: float) -> None:
+    limit = RateLimit(10)
+    assert [limit.is_due(Moment(t)) for t in (50.0, 50.04)] == [True, False]
+    assert [limit.is_due(Moment(second + t)) for t in (0.0, 0.04, 0.1)] == [True, False, True]
