@@ -37,6 +37,8 @@ SNAPSHOTS = 10
 """Snapshots kept of each training, evenly spaced; the last is its result."""
 CHECKPOINT_SECONDS = 30.0
 """Seconds between checkpoints."""
+WITHOUT_EFFECT = {"optimiser": "adam", "error_scale": 1.0}
+"""Options whose off value is not zero: with these values a training is what it was without them."""
 LIFTING_LEGEND = {
     "network alone": "one pass of the network",
     "back-projected": "one pass, then moved onto the keypoints within the image plane",
@@ -164,13 +166,14 @@ def _mocap(selection: TrialSelection, one_camera: bool) -> Dataset:
 def _hash(dataset: Dataset, preset: Preset) -> str:
     """Return a hash of dataset, preset and version, ten digits.
 
-    Options that are off do not enter, so that a new one keeps the trainings that are there.
+    Options that are off or `WITHOUT_EFFECT` do not enter, so that a new one keeps the trainings
+    that are there.
     """
     options = [
         f"{type(part).__name__}.{name}={value}"
         for part in preset
         for name, value in dataclasses.asdict(part).items()
-        if value
+        if value and WITHOUT_EFFECT.get(name) != value
     ]
     digest = hashlib.sha256(f"{__version__} {options}".encode())
     digest.update(dataset.points.tobytes())

@@ -172,6 +172,24 @@ def test_a_new_option_that_is_off_keeps_the_trainings_that_are_there(
     assert harness._hash(dataset, found[0.5]) != harness._hash(dataset, preset)
 
 
+def test_options_without_effect_keep_the_trainings_that_are_there(
+    dataset: Dataset, preset: Preset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = {
+        scale: preset._replace(recipe=dataclasses.replace(preset.recipe, error_scale=scale))
+        for scale in (1.0, 4.0)
+    }
+    digests = {scale: harness._hash(dataset, changed) for scale, changed in found.items()}
+    assert digests[1.0] != digests[4.0]
+    longer = dataclasses.make_dataclass(
+        "Recipe", [("new", str, "as ever")], bases=(type(preset.recipe),), frozen=True
+    )
+    new = preset._replace(recipe=longer(**dataclasses.asdict(found[1.0].recipe)))
+    assert harness._hash(dataset, new) != digests[1.0]
+    monkeypatch.setitem(harness.WITHOUT_EFFECT, "new", "as ever")
+    assert harness._hash(dataset, new) == digests[1.0]
+
+
 def test_across_gives_both_errors_of_every_test(
     session: Session, dataset: Dataset, preset: Preset
 ) -> None:
