@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -76,10 +76,6 @@ class Dataset:
             sequence = np.searchsorted(starts, np.arange(len(self))[frames], "right")
             starts = np.flatnonzero(np.diff(sequence, prepend=-1))
         return Dataset(points, visible, self.layout, self.source, shapes, starts)
-
-    def as_sequence(self) -> Dataset:
-        """Return the dataset as one sequence, in the order of its frames."""
-        return replace(self, sequence_starts=np.zeros(min(len(self), 1), np.int64))
 
 
 def concatenate(datasets: list[Dataset]) -> Dataset:

@@ -273,6 +273,7 @@ def test_each_frame_is_seen_by_as_many_cameras_as_asked_for(tmp_path: Path) -> N
     dataset = read_trials([motion_file], cameras=3)
     assert dataset.shapes is not None and len(dataset) == 6
     np.testing.assert_array_equal(dataset.shapes[:2], dataset.shapes[4:])
+    assert dataset.sequence_starts.tolist() == [0, 2, 4]
     distances = np.abs(dataset.points[:, None] - dataset.points).max((-2, -1))
     assert (distances[~np.eye(6, dtype=bool)] > 1e-3).all()
 
