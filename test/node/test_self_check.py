@@ -48,11 +48,15 @@ def test_the_layout_is_found(
     lifter = start_lifter(listens=False, **AUTO)
     client = connect()
     with stream(client, *in_layout(LAYOUTS[layout])):
-        status = client.wait_for_health(
-            lambda _, v: int(v["messages lifted"]) > 20 and v["keypoint layout"].startswith(layout)
+        # A busy machine drops some of the first messages, which is a warning of its own.
+        client.wait_for_health(
+            lambda s, v: (
+                s.level == b"\x00"
+                and int(v["messages lifted"]) > 20
+                and v["keypoint layout"].startswith(layout)
+            )
         )
         assert running_layout("lifter", 30, domain) == layout
-    assert status.level == b"\x00", status.message
     assert f"keypoint_layout auto: {layout}" in lifter.log
 
 
