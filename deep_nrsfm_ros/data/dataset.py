@@ -54,7 +54,7 @@ class Dataset:
 
         starts = self.sequence_starts
         if len(starts) and (starts[0] or starts[-1] >= f or (np.diff(starts) <= 0).any()):
-            raise ValueError(f"sequence_starts must ascend from 0, to a frame of the {f}")
+            raise ValueError(f"sequence_starts {starts} must ascend from 0, to a frame of the {f}")
 
     def __len__(self) -> int:
         """Return f, the number of frames."""
@@ -136,7 +136,7 @@ class DatasetBuilder:
         self._starts: list[int] = []
 
     def begin_sequence(self) -> None:
-        """Say that the next object is the first of a recording or a topic of it."""
+        """Mark the next object as the first of a sequence: a recording, or one of its topics."""
         self._starts.append(self.count)
 
     def add_serialised(self, known_format: SerialisedFormat, raw: bytes) -> None:

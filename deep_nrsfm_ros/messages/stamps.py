@@ -41,13 +41,13 @@ class Moment(NamedTuple):
 
 
 class RateLimit:
-    """Chooses messages of a topic, at most some a second on average."""
+    """Chooses which messages of a topic are sent, so that their mean rate has a limit."""
 
     def __init__(self, rate: float) -> None:
         """Start with no message chosen.
 
         Args:
-            rate: in Hz; 0: all messages are chosen.
+            rate: limit in Hz, 10 typical; 0: all messages are chosen.
         """
         self._interval = 1 / rate if rate else 0.0
         self._next = -math.inf

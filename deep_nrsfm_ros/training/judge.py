@@ -87,7 +87,7 @@ IN_WORDS = {
     "mirrored_share": "{:.1%} of its frames are mirrored against their neighbours",
     "front_disagreement": "in {:.1%} of the frames its front is behind",
     "opposed": "it lifts {:.1%} of the frames to the mirror image of the other's",
-    "turned": "it has turned {:.1%} of the frames to the mirror image of those of its start",
+    "turned": "it lifts {:.1%} of the frames to the mirror image of what its start makes of them",
     "bone_variation": "its bones vary by {:.1%} of their lengths",
 }
 """The figures by which the rule decides, in words."""
