@@ -40,11 +40,6 @@ BASELINES: dict[str, Any] = {
     "EM-SfM (Torresani et al.)": em_ppca,
     "EM-SfM, annealed or not by likelihood": em_ppca_by_likelihood,
 }
-# Dai et al., IJCV 2014, and Kumar, WACV 2020 (arXiv 1902.10274): e3D as quoted in the literature.
-PAPER = {
-    "drink": {"Simple (Dai et al.)": 0.0266, "Simple, weighted (Kumar)": 0.0119},
-    "pickup": {"Simple (Dai et al.)": 0.1731, "Simple, weighted (Kumar)": 0.0198},
-}
 AGREED = "factorisations that agree (no truth used)"
 WITHOUT_RANK: dict[str, Any] = {
     AGREED: lambda W: consensus(W).shapes,
@@ -63,8 +58,6 @@ ERRORS = {
     "cameras and mirrored frames",
 }
 _LEGEND = {
-    "paper": "e3D of Dai et al. (IJCV 2014) and Kumar (WACV 2020), quoted from memory of their "
-    "tables, not checked against the text",
     "frames": "few: the network overfits them; all figures are of the training frames",
     AGREED: "what a training of up to 1000 frames teaches its network, by nrsfm/factorisation",
     "K": "chosen by the lowest shape error against the ground truth, which favours the baselines; "
@@ -148,8 +141,6 @@ def benchmark(session: Session) -> Table:
         dataset = sequence.dataset[slice(None, None, session.stride)]
         sequence = sequence._replace(dataset=dataset)
         labels = name, str(len(dataset))
-        for method, printed in PAPER.get(name, {}).items():
-            table.add((*labels, f"paper: {method}"), {"e3D": printed})
         for seed in session.seeds:
             title, preset = f"{name} seed {seed}", session.preset("default", seed, steps=STEPS)
             model = session.trained(title, dataset, preset)
