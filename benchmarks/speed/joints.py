@@ -9,8 +9,8 @@ import subprocess
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -18,6 +18,8 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, TwistStamped
+from rclpy.executors import ExternalShutdownException
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, JointState, MultiDOFJointState, PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
@@ -36,9 +38,9 @@ from deep_nrsfm_ros.node import lifter
 from deep_nrsfm_ros.node.bodies import BodyPublishers
 
 PEOPLE, RATE = 5, 30.0
-SWITCHED_OFF, SILENT, OWN, ALL, UNLIMITED = ROWS = (
-    *("without the code for joints", "nobody listens"),
-    *("~/joints, ~/joint_states, ~/tracks", "all of it", "all of it, no limit"),
+SWITCHED_OFF, SILENT, OWN, ALL, UNLIMITED, RELIABLE = ROWS = (
+    *("without the code for joints", "nobody listens", "~/joints, ~/joint_states, ~/tracks"),
+    *("all of it", "all of it, no limit", "all of it, reliable"),
 )
 LEGEND = {
     "us": f"CPU time of all threads of the node for a message of {PEOPLE} people, model human",
@@ -48,11 +50,14 @@ LEGEND = {
     "points us": "median time from the call with a message until ~/points is handed to the "
     "middleware",
     "last us": "the same until the last topic is",
-    OWN: "with a subscriber to each, in another process",
+    OWN: "with a subscriber to each, in another process; it asks for best effort, as subscribers "
+    "to sensors do",
     ALL: "these, ~/markers, ~/objects, and joint_states, urdf, position and velocity of each "
     "person (body.humans), the last two at most ten times a second; without /tf, whose package is "
     "not on PyPI",
     UNLIMITED: "the same as with body.motion_rate 0: position and velocity with each message",
+    RELIABLE: "with subscribers who ask for reliable messages: the middleware checks that each "
+    "has come",
 }
 _KINDS = {
     "joint_states": JointState,
@@ -61,6 +66,7 @@ _KINDS = {
     "velocity": TwistStamped,
 }
 _ALL = "body.humans:=true"
+_TURNS = 3  # times that the listeners to everything take turns
 _PAIRS = 4  # rounds of the two first rows, which hardly differ, for each of the others
 
 
@@ -80,24 +86,28 @@ def topics(*, everything: bool) -> dict[str, Any]:
     return found
 
 
-def listen(*, everything: bool) -> None:
-    """Subscribe until the process is killed."""
+def listen(row: str) -> None:
+    """Subscribe as a row says until the process is terminated."""
     rclpy.init()
     node = rclpy.create_node("listener")
-    for topic, kind in topics(everything=everything).items():
-        node.create_subscription(kind, topic, lambda raw: None, 10, raw=True)
-    rclpy.spin(node)
+    reliability = ReliabilityPolicy.RELIABLE if row == RELIABLE else ReliabilityPolicy.BEST_EFFORT
+    quality = QoSProfile(depth=10, reliability=reliability)
+    for topic, kind in topics(everything=row != OWN).items():
+        node.create_subscription(kind, topic, lambda raw: None, quality, raw=True)
+    with suppress(ExternalShutdownException):
+        rclpy.spin(node)
+    node.destroy_node()  # else publishers would wait for this subscriber's lease to end
 
 
 @contextmanager
-def listener(*, everything: bool) -> Iterator[None]:
+def listener(row: str) -> Iterator[None]:
     """Run `listen` in a process of its own."""
-    word = "--listen-to-all" if everything else "--listen"
-    process = subprocess.Popen([sys.executable, "-m", "benchmarks.speed.joints", word])
+    words = (sys.executable, "-m", "benchmarks.speed.joints", "--listen", row)
+    process = subprocess.Popen(words)
     try:
         yield
     finally:
-        process.kill()
+        process.terminate()
         process.wait()
 
 
@@ -154,10 +164,19 @@ class Lifter:
 
     def wait_for(self, publishers: Sequence[Any], seconds: float = 60.0) -> None:
         """Wait until all publishers have a subscriber."""
+        counts = [publisher.get_subscription_count for publisher in publishers]
+        self._wait(lambda: all(count() for count in counts), "no subscriber", seconds)
+
+    def wait_for_silence(self, publisher: Any, seconds: float = 60.0) -> None:
+        """Wait until a publisher has no subscriber."""
+        self._wait(lambda: not publisher.get_subscription_count(), "a subscriber", seconds)
+
+    def _wait(self, reached: Callable[[], bool], obstacle: str, seconds: float) -> None:
+        """Wait until something is reached."""
         end = time.monotonic() + seconds
-        while not all(publisher.get_subscription_count() for publisher in publishers):
+        while not reached():
             if time.monotonic() > end:
-                raise TimeoutError("no subscriber")
+                raise TimeoutError(obstacle)
             time.sleep(0.05)
 
     def close(self) -> None:
@@ -178,7 +197,7 @@ def measure(rounds: int, calls: int) -> dict[str, Costs]:
             costs[SWITCHED_OFF].append(silent.lift(calls))
         costs[SILENT].append(silent.lift(calls))
     bodies = silent.node._bodies
-    with listener(everything=False):
+    with listener(OWN):
         silent.wait_for((silent.node._points, bodies._joints, bodies._angles, bodies._tracks))
         silent.lift(calls)
         for _ in range(rounds):
@@ -187,14 +206,18 @@ def measure(rounds: int, calls: int) -> dict[str, Costs]:
     everything = Lifter(_ALL)
     everything.lift(2)
     no_limit = mock.patch.object(RateLimit, "is_due", return_value=True)
-    with listener(everything=True):
-        own = [b.angles for bodies in everything.node._bodies._bodies.values() for b in bodies]
-        everything.wait_for((everything.node._markers, *own))
-        everything.lift(calls)
-        for _ in range(2 * rounds):
-            costs[ALL].append(everything.lift(calls))
-            with no_limit:
-                costs[UNLIMITED].append(everything.lift(calls))
+    own = [b.angles for bodies in everything.node._bodies._bodies.values() for b in bodies]
+    for _ in range(_TURNS):
+        for row in (ALL, RELIABLE):
+            with listener(row):
+                everything.wait_for((everything.node._markers, *own))
+                everything.lift(calls)
+                for _ in range(-(-rounds // _TURNS)):
+                    costs[row].append(everything.lift(calls))
+                    if row == ALL:
+                        with no_limit:
+                            costs[UNLIMITED].append(everything.lift(calls))
+            everything.wait_for_silence(everything.node._markers)
     everything.close()
     return {name: Costs(*np.median(each, 0).tolist()) for name, each in costs.items()}
 
@@ -219,11 +242,10 @@ def benchmark(args: Namespace) -> Iterator[Table]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = speed_parser(__doc__)
-    parser.add_argument("--listen", action="store_true", help="be the listener")
-    parser.add_argument("--listen-to-all", action="store_true", help="be the listener to all")
+    parser.add_argument("--listen", choices=(OWN, ALL, RELIABLE), help="be the listener of a row")
     args = parser.parse_args(argv)
-    if args.listen or args.listen_to_all:
-        listen(everything=args.listen_to_all)
+    if args.listen:
+        listen(args.listen)
     else:
         print_and_write(benchmark(args), args.output)
 
