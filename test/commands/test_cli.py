@@ -11,16 +11,14 @@ import pytest
 
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.commands import cli, program
+from test.fixtures.forked_python import NODE, run_forked
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
-def run(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *words], capture_output=True, text=True)
-
-
 def test_help_lists_every_program_with_a_line() -> None:
-    done = run("-m", "deep_nrsfm_ros", "--help")
+    command = [sys.executable, "-m", "deep_nrsfm_ros", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.startswith("usage: python -m deep_nrsfm_ros ")
     lines = [line.split() for line in done.stdout.splitlines()]
     for name, text in cli.PROGRAMS.items():
@@ -38,7 +36,7 @@ def test_a_program_says_how_it_was_called(name: str) -> None:
         ("-m", f"deep_nrsfm_ros.commands.{name}"): f"python -m deep_nrsfm_ros.commands.{name}",
         (str(SCRIPTS / name),): name,
     }.items():
-        done = run(*words, "--help")
+        done = run_forked([*words, "--help"], NODE)
         assert done.returncode == 0, done.stderr
         assert done.stdout.startswith(f"usage: {called} ")
 
@@ -72,5 +70,5 @@ def test_only_the_module_of_the_program_is_imported() -> None:
         "loaded = {m.rpartition('.')[2] for m in sys.modules if '.commands.' in m}\n"
         "assert loaded == {'cli', 'program', 'models'}, loaded"
     )
-    done = run("-c", code)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import subprocess
-import sys
 import urllib.request
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import deep_nrsfm_ros
 from deep_nrsfm_ros.commands.replay import live_layout, main
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.detections import Detections, stamps_at
@@ -25,6 +22,7 @@ from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras
+from test.fixtures.forked_python import NODE, ForkedPython
 
 
 @pytest.fixture
@@ -124,17 +122,8 @@ def test_the_layout_of_a_running_lifter(capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_a_recording_is_served_until_ctrl_c(answered: Path) -> None:
-    process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "deep_nrsfm_ros.commands.replay"),
-            *(str(answered), "--serve", "--port", "0"),
-        ],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(Path(deep_nrsfm_ros.__file__).parents[1])},
-        # A shell starts what runs in the background with Ctrl-C ignored.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    words = ("-m", "deep_nrsfm_ros.commands.replay", answered, "--serve", "--port", "0")
+    process = ForkedPython(words, NODE, stdout=subprocess.PIPE)
     try:
         assert process.stdout
         address = process.stdout.readline().split()[0]

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import deep_nrsfm_ros
 from deep_nrsfm_ros.commands import train
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -29,6 +26,7 @@ from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training import run
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.trainer import Trainer
+from test.fixtures.forked_python import TRAINING, ForkedPython
 from test.fixtures.training_program import RunTraining
 
 DEADLINE = 90.0
@@ -70,14 +68,8 @@ def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
     def run(*words: str, launcher: tuple[str, ...] = ()) -> subprocess.Popen[str]:
         command = (*launcher, "-m", "deep_nrsfm_ros.commands.train", *words, "--json-progress")
-        process = subprocess.Popen(
-            [sys.executable, *command],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"PYTHONPATH": str(Path(deep_nrsfm_ros.__file__).parents[1])},
-        )
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        process = ForkedPython(command, TRAINING, **pipes)
         started.append(process)
         return process
 

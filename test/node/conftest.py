@@ -28,7 +28,6 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-import deep_nrsfm_ros
 from deep_nrsfm_ros.commands.demo import domain as domains
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -37,6 +36,7 @@ from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from test.fixtures.forked_python import NODE, ROOT, ForkedPython
 
 DEADLINE = float(os.environ.get("DEADLINE", "60"))  # seconds; a busy machine may want more
 PROMPT_DISCOVERY = Path(__file__).parents[2] / "config" / "prompt_discovery.xml"
@@ -107,18 +107,25 @@ def models(tmp_path: Path) -> Path:
 class LifterProcess:
     """A lifter that runs, its log in a file."""
 
-    def __init__(self, program: list[str], parameters: dict[str, Any], folder: Path) -> None:
+    def __init__(
+        self, program: list[str], parameters: dict[str, Any], folder: Path, fork: bool
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         settings = folder / "parameters.yaml"
         settings.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
         self._log = folder / "log"
+        words = [*program, "--ros-args", "--params-file", str(settings)]
         with self._log.open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, *program, "--ros-args", "--params-file", str(settings)],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                env=os.environ | {"PYTHONPATH": str(Path(deep_nrsfm_ros.__file__).parents[1])},
+            given: dict[str, Any] = {
+                "stdout": log,
+                "stderr": subprocess.STDOUT,
+                "start_new_session": True,
+                "env": os.environ | {"PYTHONPATH": str(ROOT)},
+            }
+            self.process = (
+                ForkedPython(words, NODE, **given)
+                if fork
+                else subprocess.Popen([sys.executable, *words], text=True, **given)
             )
 
     @property
@@ -153,23 +160,27 @@ class LifterProcess:
 
 
 StartLifter = Callable[..., LifterProcess]
-"""Starts a lifter: start(program, listens, **parameters), see `start_lifter`."""
+"""Starts a lifter: start(program, listens, fork, **parameters), see `lifters`."""
 
 
 @contextmanager
 def lifters(models: Path, folder: Path) -> Iterator[StartLifter]:
-    """Start lifters with the model `person` and the parameters given; each must end cleanly."""
+    """Start lifters with the model `person` and the parameters given; each must end cleanly.
+
+    `fork=False` starts Python, for tests of the imports of a start.
+    """
     started: list[LifterProcess] = []
 
     def start(
         program: tuple[str, ...] = ("-m", "deep_nrsfm_ros.node.lifter"),
         listens: bool = True,
+        fork: bool = True,
         **parameters: Any,
     ) -> LifterProcess:
         folders = {"models_dir": str(models), "bags_dir": str(folder)}
         usual = {"model": "person", "input_type": POINT_CLOUD}
         parameters = usual | folders | parameters
-        lifter = LifterProcess([*program], parameters, folder / f"lifter{len(started)}")
+        lifter = LifterProcess([*program], parameters, folder / f"lifter{len(started)}", fork)
         started.append(lifter)
         if listens:
             lifter.wait_for_log("subscribed to")

@@ -4,10 +4,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,6 +34,7 @@ from deep_nrsfm_ros.node.serialised_template import (
     text_mark,
 )
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
+from test.fixtures.forked_python import NODE, ForkedPython
 from test.fixtures.standing_person import (
     keypoints_of,
     random_angles,
@@ -261,9 +259,7 @@ def test_the_example_shows_an_elbow(client: Client, tmp_path: Path) -> None:
     assert len([line for line in source if line.strip()]) <= 20
     shown = tmp_path / "shown"
     with shown.open("w") as output:
-        process = subprocess.Popen(
-            [sys.executable, EXAMPLES / "elbow_angle.py"], stdout=output, env=os.environ
-        )
+        process = ForkedPython([EXAMPLES / "elbow_angle.py"], NODE, stdout=output)
         try:
             message, _ = keypoints()
             publisher = client.publisher(PointCloud2)

@@ -77,7 +77,7 @@ def catches_signals(pid: int) -> bool:
 def test_a_signal_at_any_moment_of_the_start_ends_it_with_code_0(start_lifter: StartLifter) -> None:
     moments = random.Random(0)
     for i in range(MANY):
-        lifter = start_lifter(SCRIPT, listens=False)
+        lifter = start_lifter(SCRIPT, listens=False, fork=False)
         wait_until(lambda pid=lifter.process.pid: catches_signals(pid), "the first lines")
         # In CPU time, so that a busy machine moves no moment.
         moment = lifter.cpu_seconds + (moments.uniform(0, 1.5) if i else 0)

@@ -9,7 +9,6 @@ import random
 import resource
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,15 +17,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-import deep_nrsfm_ros
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training.record import checkpoint_file, read_record, record_file
+from test.fixtures.forked_python import TRAINING, ForkedPython
 from test.fixtures.training_program import RunTraining
 
 DEADLINE = 60.0
-PROGRAM = (sys.executable, "-m", "deep_nrsfm_ros.commands.train", "--json-progress")
+PROGRAM = ("-m", "deep_nrsfm_ros.commands.train", "--json-progress")
 NEW: tuple[str, ...] = ("--bag", "bag", "--keypoint-layout", "coco17", "--batch", "8")
 NEW += ("--widths", "8", "4", "--seeds", "1")
 Said = Callable[..., dict[str, Any]]
@@ -49,14 +48,9 @@ class Folder:
 
     def start(self, *words: str, cwd: Path | None = None) -> subprocess.Popen[str]:
         """Start a training, or one that goes on."""
-        process = subprocess.Popen(
-            [*PROGRAM, *words, *self.common()],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=cwd or "/",
-            env=os.environ | {"PYTHONPATH": str(Path(deep_nrsfm_ros.__file__).parents[1])},
-        )
+        pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+        words = (*PROGRAM, *words, *self.common())
+        process = ForkedPython(words, TRAINING, cwd=cwd or "/", **pipes)
         self.started.append(process)
         return process
 
