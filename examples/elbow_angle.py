@@ -7,6 +7,7 @@ from contextlib import suppress
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 
 
@@ -19,6 +20,6 @@ def show(message: JointState) -> None:
 
 rclpy.init()
 node = Node("elbow_angle")
-node.create_subscription(JointState, "lifter/joint_states", show, 10)
+node.create_subscription(JointState, "lifter/joint_states", show, qos_profile_sensor_data)
 with suppress(KeyboardInterrupt, ExternalShutdownException):
     rclpy.spin(node)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.data.synthetic_furniture import table
 from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import block_matrix
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus, image_scales
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
@@ -58,6 +59,16 @@ def test_few_modes_without_noise_are_found_exactly() -> None:
 def test_one_solution_alone_is_no_agreement() -> None:
     W = np.random.default_rng(0).standard_normal((30, 10, 2))
     assert consensus(W).spread > MAX_SPREAD
+
+
+def test_rounds_come_closer_where_the_first_solutions_disagree() -> None:
+    rng = np.random.default_rng(0)
+    tables = centre(table(rng, 100))
+    W = tables @ random_cameras(100, rng).astype(float)
+    found = consensus(W)
+    before = min(shape_errors(block_matrix(W, K), tables).proper for K in (3, 4))
+    assert shape_errors(found.shapes, tables).proper < 0.5 * before
+    assert 0.02 < found.spread < MAX_SPREAD
 
 
 def test_scales_of_images_are_found_where_they_differ() -> None:

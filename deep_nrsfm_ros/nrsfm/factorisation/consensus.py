@@ -9,8 +9,10 @@
 2. From each of these, EM-PPCA refines cameras and shapes with 3, 5, 8 and 12 modes. Where 2 or 3
    modes leave no noise, the object has no more: the likelier of these two models is the result.
 3. All solutions meet the images after back-projection, so they differ in depth alone. Solutions far
-   from the median are left out. The result is the weighted mean of the others. Where EM-PPCA went
-   elsewhere, the solutions of step 1 count alone, if there are several.
+   from the median are left out. The result is the weighted mean of the others.
+4. Where half or more of the solutions of EM-PPCA are far from the median, its cameras are kept, also those from
+   rigid factorisation, and its shapes are not: the shapes of lowest nuclear norm take their place.
+   In each of three rounds EM-PPCA starts from the mean of these solutions.
 
 The errors of depth of the solutions are partly independent, so that the mean is better than each:
 on pickup, yoga and face_mocap by 15 to 50 %.
@@ -20,7 +22,8 @@ Source: Dai, Li and He (2014); Torresani, Hertzmann and Bregler (2008); the cons
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,9 +34,9 @@ from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import (
     block_rotations,
     least_nuclear_norm,
 )
-from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import fit, from_shapes, shapes_of
+from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import LinearModel, fit, from_shapes, shapes_of
 from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations
-from deep_nrsfm_ros.nrsfm.geometry import back_project, centre, rotation_from_camera
+from deep_nrsfm_ros.nrsfm.geometry import align, back_project, centre, rotation_from_camera
 
 Floats = NDArray[Any]
 
@@ -49,6 +52,8 @@ _SCALE_RANK = 3
 _SAME_SCALE = 0.15  # range of the middle half of the logarithms: 0.09 without differences on pickup
 _LEAST_SCALE = 0.1
 _SAME_NORM = 1.005  # times the lowest nuclear norm: cameras that are kept
+_ROUNDS = 3
+_ALIGNMENTS = 20  # of the shapes to their mean, a round
 _EM_ITERATIONS = 100
 _MORE_ITERATIONS = 300  # where there is no noise: EM converges slowly
 _NO_NOISE = 1e-5  # variance of the noise, relative to that of the images, that is none
@@ -63,7 +68,8 @@ class Consensus(NamedTuple):
         rotations: (f, 3, 3) from object to camera.
         scales: (f,) of the images, 1 where they hardly differ: scale * projected shape = image.
         spread: root mean square difference of depth between the solutions and the result, relative
-            to the size of the images: 0.03 typical, 0.3 no agreement.
+            to the size of the images: 0.03 typical, 0.3 no agreement. With rounds it is that of
+            the solutions before them, which do not know of each other.
         solutions: number of solutions that were averaged.
     """
 
@@ -93,33 +99,96 @@ def consensus(W: Floats, before_each: Callable[[], None] = lambda: None) -> Cons
     scales = image_scales(W)
     W = W / scales[:, None, None]
     starts = _best_starts(W, before_each)
-    exact = _exact(W, before_each)
-    refined = [] if exact else [s for start in starts for s in _refined(W, start, before_each)]
-    starts = exact or starts
+    if exact := _exact(W, before_each):
+        found = _mean(W, exact)
+    else:
+        refined = [s for start in starts for s in _refined(W, start, MODES, before_each)]
+        agreeing = _agreeing(W, starts, refined)
+        found = _mean(W, agreeing) if agreeing else _in_rounds(W, refined, before_each)
+    return Consensus(centre(found.seen @ found.Q), found.Q, scales, found.spread, found.solutions)
+
+
+def _agreeing(W: Floats, starts: list[_Solution], refined: list[_Solution]) -> list[_Solution]:
+    """Return the solutions near the median of the starts; none unless most of EM-PPCA are."""
     solutions = starts + refined
-    depth = np.stack([(item.S @ item.Q.swapaxes(1, 2))[..., 2] for item in solutions])
-    depth *= _signs(depth)[:, None, None]
-    size = W.std()
-    middle = np.median(depth[: len(starts)], 0)
-    distance = np.sqrt(((depth - middle) ** 2).mean((1, 2))) / size
+    depth = _depths(solutions)
+    distance = _distances(depth, np.median(depth[: len(starts)], 0)) / W.std()
     kept = distance < DISAGREEMENT
-    if not exact and kept[len(starts) :].mean() >= 0.5:
-        middle = np.median(depth[kept], 0)
-    elif exact or len(starts) > 1:  # EM went elsewhere each time: no agreement but of the starts
-        kept = np.arange(len(depth)) < len(starts)
-    else:  # Nothing agrees with the only start: the spread of all says so.
-        kept = np.ones(len(depth), bool)
-    depth, solutions = depth[kept], [s for s, good in zip(solutions, kept, strict=True) if good]
+    if kept[len(starts) :].mean() <= 0.5:
+        return []
+    return [s for s, good in zip(solutions, kept, strict=True) if good]
+
+
+def _in_rounds(W: Floats, refined: list[_Solution], before_each: Callable[[], None]) -> _Mean:
+    """Return the mean of solutions for cameras of EM-PPCA, which starts from the mean each time.
+
+    As many modes as points explain half of an image, whatever the cameras: such models are left
+    out, and those of the fewest modes, which explain too little.
+    """
+    modes = [K for K in MODES[1:] if K < W.shape[1]] or list(MODES[:1])
+    several = [s for s, K in zip(refined, itertools.cycle(MODES)) if K in modes]
+    for K in modes:
+        before_each()
+        several.append(_solution(W, fit(W, K, iterations=_EM_ITERATIONS)))
+    found = _mean(W, [_of_least_norm(W, s.Q) for s in several])
+    spread = found.spread
+    for _ in range(_ROUNDS):
+        Q = _aligning(found.seen, found.Q)
+        start = _Solution(Q, found.seen @ Q)
+        several = list(_refined(W, start, modes, before_each))
+        found = _mean(W, [_of_least_norm(W, s.Q) for s in several])
+    return found._replace(spread=spread)
+
+
+class _Mean(NamedTuple):
+    """The weighted mean of solutions.
+
+    Attributes:
+        seen: (f, p, 3) shapes in camera axes.
+        Q: (f, 3, 3) rotations of the solution nearest to the mean.
+        spread: see `Consensus`.
+        solutions: their number.
+    """
+
+    seen: Floats
+    Q: Floats
+    spread: float
+    solutions: int
+
+
+def _mean(W: Floats, solutions: list[_Solution]) -> _Mean:
+    """Return the mean of the solutions; those near it weigh more."""
+    depth = _depths(solutions)
+    middle = np.median(depth, 0)
     for _ in range(5):
-        distance = np.sqrt(((depth - middle) ** 2).mean((1, 2)))
+        distance = _distances(depth, middle)
         weight = 1 / (distance + np.median(distance) + 1e-12)
         middle = np.tensordot(weight / weight.sum(), depth, 1)
-    spread = float(np.sqrt(((depth - middle) ** 2).mean())) / size
+    spread = float(np.sqrt(((depth - middle) ** 2).mean()) / W.std())
     nearest = solutions[int(distance.argmin())]
-    seen = np.concatenate((W, middle[..., None]), 2)
-    mirrored = _signs(np.stack((middle, (nearest.S @ nearest.Q.swapaxes(1, 2))[..., 2])))
-    Q = nearest.Q if mirrored.prod() > 0 else _mirrored(nearest.Q)
-    return Consensus(centre(seen @ Q), Q, scales, spread, len(solutions))
+    mirrored = _signs(np.stack((middle, _depths([nearest])[0]))).prod() < 0
+    Q = _mirrored(nearest.Q) if mirrored else nearest.Q
+    return _Mean(np.concatenate((W, middle[..., None]), 2), Q, spread, len(solutions))
+
+
+def _depths(solutions: list[_Solution]) -> Floats:
+    """Return the depths (n, f, p) of the solutions, with signs that agree best."""
+    depth: Floats = np.stack([(item.S @ item.Q.swapaxes(1, 2))[..., 2] for item in solutions])
+    return depth * _signs(depth)[:, None, None]
+
+
+def _distances(depth: Floats, middle: Floats) -> Floats:
+    """Return the root mean square differences (n,) of depths (n, f, p) from one (f, p)."""
+    distance: Floats = np.sqrt(((depth - middle) ** 2).mean((1, 2)))
+    return distance
+
+
+def _aligning(seen: Floats, Q: Floats) -> Floats:
+    """Return rotations (f, 3, 3), near Q, that turn shapes in camera axes to their mean."""
+    for _ in range(_ALIGNMENTS):
+        mean = (seen @ Q).mean(0)
+        Q = align(np.broadcast_to(mean, seen.shape), seen).rotation.swapaxes(1, 2)
+    return Q
 
 
 def image_scales(W: Floats) -> Floats:
@@ -140,10 +209,14 @@ def _best_starts(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     starts, norms = [], []
     for R in cameras:
         before_each()
-        S = least_nuclear_norm(W, R)
-        starts.append(_meeting(W, rotation_from_camera(R.swapaxes(1, 2)), S))
+        starts.append(_of_least_norm(W, rotation_from_camera(R.swapaxes(1, 2))))
         norms.append(np.linalg.svd(starts[-1].S.reshape(len(W), -1), compute_uv=False).sum())
     return [s for s, norm in zip(starts, norms, strict=True) if norm <= _SAME_NORM * min(norms)]
+
+
+def _of_least_norm(W: Floats, Q: Floats) -> _Solution:
+    """Return the shapes of lowest nuclear norm for rotations Q (f, 3, 3)."""
+    return _meeting(W, Q, least_nuclear_norm(W, Q[:, :2]))
 
 
 def _exact(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
@@ -159,15 +232,21 @@ def _exact(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     if model.variance > _NO_NOISE * float((W**2).mean()):
         return []
     model = fit(W, len(model.basis) - 1, iterations=_MORE_ITERATIONS)
-    return [_meeting(W, model.Q, shapes_of(W, model))]
+    return [_solution(W, model)]
 
 
-def _refined(W: Floats, start: _Solution, before_each: Callable[[], None]) -> Iterator[_Solution]:
+def _refined(
+    W: Floats, start: _Solution, modes: Sequence[int], before_each: Callable[[], None]
+) -> Iterator[_Solution]:
     """Yield the solutions of EM-PPCA with different numbers of modes."""
-    for K in MODES:
+    for K in modes:
         before_each()
-        model = from_shapes(W, start.Q, start.S, K, iterations=_EM_ITERATIONS)
-        yield _meeting(W, model.Q, shapes_of(W, model))
+        yield _solution(W, from_shapes(W, start.Q, start.S, K, iterations=_EM_ITERATIONS))
+
+
+def _solution(W: Floats, model: LinearModel) -> _Solution:
+    """Return the cameras of EM-PPCA and its shapes, which meet the images."""
+    return _meeting(W, model.Q, shapes_of(W, model))
 
 
 def _meeting(W: Floats, Q: Floats, S: Floats) -> _Solution:
