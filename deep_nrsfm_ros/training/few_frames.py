@@ -37,7 +37,10 @@ class _StoppedError(Exception):
 
 
 def factorise(
-    frames: FrameStore, preset: Preset, should_stop: Callable[[], bool] = lambda: False
+    frames: FrameStore,
+    preset: Preset,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_message: Callable[[str], None] = lambda sentence: None,
 ) -> Consensus | None:
     """Return the shapes of the frames by factorisation; None where a network learns them better.
 
@@ -48,6 +51,7 @@ def factorise(
         frames: all frames of the training.
         preset: its recipe says for how many frames to factorise.
         should_stop: called before each factorisation; None is returned once it is True.
+        on_message: called with a sentence before the first.
     """
 
     def check() -> None:
@@ -71,6 +75,7 @@ def factorise(
         points, _ = complete(
             net.from_named_weights(net.architecture, weights), centred * mask, mask
         )
+    on_message(f"factorises the {len(points)} frames first (few_frames): up to some minutes")
     try:
         found = consensus(points, check)
     except _StoppedError:

@@ -70,11 +70,13 @@ class Callbacks:
         on_progress: called every few seconds, and at the end, by the first process.
         should_stop: called before each step (every 16 steps in a group of processes); True ends
             the training.
+        on_message: called with a sentence when work of up to minutes begins before the first step.
     """
 
     on_step: Callable[[Trainer], None] = lambda trainer: None
     on_progress: Callable[[Progress], None] = lambda progress: None
     should_stop: Callable[[], bool] = lambda: False
+    on_message: Callable[[str], None] = lambda sentence: None
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,9 @@ def train(
     if group.rank:
         checkpointing = dataclasses.replace(checkpointing, file=None)
     alone = setup.start is None and group.size == 1
-    known = factorise(part, preset, callbacks.should_stop) if alone else None
+    known = None
+    if alone:
+        known = factorise(part, preset, callbacks.should_stop, callbacks.on_message)
     loop = _Loop(part, preset, setup, callbacks, checkpointing, known)
     file = checkpointing.file
     saved = group.broadcast(read_checkpoint(file) if file is not None and file.exists() else None)

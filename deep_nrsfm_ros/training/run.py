@@ -198,7 +198,7 @@ def _train(
             group,
             own_frames=not config.data.cmu,
         ),
-        Callbacks(on_progress=reporter.training, should_stop=should_stop),
+        Callbacks(on_progress=reporter.training, should_stop=should_stop, on_message=reporter.say),
         Checkpointing(checkpoint),
     )
     group.close()

@@ -62,8 +62,11 @@ def test_where_it_has_no_place_nothing_is_factorised(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(few_frames, "consensus", lambda W, _: agreed(W))
-    assert factorise(store(figure), preset()) is not None
-    assert factorise(store(figure, frames, hidden), preset(**recipe)) is None
+    said: list[str] = []
+    assert factorise(store(figure), preset(), on_message=said.append) is not None
+    none = factorise(store(figure, frames, hidden), preset(**recipe), on_message=said.append)
+    assert none is None
+    assert [f"{FRAMES} frames" in sentence for sentence in said] == [True]  # of the first alone
 
 
 def test_solutions_that_disagree_are_not_believed(

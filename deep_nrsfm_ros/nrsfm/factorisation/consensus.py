@@ -10,9 +10,9 @@
    modes leave no noise, the object has no more: the likelier of these two models is the result.
 3. All solutions meet the images after back-projection, so they differ in depth alone. Solutions far
    from the median are left out. The result is the weighted mean of the others.
-4. Where half or more of the solutions of EM-PPCA are far from the median, its cameras are kept, also those from
-   rigid factorisation, and its shapes are not: the shapes of lowest nuclear norm take their place.
-   In each of three rounds EM-PPCA starts from the mean of these solutions.
+4. Where half or more of the solutions of EM-PPCA are far from the median, its cameras are kept,
+   also those from rigid factorisation, and its shapes are not: the shapes of lowest nuclear norm
+   take their place. In each of three rounds EM-PPCA starts from the mean of these solutions.
 
 The errors of depth of the solutions are partly independent, so that the mean is better than each:
 on pickup, yoga and face_mocap by 15 to 50 %.
