@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +50,13 @@ LEGEND = {
 }
 
 
-def benchmark(session: Session) -> Table:
-    """Return the table of errors with hidden keypoints of the training frames."""
+def benchmark(session: Session, trainings: Sequence[str] = tuple(TRAINED)) -> Table:
+    """Return the table of errors with hidden keypoints of the training frames.
+
+    Args:
+        session: data, subjects and seeds.
+        trainings: the trainings to compare, keys of `TRAINED`.
+    """
     columns = [*map(str, COUNTS), *LIMBS]
     table = Table(
         "missing_keypoints",
@@ -63,7 +70,8 @@ def benchmark(session: Session) -> Table:
         dataset = session.mocap([subject], "train")
         encoded = dataset[slice(None, None, TEST_STRIDE)]
         tests = {column: hide(encoded, column) for column in columns}
-        for trained, recipe in TRAINED.items():
+        for trained in trainings:
+            recipe = TRAINED[trained]
             for seed in session.seeds:
                 preset = session.preset("default", seed, **recipe)
                 name = "masked" if recipe else "default"
@@ -105,7 +113,12 @@ def hide(dataset: Dataset, column: str, seed: int = 0) -> Dataset:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
-    run_program(benchmark, __doc__, SUBJECTS, argv)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--trained", nargs="+", choices=tuple(TRAINED), default=tuple(TRAINED))
+    known, others = parser.parse_known_args(argv)
+    names = ", ".join(map(repr, TRAINED))
+    description = f"{__doc__}\nWith --trained NAME ... these trainings alone: {names}."
+    run_program(partial(benchmark, trainings=known.trained), description, SUBJECTS, others)
 
 
 if __name__ == "__main__":

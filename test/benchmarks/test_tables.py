@@ -137,6 +137,8 @@ def test_recipes_and_protocols_can_be_chosen(data: Path, output: Path) -> None:
     assert ours == {"paper's network, ours, network alone"}
     protocols.main([*options, "--protocols", "trial"])
     assert {row["protocol"] for row in rows(output, "protocols")} == {"a camera a trial, 120 Hz"}
+    missing_keypoints.main([*options[:-1], "--trained", "masked"])
+    assert {row["trained"] for row in rows(output, "missing_keypoints")} == {"masked"}
 
 
 def test_papers_table_is_whole() -> None:
