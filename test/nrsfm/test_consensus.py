@@ -63,8 +63,8 @@ def test_one_solution_alone_is_no_agreement() -> None:
 
 def test_rounds_come_closer_where_the_first_solutions_disagree() -> None:
     rng = np.random.default_rng(0)
-    tables = centre(table(rng, 60))
-    W = tables @ random_cameras(60, rng).astype(float)
+    tables = centre(table(rng, 100))
+    W = tables @ random_cameras(100, rng).astype(float)
     found = consensus(W)
     before = min(shape_errors(block_matrix(W, K), tables).proper for K in (3, 4))
     assert shape_errors(found.shapes, tables).proper < 0.5 * before
