@@ -2,6 +2,7 @@
 """Fixtures that several rooms share, each kind in a file of its own."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,10 @@ import pytest
 # wait for a core spin. It must be set before NumPy or torch is imported.
 for _library in ("OMP", "OPENBLAS"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
+# Hundreds of processes of a run import the package and the tests; none but the first compiles them.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 _LONG = (
     "commands/test_demo.py",

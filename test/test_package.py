@@ -89,8 +89,9 @@ def installed_by_pip(workspace: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture(scope="module")
-def built_by_colcon(workspace: Path) -> Path:
-    """The prefix of the package after `colcon build`."""
+def built_by_colcon(workspace: Path, installed_by_pip: Path) -> Path:
+    """The prefix of the package after `colcon build`, which finds the kernel that pip compiled."""
+    shutil.copytree(workspace / "src" / NAME / "build", workspace / "build" / NAME / "build")
     colcon("build", "--event-handlers", "console_direct+", workspace=workspace)
     return workspace / "install" / NAME
 
