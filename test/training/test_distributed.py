@@ -4,9 +4,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,13 +13,13 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-import deep_nrsfm_ros
 from deep_nrsfm_ros.nrsfm.losses import Batch
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup, join, rank
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.loop import Setup, train
 from deep_nrsfm_ros.training.trainer import Trainer
+from test.fixtures.forked_python import TRAINING, run_forked
 
 WORK = Path(__file__).with_name("processes.py")
 TOLERANCE = 0.1
@@ -46,13 +43,7 @@ def found(figure: Any, tmp_path_factory: pytest.TempPathFactory) -> list[dict[st
     folder = tmp_path_factory.mktemp("processes")
     np.save(folder / "points.npy", figure.points)
     words = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", WORK, folder)
-    subprocess.run(
-        [sys.executable, *map(str, words)],
-        check=True,
-        timeout=150,
-        env=os.environ
-        | {"PYTHONPATH": str(Path(deep_nrsfm_ros.__file__).parents[1]), "OMP_NUM_THREADS": "1"},
-    )
+    run_forked(words, TRAINING).check_returncode()
     assert (folder / "checkpoint").exists()
     return [load_file(folder / f"{i}.safetensors") for i in range(2)]
 
