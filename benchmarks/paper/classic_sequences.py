@@ -66,7 +66,7 @@ ERRORS = {
 }
 _LEGEND = {
     "frames": "few: the network overfits them; all figures are of the training frames",
-    AGREED: "what a training of up to 1000 frames teaches its network, by nrsfm/factorisation",
+    AGREED: "what a training of up to 2000 frames teaches its network, by nrsfm/factorisation",
     "bed, chair, sofa, table, chairs, faces": "every fourth image of table 2. They are of many "
     "objects, so that e3D means nothing",
     "K": "chosen by the lowest shape error against the ground truth, which favours the baselines; "

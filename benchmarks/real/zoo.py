@@ -40,8 +40,6 @@ LAYOUTS = Path(__file__).parents[2] / "config/layouts"
 TRAINING_SHARE = 0.8
 CAMERAS = 5
 """Random cameras of each chair."""
-FEW_FRAMES = 2000
-"""Frames up to which classic factorisations teach the network: more than by default."""
 EXCAVATOR_FRAMES = 6000, 1000
 """For training and for the test."""
 COLUMNS = {
@@ -181,7 +179,7 @@ def trained(thing: Object, name: str, path: Path, steps: int) -> tuple[Model, fl
         model = load_model(path)
         return model, float(model.provenance["cpu_minutes"])
     began, default = time.process_time(), PRESETS["default"]
-    recipe = dataclasses.replace(default.recipe, steps=steps, few_frames=FEW_FRAMES)
+    recipe = dataclasses.replace(default.recipe, steps=steps)
     training = thing.training
     trainer = train(training.points, training.visible, default._replace(recipe=recipe))
     model = finish(trainer, name, training.layout, training.source)

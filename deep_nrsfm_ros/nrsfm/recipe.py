@@ -95,7 +95,7 @@ class Recipe:
         high=100.0,
     )
     few_frames: int = option(
-        1000,
+        2000,
         "frames up to which the known shapes of the cycle loss come from classic factorisations of "
         "all frames, on which a network cannot improve with so few; 0 = never; without effect in "
         "trainings of fewer than 2000 steps, that start from a model, or of several processes",

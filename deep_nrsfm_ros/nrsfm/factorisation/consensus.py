@@ -93,7 +93,7 @@ def consensus(W: Floats, before_each: Callable[[], None] = lambda: None) -> Cons
 
     Args:
         W: (f, p, 2) complete images, x right and y down; at least 4 frames and points.
-        before_each: called before each factorisation, which takes a second or two of 1000 frames;
+        before_each: called before each factorisation, which takes up to half a minute;
             an exception ends the work.
     """
     W = centre(W.astype(np.float64))
