@@ -6,8 +6,8 @@
 1. Cameras come from rigid factorisation and from the block-matrix method with several ranks. The
    shapes of lowest nuclear norm are found for each. Cameras whose norm is within 0.5 % of the
    lowest are kept.
-2. From each of these, EM-PPCA refines cameras and shapes with 3, 5, 8 and 12 modes. Where 2 or 3
-   modes leave no noise, the object has no more: the likelier of these two models is the result.
+2. From each of these, EM-PPCA refines cameras and shapes with 3, 5, 8 and 12 modes. Where 2 to 4
+   modes leave no noise, the object has no more: the likeliest of these models is the result.
 3. All solutions meet the images after back-projection, so they differ in depth alone. Solutions far
    from the median are left out. The result is the weighted mean of the others.
 4. Where half or more of the solutions of EM-PPCA are far from the median, its cameras are kept,
@@ -58,7 +58,7 @@ _EM_ITERATIONS = 100
 _MORE_ITERATIONS = 300  # where there is no noise: EM converges slowly
 _NO_NOISE = 1e-5  # variance of the noise, relative to that of the images, that is none
 _NO_NOISE_AT_LAST = 1e-6  # the same after the last round: furniture 5e-7, dance 1e-5
-_FEW_MODES = 3
+_FEW_MODES = (2, 3, 4)
 
 
 class Consensus(NamedTuple):
@@ -229,19 +229,20 @@ def _of_least_norm(W: Floats, Q: Floats) -> _Solution:
 
 
 def _exact(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
-    """Return the likelier solution of EM-PPCA with 2 and 3 modes, if it leaves no noise.
+    """Return the likeliest solution of EM-PPCA with few modes, if it leaves no noise.
 
-    It starts from rigid factorisation: the least nuclear norm is far from few modes.
+    It starts from rigid factorisation: the least nuclear norm is far from few modes. The runs with
+    and without annealing end apart.
     """
-    models = []
-    for K in (2, _FEW_MODES):
-        before_each()
-        models.append(fit(W, K, iterations=_EM_ITERATIONS))
-    model = min(models, key=lambda model: model.variance)
-    if model.variance > _NO_NOISE * float((W**2).mean()):
+    models = {}
+    for K in _FEW_MODES:
+        for annealed in (False, True):
+            before_each()
+            models[K, annealed] = fit(W, K, annealed=annealed, iterations=_EM_ITERATIONS)
+    K, annealed = min(models, key=lambda settings: models[settings].variance)
+    if models[K, annealed].variance > _NO_NOISE * float((W**2).mean()):
         return []
-    model = fit(W, len(model.basis) - 1, iterations=_MORE_ITERATIONS)
-    return [_solution(W, model)]
+    return [_solution(W, fit(W, K, annealed=annealed, iterations=_MORE_ITERATIONS))]
 
 
 def _models(

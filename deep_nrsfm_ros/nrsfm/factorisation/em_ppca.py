@@ -142,10 +142,10 @@ def _start(Y: Floats, K: int, rng: np.random.Generator | None = None) -> LinearM
     return LinearModel(Q, np.concatenate((mean.T[None], modes)), float((residual**2).mean()))
 
 
-def fit(W: Floats, K: int, *, iterations: int = 300) -> LinearModel:
+def fit(W: Floats, K: int, *, annealed: bool = False, iterations: int = 300) -> LinearModel:
     """Return the model that EM finds for images W (f, p, 2) from rigid factorisation."""
     Y = W.astype(np.float64).swapaxes(1, 2)
-    return _fit(Y, K, annealed=False, mirror_test=False, iterations=iterations)
+    return _fit(Y, K, annealed=annealed, mirror_test=False, iterations=iterations)
 
 
 def from_shapes(W: Floats, Q: Floats, S: Floats, K: int, *, iterations: int) -> LinearModel:
