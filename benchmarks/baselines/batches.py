@@ -30,8 +30,9 @@ LEGEND = {
     "which favours them",
 } | {name: baseline.legend for name, baseline in BASELINES.items() if baseline.legend}
 SPENT = {
-    "CPU min": "CPU time on this machine of the training, or of the baseline on the frames of the "
-    "row with the search for its settings",
+    "CPU min": "CPU time on this machine of the training's steps, without the factorisations that "
+    "teach a training of up to 2000 frames; or of the baseline on the frames of the row with the "
+    "search for its settings",
     "frames": "that the row is measured on; of baselines a random sample, see --batches",
     "ms": "CPU time of a frame in ms, without the search for the settings",
 }

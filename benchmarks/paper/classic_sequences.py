@@ -53,7 +53,8 @@ WITHOUT_RANK: dict[str, Any] = {
     "rigid factorisation (Tomasi-Kanade)": rigid,
 }
 _SPENT = {
-    "CPU min": "CPU time on this machine of the training, or of the method with all K",
+    "CPU min": "CPU time on this machine of the training's steps, without the factorisations that "
+    "teach it; or of the method with all K",
     "ms": "CPU time of a frame in ms, for one K",
 }
 _SHOWN = ("shape %", "proper %", "mirrored %")

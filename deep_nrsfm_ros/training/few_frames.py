@@ -75,7 +75,10 @@ def factorise(
         points, _ = complete(
             net.from_named_weights(net.architecture, weights), centred * mask, mask
         )
-    on_message(f"factorises the {len(points)} frames first (few_frames): up to some minutes")
+    on_message(
+        f"classic factorisations of all {len(points)} frames come first and may take minutes; "
+        "few_frames 0 leaves them out"
+    )
     try:
         found = consensus(points, check)
     except _StoppedError:
