@@ -16,6 +16,8 @@ from deep_nrsfm_ros import KeypointLayout, Lifted, Lifter, Model, Recipe, load_m
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
 from deep_nrsfm_ros.model_files.model_file import ModelFileError, save_model
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
+from deep_nrsfm_ros.training import few_frames
 
 ROOT = Path(__file__).parents[1]
 
@@ -123,7 +125,10 @@ def test_a_model_is_loaded_by_name_by_path_and_from_a_folder(human: Model, tmp_p
         load_model("nobody")
 
 
-def test_an_array_becomes_a_model_that_lifts() -> None:
+def test_an_array_becomes_a_model_that_lifts(monkeypatch: pytest.MonkeyPatch) -> None:
+    disagreed = Consensus(np.zeros((0, 8, 3)), np.zeros((0, 3, 3)), np.ones(0), 1.0, 2)
+    monkeypatch.setattr(few_frames, "MIN_STEPS", 1)
+    monkeypatch.setattr(few_frames, "consensus", lambda W, _: disagreed)
     rng = np.random.default_rng(0)
     shapes = rng.standard_normal((1, 8, 3)) + 0.3 * rng.standard_normal((400, 1, 1)) * (
         rng.standard_normal((1, 8, 3))
@@ -132,6 +137,7 @@ def test_an_array_becomes_a_model_that_lifts() -> None:
     points = 100 * (shapes @ rotations)[..., :2] + 300
     layout = KeypointLayout("thing", tuple("abcdefgh"))
     progress: list[Any] = []
+    messages: list[str] = []
     with pytest.warns(UserWarning, match="'thing' names no handedness"):
         model = train(
             points,
@@ -139,7 +145,9 @@ def test_an_array_becomes_a_model_that_lifts() -> None:
             name="thing",
             recipe=Recipe(steps=30, seeds=1),
             on_progress=progress.append,
+            on_message=messages.append,
         )
+    assert ["factorisations" in message for message in messages] == [True]
     assert model.name == "thing" and model.layout == layout and progress
     assert "rival" not in model.provenance["judgement"]  # no model has such an object
     assert np.isfinite(Lifter(model)(points[:3]).shapes).all()

@@ -38,6 +38,7 @@ def train(
     recipe: Recipe | None = None,
     sequence_starts: Sequence[int] = (),
     on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_message: Callable[[str], None] = lambda sentence: None,
 ) -> Model:
     """Train a model on 2D keypoints and return it; `save_model` writes it to a file.
 
@@ -64,7 +65,9 @@ def train(
         sequence_starts: first frames of the recordings, views or people in the points, the frames
             of each in the order of their time: (0, 500) where 500 frames of one camera come first.
             (0,): one recording. (): unknown, each quarter of the frames counts as a sequence.
-        on_progress: called every few seconds, and at the end.
+        on_progress: called every few seconds from the first step on, and at the end.
+        on_message: called with a sentence when work of up to minutes begins before the first step,
+            such as the factorisations of at most `Recipe.few_frames` frames; `print` shows it.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -101,7 +104,7 @@ def train(
             architecture=origin.network.architecture, normaliser=origin.normaliser
         )
         setup = Setup(start_from(origin, layout))
-    callbacks = Callbacks(on_progress=on_progress)
+    callbacks = Callbacks(on_progress=on_progress, on_message=on_message)
     trainer = run(frames.training.points, frames.training.visible, preset, setup, callbacks)
     model = finish(trainer, name, layout, curated.dataset.source)
     if origin:
