@@ -167,8 +167,11 @@ def _hash(dataset: Dataset, preset: Preset) -> str:
     """Return a hash of dataset, preset and version, ten digits.
 
     Options that are off or `WITHOUT_EFFECT` do not enter, so that a new one keeps the trainings
-    that are there.
+    that are there. Nor does `few_frames` of a dataset with more frames.
     """
+    recipe = preset.recipe
+    if len(dataset) > recipe.few_frames:
+        preset = preset._replace(recipe=dataclasses.replace(recipe, few_frames=0))
     options = [
         f"{type(part).__name__}.{name}={value}"
         for part in preset

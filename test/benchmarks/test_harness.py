@@ -190,6 +190,19 @@ def test_options_without_effect_keep_the_trainings_that_are_there(
     assert harness._hash(dataset, new) == digests[1.0]
 
 
+def test_few_frames_enters_the_name_of_a_training_of_few_frames_only(
+    dataset: Dataset, preset: Preset
+) -> None:
+    few, many = len(dataset) - 1, len(dataset)
+    digests = {
+        limit: harness._hash(
+            dataset, preset._replace(recipe=dataclasses.replace(preset.recipe, few_frames=limit))
+        )
+        for limit in (0, few, many)
+    }
+    assert digests[0] == digests[few] != digests[many]
+
+
 def test_across_gives_both_errors_of_every_test(
     session: Session, dataset: Dataset, preset: Preset
 ) -> None:
