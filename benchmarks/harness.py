@@ -63,6 +63,7 @@ class Session:
     one_camera: bool = False  # for all frames of a trial, not one for each frame
     baselines: tuple[str, ...] | None = None  # words, of which a baseline's name has one; None: all
     error_scale: float | None = None  # instead of that of the presets
+    few_frames: int | None = None  # instead of that of the presets; 0: without factorisations
 
     def mocap(self, subjects: Sequence[str], split: str) -> Dataset:
         """Return the dataset of the trials "train", "held-out" or "all" of CMU subjects."""
@@ -76,6 +77,8 @@ class Session:
             recipe["steps"] = self.steps
         if self.error_scale:
             recipe["error_scale"] = self.error_scale
+        if self.few_frames is not None:
+            recipe["few_frames"] = self.few_frames
         base = PRESETS[name]
         changed = dataclasses.replace(base.recipe, seed=seed, **recipe)
         return base._replace(recipe=with_steps(changed, 0, None))
@@ -256,6 +259,11 @@ def run_program(
     parser.add_argument(
         "--error-scale", type=float, help="of each training (default: the preset's)"
     )
+    parser.add_argument(
+        "--few-frames",
+        type=int,
+        help="frames up to which factorisations teach a training (default: the preset's; 0: none)",
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
@@ -264,5 +272,6 @@ def run_program(
         *(args.steps, args.stride, args.batches),
         baselines=None if args.baselines is None else tuple(args.baselines),
         error_scale=args.error_scale,
+        few_frames=args.few_frames,
     )
     print_tables(lambda: [benchmark(session)], session.output)

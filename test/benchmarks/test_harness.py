@@ -86,6 +86,8 @@ def test_preset_has_seed_steps_and_options(session: Session) -> None:
     assert whole.preset("default", 0).recipe.steps == FROM_RANDOM
     scaled = dataclasses.replace(whole, error_scale=2.0)
     assert scaled.preset("default", 0).recipe.error_scale == 2
+    untaught = dataclasses.replace(whole, few_frames=0)
+    assert untaught.preset("default", 0).recipe.few_frames == 0
 
 
 def test_snapshots_are_those_of_one_uninterrupted_training(
