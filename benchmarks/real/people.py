@@ -208,7 +208,7 @@ def lift_track(lifter: Lifter, track: Track, system: System, *, intrinsics: bool
     seen = to_observation(values, InputOptions().min_confidence)
     to_model = KeypointMap(track.layout, lifter.model.layout)
 
-    lifter = Lifter(lifter.model, lifter.options, history=system.history)
+    lifter = Lifter(lifter.model, lifter.options, layout=track.layout, history=system.history)
     f = len(track.points)
     starts, names = np.arange(f + 1), ["person"] * f
 
@@ -415,8 +415,8 @@ def look_at(lifters: Mapping[str, Lifter], data: Path, output: Path) -> Table:
         shapes: dict[str, Floats] = {}
         own = KeypointMap(people.layout, HUMAN17)(seen.points, seen.confidence)
         for model, lifter in lifters.items():
-            to_model = KeypointMap(people.layout, lifter.model.layout)
-            lifted = lift_all(lifter.lift, *to_model(seen.points, seen.confidence))
+            lifter = Lifter(lifter.model, lifter.options, layout=people.layout)
+            lifted = lifter(seen.points, seen.confidence)
             done = np.isfinite(lifted.residual)
             S = lifted.shapes[:, [lifter.model.layout.index(k) for k in HUMAN17.keypoints]]
             row = {

@@ -326,13 +326,15 @@ def _scene_views(
 ) -> Iterator[Detections]:
     """Yield the views of a scene: points (frames, views, people, joints, 2), truth, K, dist, R, t.
 
-    The detector None has joints by the names of `COCO17`, among others.
+    The detector None has the joints of the scene that are `COCO17`'s too.
     """
     layout = lifter.model.layout
     limbs = np.array([layout.index(joint) for joint in JOINTS])
     with np.load(file) as scene:
         names = [str(name) for name in scene["joint_names"]]
-        to = detector or COCO17
+        shared = tuple(name for name in COCO17.keypoints if name in names)
+        to = detector or KeypointLayout(file.stem, shared)
+        lifter = Lifter(lifter.model, lifter.options, layout=to)
         at = [names.index(name) if name in names else -1 for name in to.keypoints]
         truth_at = [names.index(joint) for joint in JOINTS]
         points, confidence = scene["points"][::stride], scene["confidence"][::stride]

@@ -45,6 +45,8 @@ HIP_SPREAD, TOE_SPREAD = 0.02, 0.015  # m, per axis
 JOINT_SPREAD = 0.03  # of the bone that ends at a joint, along it
 FACE = ((0.02, 0.05), (0.01, 0.04), (0.028, 0.038), (0.0, 0.04), (0.08, 0.13), (0.06, 0.085))
 """Ranges in metres of the numbers of `FaceShape`, in their order."""
+FACE_KEYPOINTS = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")
+"""Keypoints that some detectors lack altogether; the network then sees less of the head's pose."""
 _PARTS = (
     ("root", ("hipjoint",)),
     ("hipjoint", ("femur",)),

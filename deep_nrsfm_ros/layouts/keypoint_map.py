@@ -40,6 +40,7 @@ class KeypointMap:
         source: layout of the input.
         target: layout of the output.
         identical: True if both have the same keypoints in the same order.
+        filled: names of the keypoints of the target that the source has, or that follow from them.
         derivations: pairs (m, 2) of a keypoint of the target and a keypoint that it follows from,
             in the order of the first. A visible keypoint adds no information where all that it
             follows from are visible. The pair (t, t) marks a keypoint that this map computes; it
@@ -68,10 +69,12 @@ class KeypointMap:
             and name in target.derived
             and all(part in sources for part in target.derived[name])
         ]
-        shared = len(direct) + len(self._derived)
-        if shared < _MIN_SHARED:
+        mapped = (*direct, *self._derived)
+        self.filled = tuple(target.keypoints[t] for t, _ in mapped)
+        if len(mapped) < _MIN_SHARED:
             raise ValueError(
-                f"layouts {source.name!r} and {target.name!r} share {shared} keypoints by name; "
+                f"layouts {source.name!r} and {target.name!r} share {len(mapped)} keypoints by "
+                f"name; "
                 f"at least {_MIN_SHARED} are needed. {source.name!r} has "
                 f"{_shown(source.keypoints)}; {target.name!r} has {_shown(target.keypoints)}"
             )

@@ -154,18 +154,43 @@ def error_covariance(lift: Lift, W: Floats, rng: np.random.Generator) -> NDArray
     """
     _, p, _ = W.shape
     all_visible = np.ones(W.shape[:2])
-    covariance = np.eye(3 * p)
+    covariance: Floats = np.eye(3 * p)
     for _ in range(_ROUNDS):
         T = centre(correct(*lift(W), all_visible, ErrorModel(covariance)))
-        Q = random_cameras(len(T), rng)
-        S, M, keypoints = lift(T @ Q)
-        unit = np.linalg.norm(keypoints, axis=(1, 2)) / np.linalg.norm(T @ Q, axis=(1, 2))
-        # Rotate the known shape into the object's axes that the lifted camera M implies.
-        T = unit[:, None, None] * T @ rotation_from_camera(Q).swapaxes(1, 2)
-        E = (T @ rotation_from_camera(M) - S).reshape(len(T), 3 * p).astype(np.float64)
-        covariance = E.T @ E / len(E)
-        covariance += _MIN_VARIANCE * np.trace(covariance) / (3 * p) * np.eye(3 * p)
+        covariance = _second_moment(lift, T, rng)
     return covariance.astype(np.float32)
+
+
+def hidden_covariance(
+    lift: Lift, lift_visible: Lift, W: Floats, covariance: Floats, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Return the second moment (3p, 3p) of a network's errors where keypoints are hidden.
+
+    The shapes that are lifted again come from all keypoints, as those of `error_covariance`.
+
+    Args:
+        lift: the network with its normalisation.
+        lift_visible: the same, from a part of the keypoints.
+        W: (n, p, 2) complete keypoints.
+        covariance: (3p, 3p) as `error_covariance` returns it.
+        rng: draws the random cameras.
+    """
+    T = centre(correct(*lift(W), np.ones(W.shape[:2]), ErrorModel(covariance)))
+    return _second_moment(lift_visible, T, rng).astype(np.float32)
+
+
+def _second_moment(lift: Lift, T: Floats, rng: np.random.Generator) -> Floats:
+    """Return the second moment (3p, 3p) of the errors of lifts of the known shapes T (n, p, 3)."""
+    n, p, _ = T.shape
+    Q = random_cameras(n, rng)
+    S, M, keypoints = lift(T @ Q)
+    unit = np.linalg.norm(keypoints, axis=(1, 2)) / np.linalg.norm(T @ Q, axis=(1, 2))
+    # Rotate the known shape into the object's axes that the lifted camera M implies.
+    T = unit[:, None, None] * T @ rotation_from_camera(Q).swapaxes(1, 2)
+    E = (T @ rotation_from_camera(M) - S).reshape(n, 3 * p).astype(np.float64)
+    covariance = E.T @ E / n
+    covariance += _MIN_VARIANCE * np.trace(covariance) / (3 * p) * np.eye(3 * p)
+    return covariance
 
 
 def bone_lengths(

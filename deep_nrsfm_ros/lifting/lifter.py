@@ -236,13 +236,13 @@ def _constants(
     model: Model, options: LiftingOptions, history: HistoryOptions, to_model: KeypointMap
 ) -> LifterConstants:
     """Return model and options in the form that a backend computes with."""
-    p = len(model.layout)
+    p, error_covariance = len(model.layout), model.covariance_for(to_model.filled)
     angles = 2 * np.pi * np.arange(options.test_time_rotations) / options.test_time_rotations
     c, s = np.cos(angles), np.sin(angles)
     covariance = None
     if options.correction in ("bones", "learned"):
         to_object = np.kron(np.eye(p), model.object_frame)
-        covariance = to_object.T @ model.error_covariance @ to_object
+        covariance = to_object.T @ error_covariance @ to_object
     elif options.correction == "back_projection":
         covariance = np.eye(3 * p)
     pair = model.layout.reference
@@ -256,6 +256,7 @@ def _constants(
         partners=model.layout.partners() if options.mirror else None,
         covariance=covariance,
         bones=bones,
+        # The constants of the confidence were fitted with this covariance.
         error_std=np.sqrt(model.error_covariance.diagonal().reshape(p, 3).sum(1)),
         noise=options.noise,
         refill=options.refill,

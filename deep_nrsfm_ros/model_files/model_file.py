@@ -7,7 +7,7 @@ import dataclasses
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -33,8 +33,14 @@ _FOREIGN = {
     b"version https://git-lfs": "is a pointer of Git LFS; fetch the file with `git lfs pull`",
     b"PK": "is a zip archive (or weights of PyTorch), not a safetensors file; unpack it, or train "
     "a model",
-    b"\x80": "is a pickle, which is never read; train a model",
-    b"<": "is a web page, not a model; download the file itself",
+    **dict.fromkeys(
+        (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"),
+        "is a pickle, which is never read; train a model",
+    ),
+    **dict.fromkeys(
+        (b"<!", b"<html", b"<HTML", b"<?xml"),
+        "is a web page, not a model; download the file itself",
+    ),
 }
 """What a file is that begins with these bytes."""
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -65,6 +71,9 @@ class Model:
         quality: label-free figures, such as `reprojection_error` and `cycle_error`.
         error_covariance: (3p, 3p) covariance of the network's errors, in its own axes (see
             `lifting/correction.py`); the identity if it was not measured.
+        hidden_keypoints: names of keypoints that some detectors never have, as those of the face.
+        hidden_covariance: (3p, 3p) error covariance where the detector has none of
+            `hidden_keypoints`; (0,) if there are no such keypoints.
         bone_lengths: (b, 2) mean and standard deviation of the length of each bone of the
             layout, as shares of the sum of all lengths (see `nrsfm/bones.py`); (0, 2) if they
             were not measured.
@@ -83,12 +92,24 @@ class Model:
     bone_correlation: NDArray[np.float32] = field(
         default_factory=lambda: np.zeros((0, 0), np.float32)
     )
+    hidden_keypoints: tuple[str, ...] = ()
+    hidden_covariance: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def __post_init__(self) -> None:
         """Set the error covariance to the identity if it is empty."""
         if not self.error_covariance.size:
             unknown = np.eye(3 * len(self.layout), dtype=np.float32)
             object.__setattr__(self, "error_covariance", unknown)
+
+    def covariance_for(self, keypoints: Collection[str]) -> NDArray[np.float32]:
+        """Return the error covariance (3p, 3p) for a detector that has these keypoints.
+
+        Args:
+            keypoints: names of keypoints of the layout.
+        """
+        if self.hidden_keypoints and not set(self.hidden_keypoints) & set(keypoints):
+            return self.hidden_covariance
+        return self.error_covariance
 
     @property
     def bones(self) -> Bones | None:
@@ -111,9 +132,12 @@ def save_model(path: Path, model: Model) -> None:
         "object_frame": np.asarray(model.object_frame).tolist(),
         "provenance": model.provenance,
         "quality": model.quality,
+        "hidden_keypoints": list(model.hidden_keypoints),
     }
     weights = {k: np.ascontiguousarray(w, np.float32) for k, w in model.network.named_weights()}
     weights["error_covariance"] = np.ascontiguousarray(model.error_covariance, np.float32)
+    if model.hidden_keypoints:
+        weights["hidden_covariance"] = np.ascontiguousarray(model.hidden_covariance, np.float32)
     if len(model.bone_lengths):
         weights["bone_lengths"] = np.ascontiguousarray(model.bone_lengths, np.float32)
     if model.bone_correlation.size:
@@ -210,6 +234,8 @@ def _foreign(content: bytes) -> str:
     """Return what a file that is no safetensors file is instead; "" if that is not known."""
     if not content:
         return "is empty; copy or download it anew"
+    if content[8:9] == b"{":  # the header of safetensors, after its length, which can be any bytes
+        return ""
     for start, reason in _FOREIGN.items():
         if content.startswith(start):
             return reason
@@ -264,6 +290,11 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
     layout = _layout(header["layout"])
     p = len(layout)
     shapes = weight_shapes(architecture, p) | {"error_covariance": (3 * p, 3 * p)}
+    hidden = _tuples(header.get("hidden_keypoints", []))  # older files have none
+    if not isinstance(hidden, tuple) or any(name not in layout.keypoints for name in hidden):
+        raise ValueError(f"hidden_keypoints are {str(hidden)[:60]}, not keypoints of the layout")
+    if hidden:
+        shapes["hidden_covariance"] = (3 * p, 3 * p)
     if "bone_lengths" in weights:  # older files have none
         b = len(layout.bone_indices())
         shapes["bone_lengths"] = (b, 2)
@@ -283,11 +314,12 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
         raise ValueError("object_frame is not orthonormal (3, 3)")
     if not np.abs(frame @ frame.T - np.eye(3)).max() < 1e-3:
         raise ValueError("object_frame is not orthonormal (3, 3)")
-    covariance = weights["error_covariance"]
-    if not (np.abs(covariance - covariance.T) <= 1e-5 * np.trace(covariance)).all():
-        raise ValueError("error_covariance is not symmetric")
-    if not np.linalg.eigvalsh(covariance)[0] > 0:
-        raise ValueError("error_covariance is not positive definite")
+    for name in {"error_covariance", "hidden_covariance"} & set(shapes):
+        covariance = weights[name]
+        if not (np.abs(covariance - covariance.T) <= 1e-5 * np.trace(covariance)).all():
+            raise ValueError(f"{name} is not symmetric")
+        if not np.linalg.eigvalsh(covariance)[0] > 0:
+            raise ValueError(f"{name} is not positive definite")
     bone_lengths = weights.get("bone_lengths", np.zeros((0, 2), np.float32))
     if not (bone_lengths > _SMALLEST).all():
         raise ValueError(f"bone_lengths are not all above {_SMALLEST:g}")
@@ -307,9 +339,11 @@ def _build(header: dict[str, Any], weights: dict[str, NDArray[np.float32]]) -> M
         frame.astype(np.float32),
         dict(header["provenance"]),
         dict(header["quality"]),
-        covariance,
+        weights["error_covariance"],
         bone_lengths,
         correlation if "bone_lengths" in weights else correlation[:0, :0],
+        hidden,
+        weights["hidden_covariance"] if hidden else np.zeros(0, np.float32),
     )
 
 

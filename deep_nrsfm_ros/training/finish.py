@@ -12,12 +12,20 @@ import torch
 
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.virtual_people import FACE_KEYPOINTS
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.correction import bone_lengths, error_covariance, varied_bones
+from deep_nrsfm_ros.lifting.correction import (
+    bone_lengths,
+    error_covariance,
+    hidden_covariance,
+    varied_bones,
+)
+from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
-from deep_nrsfm_ros.nrsfm.geometry import Floats
+from deep_nrsfm_ros.nrsfm.geometry import Floats, centre
 from deep_nrsfm_ros.nrsfm.handedness import object_frame
 from deep_nrsfm_ros.nrsfm.network import coherence, complete, reconstruct
+from deep_nrsfm_ros.nrsfm.normalisation import normalise
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _MOST_FRAMES = 2048  # on which the object frame, the error covariance and the bones are measured
@@ -54,6 +62,17 @@ def finish(
         encoded = normaliser.encode(W, np.ones_like(W[..., :1]))
         return *reconstruct(net, encoded.W), encoded.W
 
+    def lift_without_face(W: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return what `lift` does, centred, from the keypoints other than those of the face."""
+        visible = np.array([[name not in FACE_KEYPOINTS] for name in layout.keypoints])
+        points, mask = W, np.broadcast_to(visible, (*W.shape[:2], 1)).astype(W.dtype)
+        for _ in range(1 + LiftingOptions().refill):
+            encoded = normalise(net, normaliser, points, mask)
+            S, M = reconstruct(net, encoded.gain * encoded.W)
+            points = np.where(visible, W, normaliser.decode(S @ M, encoded))
+            mask = np.ones_like(mask)
+        return centre(S), M, centre((W - encoded.origin) / encoded.unit)
+
     sample = trainer.sample(min(_MOST_FRAMES, 4 * len(trainer.frames)))
     mask = sample.mask.cpu().numpy()
     W, _ = complete(net, sample.points.cpu().numpy(), mask)
@@ -67,8 +86,15 @@ def finish(
     else:
         lengths = bone_lengths(lift, W, pairs, covariance, rng)
         correlation = np.zeros((0, 0), np.float32)
+    hidden = FACE_KEYPOINTS if set(FACE_KEYPOINTS) <= set(layout.keypoints) else ()
+    without_face = (
+        hidden_covariance(lift, lift_without_face, W, covariance, rng)
+        if hidden
+        else np.zeros(0, np.float32)
+    )
     if people is None and trainer.from_random:
         covariance *= trainer.preset.recipe.error_scale
+        without_face *= trainer.preset.recipe.error_scale
     provenance = _provenance(trainer, source)
     if people is not None:
         provenance["last_step"] = {"data": people.source, "frames": len(people)}
@@ -81,6 +107,8 @@ def finish(
         error_covariance=covariance,
         bone_lengths=lengths,
         bone_correlation=correlation,
+        hidden_keypoints=hidden,
+        hidden_covariance=without_face,
         provenance=provenance,
         quality=_quality(trainer, coherence(net)),
     )

@@ -40,6 +40,8 @@ def test_maps_go_by_name(name: str) -> None:
             np.testing.assert_array_equal(sure[:, t], expected)
         else:  # toes
             assert not sure[:, t].any() and not mapped[:, t].any()
+    filled = {target.keypoints[t] for t in np.flatnonzero(sure.any(0))}
+    assert set(KeypointMap(source, target).filled) == filled
 
 
 def test_a_derived_point_is_missing_with_any_of_its_parts() -> None:

@@ -299,6 +299,22 @@ def test_where_the_model_errs_more_confidence_is_less(figure_model: Model, figur
     assert (doubted[:, 0] < 0.9 * even[:, 0]).all()
 
 
+def test_a_detector_that_lacks_keypoints_has_the_covariance_of_their_absence() -> None:
+    usual = random_model()
+    hidden = 3 * usual.error_covariance
+    model = dataclasses.replace(usual, hidden_keypoints=("nose",), hidden_covariance=hidden)
+    expected = dataclasses.replace(usual, error_covariance=hidden)
+    others = tuple(name for name in HUMAN17.keypoints if name != "nose")
+    points, confidence = pixels()
+    for names, same in ((HUMAN17.keypoints, usual), (others, expected)):
+        at = [HUMAN17.index(name) for name in names]
+        found, alone = (
+            Lifter(m, layout=KeypointLayout("detector", names))(points[:, at], confidence[:, at])
+            for m in (model, same)
+        )
+        np.testing.assert_array_equal(found.shapes, alone.shapes)
+
+
 @pytest.mark.parametrize(
     ("points", "confidence"), [((2, 16, 2), (2, 16)), ((2, 17, 3), (2, 17)), ((2, 17, 2), (1, 17))]
 )

@@ -169,15 +169,45 @@ def test_weights_are_checked(file: Path, weight: str, kind: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "refusal"), [("skew", "not symmetric"), ("indefinite", "not positive definite")]
 )
-def test_the_error_covariance_is_checked(file: Path, kind: str, refusal: str) -> None:
+@pytest.mark.parametrize("name", ["error_covariance", "hidden_covariance"])
+def test_error_covariances_are_checked(file: Path, name: str, kind: str, refusal: str) -> None:
     def change(header: Any, weights: Any, metadata: Any) -> None:
         if kind == "skew":
-            weights["error_covariance"][0, 1] = 0.5
+            weights[name][0, 1] = 0.5
         else:
-            weights["error_covariance"][2, 2] *= -1
+            weights[name][2, 2] *= -1
 
+    save_model(file, with_hidden_nose())
     rewrite(file, change)
-    assert f"error_covariance is {refusal}" in refused(file)
+    assert f"{name} is {refusal}" in refused(file)
+
+
+def with_hidden_nose() -> Model:
+    """Return a model that has a second covariance for detectors without a nose."""
+    covariance = 2 * np.eye(3 * len(HUMAN17), dtype=np.float32)
+    return dataclasses.replace(model(), hidden_keypoints=("nose",), hidden_covariance=covariance)
+
+
+def test_the_covariance_of_hidden_keypoints_is_kept(file: Path) -> None:
+    older = load_model(file)
+    assert older.covariance_for(()) is older.error_covariance
+    save_model(file, with_hidden_nose())
+    loaded = load_model(file)
+    assert loaded.hidden_keypoints == ("nose",)
+    np.testing.assert_array_equal(loaded.covariance_for(("neck",))[0, :2], [2, 0])
+    assert loaded.covariance_for(("neck", "nose")) is loaded.error_covariance
+
+
+@pytest.mark.parametrize("wrong", [["eye"], "nose", [["nose"]], [1], None, {"nose": 1}])
+def test_hidden_keypoints_are_names_of_the_layout(file: Path, wrong: Any) -> None:
+    save_model(file, with_hidden_nose())
+    rewrite(file, lambda header, weights, metadata: header.update(hidden_keypoints=wrong))
+    assert "hidden_keypoints are" in refused(file)
+
+
+def test_hidden_keypoints_without_a_covariance_are_refused(file: Path) -> None:
+    rewrite(file, lambda header, weights, metadata: header.update(hidden_keypoints=["nose"]))
+    assert "lacks 'hidden_covariance'" in refused(file)
 
 
 def test_a_layout_of_before_there_were_rigid_pairs_is_read(file: Path) -> None:

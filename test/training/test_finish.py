@@ -11,8 +11,12 @@ import numpy as np
 
 from deep_nrsfm_ros.commands.evaluate import evaluate
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.virtual_people import FACE_KEYPOINTS
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -47,3 +51,19 @@ def test_a_motion_that_was_not_trained_on_is_lifted_better_for_it(
     model, confident = (model_with(trained, figure, scale) for scale in (4, 1))
     options = LiftingOptions()
     assert evaluate(model, unseen, options).shape < evaluate(confident, unseen, options).shape
+
+
+def test_the_error_covariance_without_a_face_is_that_of_lifts_without_it(
+    trained: Trainer, figure: Any
+) -> None:
+    names = figure.layout.keypoints[: -len(FACE_KEYPOINTS)]
+    layout = dataclasses.replace(figure.layout, keypoints=(*names, *FACE_KEYPOINTS))
+    model = finish(trained, "figure", layout, "test")
+    assert model.hidden_keypoints == FACE_KEYPOINTS
+    usual = dataclasses.replace(model, hidden_keypoints=())
+    blind = KeypointLayout("blind", names)
+    errors = [
+        shape_errors(Lifter(m, layout=blind)(figure.points[:, : len(names)]).shapes, figure.shapes)
+        for m in (usual, model)
+    ]
+    assert errors[1].shape < errors[0].shape
