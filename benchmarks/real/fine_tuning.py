@@ -39,7 +39,7 @@ from deep_nrsfm_ros.data.pose2sim import JOINTS, read_session
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25B, preset
-from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Preset, Recipe
@@ -176,8 +176,7 @@ def errors(model: Model, part: Part) -> tuple[float, float]:
     part = part.rows(slice(None, None, max(len(part.points) // _MOST_FRAMES, 1)))
     if not np.isfinite(part.truth).any():
         return np.nan, np.nan
-    points, confidence = KeypointMap(part.layout, model.layout)(part.points, part.confidence)
-    shapes = lift_all(Lifter(model).lift, points, confidence).shapes
+    shapes = Lifter(model, layout=part.layout)(part.points, part.confidence).shapes
     shapes = shapes[:, [model.layout.index(joint) for joint in part.joints]]
     lifted = np.isfinite(shapes).all((1, 2))  # frames with too few keypoints are not
     found = camera_errors(shapes[lifted], part.truth[lifted])
