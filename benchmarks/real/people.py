@@ -82,6 +82,8 @@ SYSTEMS = {
     "looking ahead": System(HistoryOptions(), ahead=True),
 }
 """The rows of a scene: the parts of lifting over time, alone and together."""
+PARTS = {"face": ("nose", "eye", "ear"), "feet": ("toe", "heel")}
+"""Keypoints that some detectors lack, by the ends of their names."""
 MEDIAPIPE, MEAN_SHAPE = "MediaPipe", "mean shape"
 MEAN_STRIDE = 30
 FIGURES = {
@@ -132,6 +134,20 @@ _LEAST_MOTION = 10.0  # mm, RMS, of people whose lag can be measured
 _PICTURED = 10  # people of a picture
 
 
+class Choice(NamedTuple):
+    """Which people are lifted, by which keypoints.
+
+    Attributes:
+        stride: every n-th trial or sequence only.
+        scenes: names of the scenes; empty: all.
+        without: names of `PARTS` that the detectors lack.
+    """
+
+    stride: int
+    scenes: Sequence[str]
+    without: Sequence[str]
+
+
 class Errors(NamedTuple):
     """Errors of n lifted frames of one view; NaN where a figure does not apply."""
 
@@ -151,8 +167,7 @@ def benchmark(
     systems: Mapping[str, System],
     data: Path,
     output: Path,
-    stride: int,
-    chosen: Sequence[str],
+    choice: Choice,
 ) -> Table:
     """Return the table of errors of each scene and system.
 
@@ -161,8 +176,7 @@ def benchmark(
         systems: name -> how the tracks are lifted.
         data: folder that holds cmu/ and scenes/.
         output: folder of results.
-        stride: every n-th trial or sequence only.
-        chosen: names of the scenes; empty: all.
+        choice: of the scenes and their keypoints.
     """
     table = Table(
         *("people", "People before calibrated cameras", ("scene", "system", "intrinsics")),
@@ -172,7 +186,8 @@ def benchmark(
     capture = read_trials(first, HUMAN17, stride=MEAN_STRIDE)
     assert capture.shapes is not None
     mean = mean_shape(capture.shapes)[[HUMAN17.index(joint) for joint in JOINTS]]
-    for scene, tracks in people_scenes(data, output, stride, chosen):
+    for scene, complete in people_scenes(data, output, choice.stride, choice.scenes):
+        tracks = [without(track, choice.without) for track in complete]
         for intrinsics in (True, False):
             for model, lifter in lifters.items():
                 for name, system in systems.items():
@@ -193,6 +208,18 @@ def benchmark(
         table.add((scene, MEAN_SHAPE, ""), {"PA mm": figures(rigid)["PA mm"]})
         print(scene, "done", file=sys.stderr)
     return table
+
+
+def without(track: Track, parts: Sequence[str]) -> Track:
+    """Return a track as a detector that lacks the keypoints of some `PARTS` sees it."""
+    words = tuple(word for part in parts for word in PARTS[part])
+    names = [name for name in track.layout.keypoints if not name.endswith(words)]
+    if not words or len(names) == len(track.layout):
+        return track
+    at = [track.layout.index(name) for name in names]
+    layout = KeypointLayout(f"{track.layout.name}_part", tuple(names))
+    points, confidence = track.points[:, at], track.confidence[:, at]
+    return track._replace(layout=layout, points=points, confidence=confidence)
 
 
 def lift_track(lifter: Lifter, track: Track, system: System, *, intrinsics: bool) -> Lifted:
@@ -449,6 +476,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--stride", type=int, default=1, help="use every n-th trial or sequence")
     parser.add_argument("--scenes", nargs="+", default=[], help="names of scenes; default: all")
     parser.add_argument(
+        "--without",
+        nargs="+",
+        default=[],
+        choices=PARTS,
+        help="leave out the keypoints of these parts, as a detector that lacks them",
+    )
+    parser.add_argument(
         "--systems", nargs="+", default=list(SYSTEMS), choices=SYSTEMS, help="default: all"
     )
     add_arguments(parser, LiftingOptions)
@@ -459,8 +493,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         files = [find_model(name, model_folders(default_models_dir())) for name in args.models]
         lifters = {file.stem: Lifter(load_model(file), options) for file in files}
         systems = {name: SYSTEMS[name] for name in args.systems}
-        choice = (args.stride, args.scenes)
-        errors = benchmark(lifters, systems, args.data, args.output, *choice)
+        choice = Choice(args.stride, args.scenes, args.without)
+        errors = benchmark(lifters, systems, args.data, args.output, choice)
         return [errors] if args.scenes else [errors, look_at(lifters, args.data, args.output)]
 
     print_tables(tables, args.output)
