@@ -28,7 +28,8 @@ from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_mode
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish
-from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
+from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, Setup, train
+from deep_nrsfm_ros.training.parts import Parts
 from deep_nrsfm_ros.training.progress import Progress
 from deep_nrsfm_ros.training.schedule import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
@@ -64,6 +65,7 @@ class Session:
     baselines: tuple[str, ...] | None = None  # words, of which a baseline's name has one; None: all
     error_scale: float | None = None  # instead of that of the presets
     few_frames: int | None = None  # instead of that of the presets; 0: without factorisations
+    parts: float = 0.0  # share of the known shapes in which limbs are exchanged
 
     def mocap(self, subjects: Sequence[str], split: str) -> Dataset:
         """Return the dataset of the trials "train", "held-out" or "all" of CMU subjects."""
@@ -79,6 +81,7 @@ class Session:
             recipe["error_scale"] = self.error_scale
         if self.few_frames is not None:
             recipe["few_frames"] = self.few_frames
+        recipe["parts"] = self.parts
         base = PRESETS[name]
         changed = dataclasses.replace(base.recipe, seed=seed, **recipe)
         return base._replace(recipe=with_steps(changed, 0, None))
@@ -140,6 +143,7 @@ class Session:
                 dataset.points,
                 dataset.visible,
                 preset,
+                Setup(parts=Parts(dataset.layout) if preset.recipe.parts else None),
                 callbacks=Callbacks(on_step=keep, on_progress=show),
                 checkpointing=Checkpointing(checkpoint, CHECKPOINT_SECONDS),
             )
@@ -264,6 +268,12 @@ def run_program(
         type=int,
         help="frames up to which factorisations teach a training (default: the preset's; 0: none)",
     )
+    parser.add_argument(
+        "--parts",
+        type=float,
+        default=0.0,
+        help="share of the known shapes in which limbs are exchanged, of each training",
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
@@ -273,5 +283,6 @@ def run_program(
         baselines=None if args.baselines is None else tuple(args.baselines),
         error_scale=args.error_scale,
         few_frames=args.few_frames,
+        parts=args.parts,
     )
     print_tables(lambda: [benchmark(session)], session.output)

@@ -94,6 +94,16 @@ class Recipe:
         low=0.01,
         high=100.0,
     )
+    parts: float = option(
+        0.0,
+        "share of the known shapes of the cycle loss in which limbs are exchanged between shapes "
+        "and turned at the joints, at the first step; it falls to 0 by the last step; lifts people "
+        "and motions that the frames do not show better, and those of the frames a little worse; "
+        "a limb is what one edge of the layout joins to the rest; without effect where cycle is 0; "
+        "0 = off, 1 typical",
+        low=0.0,
+        high=1.0,
+    )
     few_frames: int = option(
         2000,
         "frames up to which the known shapes of the cycle loss come from classic factorisations of "

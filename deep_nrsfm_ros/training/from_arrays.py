@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
 from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model, load_once
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
+from deep_nrsfm_ros.training.parts import Parts
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.progress import Progress
@@ -77,12 +79,13 @@ def train(
     require_extra("train", "training")
     from deep_nrsfm_ros.training.finish import finish
     from deep_nrsfm_ros.training.judge import judge
-    from deep_nrsfm_ros.training.loop import DEFAULT_SETUP, Callbacks, Setup
+    from deep_nrsfm_ros.training.loop import Callbacks, Setup
     from deep_nrsfm_ros.training.loop import train as run
 
     check_name("name", name)
     if isinstance(layout, str):
         layout = find_layout("layout", layout)
+    parts = Parts(layout) if recipe and recipe.parts else None
     seen = from_arrays(points, confidence, layout)
     starts = np.array(sequence_starts, np.int64)
     visible = seen.confidence > 0
@@ -98,12 +101,12 @@ def train(
             warnings.warn(warning, stacklevel=2)
     rival = origin or _shipped(layout)
     frames = split(curated.dataset, Curation().held_out if rival else 0.0)
-    preset, setup = PRESETS["default"]._replace(recipe=recipe or Recipe()), DEFAULT_SETUP
+    preset, setup = PRESETS["default"]._replace(recipe=recipe or Recipe()), Setup(parts=parts)
     if origin:
         preset = preset._replace(
             architecture=origin.network.architecture, normaliser=origin.normaliser
         )
-        setup = Setup(start_from(origin, layout))
+        setup = dataclasses.replace(setup, start=start_from(origin, layout))
     callbacks = Callbacks(on_progress=on_progress, on_message=on_message)
     trainer = run(frames.training.points, frames.training.visible, preset, setup, callbacks)
     model = finish(trainer, name, layout, curated.dataset.source)

@@ -32,6 +32,7 @@ from deep_nrsfm_ros.training.few_frames import factorise
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
+from deep_nrsfm_ros.training.parts import Parts
 from deep_nrsfm_ros.training.progress import Clock, Progress
 from deep_nrsfm_ros.training.schedule import has_other_keypoints, with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
@@ -49,6 +50,7 @@ class Setup:
         start: network to begin with, of the preset's architecture (see `fine_tuning`); None
             begins with random networks, of which the screening chooses one.
         layout_loss: loss of the keypoint layout that is added to the recipe's; None is none.
+        parts: the limbs of the keypoint layout, which `Recipe.parts` needs.
         limits: when the training ends before its last step, and which state it keeps.
         group: the processes that share the training.
         own_frames: whether each process has frames of its own; else all have all frames.
@@ -56,6 +58,7 @@ class Setup:
 
     start: Network | None = None
     layout_loss: LayoutLoss | None = None
+    parts: Parts | None = None
     limits: Limits = WHOLE
     group: ProcessGroup = ALONE
     own_frames: bool = False
@@ -251,7 +254,7 @@ class _Loop:
         trainer = Trainer(
             *(self.frames, self.preset, seed, setup.start, setup.group, setup.layout_loss)
         )
-        trainer.known = self.known
+        trainer.known, trainer.parts = self.known, setup.parts
         return trainer
 
     def _advance(self, steps: int, time_budget: float, *, chosen: bool = False) -> None:

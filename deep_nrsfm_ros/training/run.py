@@ -23,6 +23,7 @@ from deep_nrsfm_ros.training.data_check import check_dataset
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
+from deep_nrsfm_ros.training.parts import Parts
 from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data, read_people
 from deep_nrsfm_ros.training.record import checkpoint_file, keep_record
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
@@ -194,8 +195,9 @@ def _train(
         Setup(
             start,
             loss,
-            config.limits,
-            group,
+            limits=config.limits,
+            group=group,
+            parts=Parts(dataset.layout) if config.recipe.parts else None,
             own_frames=not config.data.cmu,
         ),
         Callbacks(on_progress=reporter.training, should_stop=should_stop, on_message=reporter.say),

@@ -26,6 +26,7 @@ from deep_nrsfm_ros.training.gradient_function import (
     weight_vector,
     with_weights,
 )
+from deep_nrsfm_ros.training.parts import Parts
 from deep_nrsfm_ros.training.schedule import learning_rate
 from deep_nrsfm_ros.training.soap import Soap
 
@@ -49,6 +50,7 @@ class Trainer:
         mirrored_share: share of frames with mirrored depth at the end, 0 to 0.5; NaN unknown.
         known: shapes of the frames by factorisation that the network is taught; None: none.
         from_random: whether the training began with random weights.
+        parts: recombines the share `Recipe.parts` of the known shapes; None: none.
         total_frames: frames of all processes.
         cpu_seconds: processor time of this process in steps.
     """
@@ -86,6 +88,7 @@ class Trainer:
         self.mirrored_share = math.nan
         self.known: Consensus | None = None
         self.from_random = start is None
+        self.parts: Parts | None = None
         device = frames.device
         initial = start or initialise(
             architecture,
@@ -132,6 +135,18 @@ class Trainer:
             torch.randint(len(frames), (size,), generator=generator, device=frames.device)
         )
 
+    def known_shapes(self) -> Tensor | None:
+        """Return the known shapes of the next step: those of the last batch, some recombined."""
+        shapes = self.shapes
+        if shapes is None or self.parts is None:
+            return shapes
+        share = self.preset.recipe.parts * max(1 - self.progress, 0.0)
+        count = round(share * len(shapes))
+        rng = np.random.default_rng((self.seed, self.group.rank, self.step))
+        recombined = self.parts.recombine(shapes.cpu().numpy(), count, rng)
+        first = torch.from_numpy(recombined.astype(np.float32)).to(shapes.device)
+        return torch.cat((first, shapes[count:]))
+
     def advance(self) -> None:
         """Take one gradient step."""
         with self.gradient_function.threads():
@@ -140,7 +155,8 @@ class Trainer:
     def _advance(self) -> None:
         began = time.process_time()
         batch = self.sample(self.batch, self.step)
-        losses, gradient = self.gradient_function(self.weights, batch, self.shapes, self.generator)
+        known = self.known_shapes()
+        losses, gradient = self.gradient_function(self.weights, batch, known, self.generator)
         self.shapes = losses.shapes
         if self.group.size > 1:
             gradient = gradient * (self.batch / self.preset.recipe.batch)

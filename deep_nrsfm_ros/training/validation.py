@@ -22,6 +22,7 @@ from deep_nrsfm_ros.model_files.model_file import check_name, load_once
 from deep_nrsfm_ros.training.config import DataConfig, OptionNames, TrainingConfig
 from deep_nrsfm_ros.training.disk import check_room
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
+from deep_nrsfm_ros.training.parts import Parts
 
 _NUMBERED_LAYOUT = KeypointLayout(NUMBERED, ())  # its points are counted when the bags are read
 
@@ -53,6 +54,14 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
     if target != _NUMBERED_LAYOUT:
         KeypointMap(source, target)
     config.layout_loss.check(target, names)
+    if config.recipe.parts:
+        try:
+            Parts(target)
+        except ValueError as error:
+            raise ValueError(
+                f"{names('parts')} is {config.recipe.parts:g}, but {error}; give it edges in "
+                "a layout file, or set it to 0"
+            ) from None
     people = (HUMAN17.keypoints, HUMAN25.keypoints)
     if config.data.virtual_people and target.keypoints not in people:
         raise ValueError(

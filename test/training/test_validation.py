@@ -81,6 +81,11 @@ def test_a_name_that_is_no_plain_file_name_is_refused(config: TrainingConfig, na
             "--bone-length-weight is 1, but layout 'numbered' has no edges",
             "train.bone_length_weight is 1, but layout 'numbered' has no edges",
         ),
+        (
+            {"parts": 1.0, "object": "numbered", "keypoint_layout": ""},
+            "--parts is 1, but layout .numbered. has no limbs: .*; give it edges .*, or set it",
+            "train.parts is 1, but layout 'numbered' has no limbs",
+        ),
         ({"free_disk": 1e9}, r"needs 1000000000 MB \(--free-disk\)", r"\(train.free_disk\)"),
         ({"start": "/gone.safetensors"}, "cannot read model", "cannot read model"),
     ],

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""New shapes of known ones: limbs are exchanged between shapes and turned at the joints.
+
+A limb is what hangs on one side of an edge of the layout. As known shapes of the cycle loss the
+new ones teach a network that limbs move apart from each other, which the poses of its training
+frames may not show. They need no 3D label, since they are made of the network's own shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.body.kinematic_tree import rotation_about
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.nrsfm.geometry import Floats, align, centre
+
+_REACH = 1.5  # edges between the joint and a keypoint that has the weight 1 / e in the alignment
+_TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class PartOptions:
+    """How shapes are recombined.
+
+    Attributes:
+        limbs: limbs of each shape that are exchanged and turned, one after the other.
+        angle: standard deviation of a limb's rotation vector, per axis, in radians.
+        lengths: standard deviation of the logarithm of each edge's length.
+    """
+
+    limbs: int = 3
+    angle: float = 0.35
+    lengths: float = 0.1
+
+
+DEFAULT_PARTS = PartOptions()
+
+
+class Parts:
+    """The limbs of a layout, and shapes recombined of them.
+
+    Attributes:
+        limbs: (e, p) bool, the keypoints on the smaller side of each edge that divides the layout.
+        joints: (e,) the end of each of these edges on its other side.
+    """
+
+    def __init__(self, layout: KeypointLayout, options: PartOptions = DEFAULT_PARTS) -> None:
+        """Find the limbs.
+
+        An edge divides the layout where no other way leads from one of its ends to the other: an
+        upper arm does, an edge of the palm does not.
+
+        Raises:
+            ValueError: no edge divides the layout.
+        """
+        edges, p = layout.edge_indices(), len(layout)
+        limbs, joints, ends = [], [], []
+        for i, (a, b) in enumerate(edges):
+            others = [*edges[:i], *edges[i + 1 :]]
+            near_a, near_b = (np.isfinite(_distances(others, p)[end]) for end in (a, b))
+            if near_a[b]:
+                continue
+            if near_b.sum() > near_a.sum():
+                a, b, near_b = b, a, near_a
+            limbs.append(near_b)
+            joints.append(a)
+            ends.append(b)
+        if not limbs:
+            raise ValueError(
+                f"layout {layout.name!r} has no limbs: none of its {len(edges)} edges divides it"
+            )
+        self.options = options
+        self.limbs: NDArray[np.bool_] = np.array(limbs)
+        self.joints: NDArray[np.intp] = np.array(joints)
+        distance = _distances(edges, p)[self.joints]
+        self._weights = (np.exp(-distance / _REACH) * ~self.limbs)[..., None]
+        self._ends = np.array(ends)
+
+    def recombine(self, S: Floats, count: int, rng: np.random.Generator) -> Floats:
+        """Return shapes that are recombined of the first `count` and of limbs of all.
+
+        A shape takes over the limb of another one, which is scaled to its size and aligned with
+        what surrounds the joint. The limb is turned about the joint, and in the end each edge gets
+        another length.
+
+        Args:
+            S: (b, p, 3) shapes in common axes.
+            count: 0 to b.
+            rng: source of all random numbers.
+
+        Returns:
+            (count, p, 3) centred.
+        """
+        options, X, size = self.options, S[:count], self._size(S)
+        for _ in range(options.limbs):
+            edge, other = (
+                rng.integers(len(self.limbs), size=count),
+                rng.integers(len(S), size=count),
+            )
+            Y = S[other] * (size[:count] / np.maximum(size[other], _TINY))
+            weights = self._weights[edge]
+            weights = weights / weights.sum(1, keepdims=True)
+            near_X, near_Y = ((weights * Z).sum(1, keepdims=True) for Z in (X, Y))
+            Q = align(weights * (Y - near_Y), X - near_X).rotation
+            vector = options.angle * rng.standard_normal((count, 3))
+            angle = np.linalg.norm(vector, axis=1)
+            R = rotation_about(vector / np.maximum(angle, _TINY)[:, None], angle)
+            joint = self.joints[edge][:, None, None]
+            at_X, at_Y = (np.take_along_axis(Z, joint, 1) for Z in (X, Y))
+            X = np.where(self.limbs[edge][..., None], at_X + (Y - at_Y) @ (Q @ R), X)
+        longer = np.exp(options.lengths * rng.standard_normal((count, len(self.limbs), 1))) - 1
+        return centre(X + self.limbs.T @ (longer * self._edges(X)))
+
+    def _edges(self, S: Floats) -> Floats:
+        """Return the vectors (b, e, 3) of shapes S (b, p, 3) from each joint to its limb."""
+        vectors: Floats = S[:, self._ends] - S[:, self.joints]
+        return vectors
+
+    def _size(self, S: Floats) -> Floats:
+        """Return the total length (b, 1, 1) of the edges of shapes S (b, p, 3)."""
+        total: Floats = np.linalg.norm(self._edges(S), axis=2).sum(1)[:, None, None]
+        return total
+
+
+def _distances(edges: Sequence[tuple[int, int]], p: int) -> NDArray[np.float64]:
+    """Return the number of edges (p, p) from each keypoint to each other, inf without a path."""
+    distance = np.where(np.eye(p, dtype=bool), 0.0, np.inf)
+    for a, b in edges:
+        distance[a, b] = distance[b, a] = 1
+    for k in range(p):
+        distance = np.minimum(distance, distance[:, k : k + 1] + distance[k])
+    return distance

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recombined shapes: which limbs are exchanged, and what they keep."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import CMU31
+from deep_nrsfm_ros.nrsfm.geometry import align, centre, rotation_from_vector
+from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.parts import PartOptions, Parts
+from deep_nrsfm_ros.training.trainer import Trainer
+
+BODY = ("a", "b", "c", "d", "shoulder", "elbow", "hand")
+CHAIN = KeypointLayout("chain", BODY, edges=tuple(pairwise(BODY)))
+EXCHANGE = PartOptions(limbs=1, angle=0.0, lengths=0.0)
+"""One limb is exchanged, and nothing else."""
+
+
+def edge_lengths(S: np.ndarray, layout: KeypointLayout) -> np.ndarray:
+    i, j = np.array(layout.edge_indices()).T
+    lengths: np.ndarray = np.linalg.norm(S[:, i] - S[:, j], axis=2)
+    return lengths
+
+
+def people_of_one_size(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Return shapes of `CMU31` with the same edge lengths in random directions."""
+    lengths = rng.uniform(1, 2, len(CMU31.edges))
+    directions = rng.standard_normal((n, len(CMU31.edges), 3))
+    directions *= (lengths / np.linalg.norm(directions, axis=2))[..., None]
+    S = np.zeros((n, len(CMU31), 3))
+    for e, (i, j) in enumerate(CMU31.edge_indices()):  # an edge of the file ends nearer to the root
+        S[:, i] = S[:, j] + directions[:, e]
+    return centre(S)
+
+
+def is_like(S: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return which shapes are a target, properly rotated."""
+    apart = align(S, np.broadcast_to(target, S.shape)).aligned - target
+    result: np.ndarray = np.linalg.norm(apart, axis=(1, 2)) < 1e-6
+    return result
+
+
+def test_a_limb_is_the_smaller_side_of_an_edge() -> None:
+    parts = Parts(CMU31)
+    edge = CMU31.edges.index(("lfemur", "lhipjoint"))
+    limb = {CMU31.keypoints[i] for i in np.flatnonzero(parts.limbs[edge])}
+    assert limb == {"lfemur", "ltibia", "lfoot", "ltoes"}
+    assert CMU31.keypoints[parts.joints[edge]] == "lhipjoint"
+    assert (2 * parts.limbs.sum(1) <= len(CMU31)).all()
+
+
+def test_shapes_exchange_a_limb() -> None:
+    rng = np.random.default_rng(0)
+    A = centre(rng.standard_normal((7, 3)))
+    B = A.copy()
+    R = rotation_from_vector(np.array([0.5, -0.3, 0.8]))
+    B[5:] = A[4] + (A[5:] - A[4]) @ R  # elbow and hand, turned about the shoulder
+    B = centre(B)
+    elsewhere = 0.7 * B @ rotation_from_vector(np.array([0.2, 0.1, -0.4]))
+    S = np.concatenate((np.tile(A, (600, 1, 1)), np.tile(elsewhere, (600, 1, 1))))
+    recombined = Parts(CHAIN, EXCHANGE).recombine(S, 600, rng)
+    # Half of the partners are A itself; a third of the edges join the arm.
+    assert is_like(recombined, A).mean() == pytest.approx(1 / 2, abs=0.07)
+    assert is_like(recombined, B).mean() == pytest.approx(1 / 6, abs=0.05)
+
+
+def test_edges_keep_their_lengths_up_to_the_drawn_ratio() -> None:
+    rng = np.random.default_rng(0)
+    S = people_of_one_size(300, rng)
+    before = edge_lengths(S, CMU31)
+    kept = Parts(CMU31, PartOptions(lengths=0.0)).recombine(S, 200, rng)
+    assert np.abs(kept - S[:200]).max() > 1
+    np.testing.assert_allclose(edge_lengths(kept, CMU31), before[:200], rtol=1e-6)
+    changed = Parts(CMU31, PartOptions(lengths=0.1)).recombine(S, 200, rng)
+    np.testing.assert_allclose(changed.mean(1), 0, atol=1e-9)
+    ratio = np.log(edge_lengths(changed, CMU31) / before[:200])
+    assert ratio.std() == pytest.approx(0.1, rel=0.05)
+    assert ratio.mean() == pytest.approx(0, abs=0.01)
+
+
+@pytest.mark.parametrize("edges", [(*CHAIN.edges, ("a", "hand")), ()])
+def test_a_layout_that_no_edge_divides_is_refused(edges: tuple[tuple[str, str], ...]) -> None:
+    with pytest.raises(ValueError, match=f"'ring' has no limbs: none of its {len(edges)} edges"):
+        Parts(KeypointLayout("ring", BODY, edges=edges))
+
+
+def test_edges_of_a_ring_have_no_limbs_and_other_edges_have() -> None:
+    ring = (("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"))
+    arm = (("d", "shoulder"), ("elbow", "shoulder"))  # the hand is joined to nothing
+    parts = Parts(KeypointLayout("body", BODY, edges=(*ring, *arm)))
+    limbs = [{BODY[i] for i in np.flatnonzero(limb)} for limb in parts.limbs]
+    assert limbs == [{"shoulder", "elbow"}, {"elbow"}]
+    assert [BODY[joint] for joint in parts.joints] == ["d", "shoulder"]
+    S = np.random.default_rng(0).standard_normal((20, 7, 3))
+    apart = parts.recombine(S, 20, np.random.default_rng(1)) - centre(S)
+    moved = apart - apart[:, :1]
+    np.testing.assert_allclose(moved[:, [1, 2, 3, 6]], 0, atol=1e-9)
+    assert np.abs(moved[:, 5]).max() > 0.1
+
+
+@pytest.fixture(scope="module")
+def limbs(figure: Any) -> Parts:
+    """The limbs of the figure, whose keypoints form a chain here."""
+    names = figure.layout.keypoints
+    return Parts(KeypointLayout("chain", names, edges=tuple(pairwise(names))))
+
+
+def weights_after(figure: Any, trained: Trainer, share: float, parts: Parts | None) -> np.ndarray:
+    recipe = dataclasses.replace(trained.preset.recipe, parts=share, steps=8)
+    frames = FrameStore.of(figure.points, np.ones(figure.points.shape[:2], bool))
+    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
+    trainer.parts = parts
+    for _ in range(4):
+        trainer.advance()
+    result: np.ndarray = trainer.weights.numpy()
+    return result
+
+
+def test_a_share_of_the_known_shapes_is_recombined(
+    figure: Any, trained: Trainer, limbs: Parts
+) -> None:
+    plain = weights_after(figure, trained, 0.0, None)
+    np.testing.assert_array_equal(weights_after(figure, trained, 0.0, limbs), plain)
+    half = weights_after(figure, trained, 0.5, limbs)
+    assert np.abs(half - plain).max() > 1e-4
+    np.testing.assert_array_equal(weights_after(figure, trained, 0.5, limbs), half)
+
+
+def test_only_the_first_shapes_are_recombined_and_fewer_with_progress(
+    figure: Any, trained: Trainer, limbs: Parts
+) -> None:
+    recipe = dataclasses.replace(trained.preset.recipe, parts=0.5, steps=8)
+    frames = FrameStore.of(figure.points, np.ones(figure.points.shape[:2], bool))
+    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
+    trainer.parts = limbs
+    trainer.advance()
+    assert trainer.shapes is not None
+    for step, recombined in ((0, 32), (4, 16), (8, 0)):
+        trainer.step = step
+        known = trainer.known_shapes()
+        assert known is not None
+        changed = (known != trainer.shapes).any(-1).any(-1).numpy()
+        np.testing.assert_array_equal(changed, np.arange(64) < recombined)
