@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from test.fixtures.forked_python import ForkedPython, run_forked
+from test.fixtures.forked_python import ForkedPython, children_of, forked_programs, run_forked
 
 IMPORTS = ("colorsys",)
 PROGRAM = """
@@ -106,11 +106,54 @@ def test_programs_leave_each_other_alone(tmp_path: Path) -> None:
     assert outputs == ["False None\n"] * 2
 
 
+PARENT = r"""
+import os, subprocess, sys
+from pathlib import Path
+from test.fixtures.forked_python import children_of
+code = "import os, sys; print(os.getppid(), 'colorsys' in sys.modules, open(sys.argv[1]).read())"
+Path("child.py").write_text(code)
+reader, writer = os.pipe()
+os.write(writer, b"of a pipe")
+os.close(writer)
+words = [sys.executable, "-u", "child.py", f"/dev/fd/{reader}"]
+child = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, pass_fds=[reader])
+assert children_of(os.getpid()) == [child.pid]
+print(child.communicate()[0].split(maxsplit=1) == [str(os.getpid()), "True of a pipe\n"])
+print(child.returncode, children_of(os.getpid()))
+"""
+
+
+def test_programs_that_it_starts_are_forked_too(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(PARENT)
+    assert run_forked([program], IMPORTS, cwd=tmp_path).stdout.startswith("False\n0 []")
+    forked = run_forked([program], IMPORTS, forks=True, cwd=tmp_path)
+    assert forked.stdout.startswith("True\n0 []"), forked.stderr
+
+
+def test_programs_of_this_process_are_forked_within_the_context(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text("import sys; print('colorsys' in sys.modules)\n")
+    words = [sys.executable, "program.py"]
+    with forked_programs(IMPORTS):
+        within = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+        other = subprocess.run(["echo", "not Python"], capture_output=True, text=True)
+    after = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert [done.stdout for done in (within, other, after)] == ["True\n", "not Python\n", "False\n"]
+    assert children_of(os.getpid()) == []
+
+
+def test_modules_are_found_where_its_environment_says(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "found_there.py").write_text("print('found')\n")
+    env = os.environ | {"PYTHONPATH": f"{tmp_path / 'elsewhere'}"}
+    assert run_forked(["-m", "found_there"], IMPORTS, env=env).stdout == "found\n"
+
+
 def test_a_server_ends_with_the_process_that_started_it() -> None:
     code = (
         "from test.fixtures.forked_python import _server, run_forked\n"
         "assert run_forked(['-m', 'this'], ('colorsys',)).returncode == 0\n"
-        "print(_server(('colorsys',))._process.pid)\n"
+        "print(_server(('colorsys',)).process.pid)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     deadline = time.monotonic() + 60

@@ -68,8 +68,8 @@ def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
     def run(*words: str, launcher: tuple[str, ...] = ()) -> subprocess.Popen[str]:
         command = (*launcher, "-m", "deep_nrsfm_ros.commands.train", *words, "--json-progress")
-        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-        process = ForkedPython(command, TRAINING, **pipes)
+        pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        process = ForkedPython(command, TRAINING, forks=bool(launcher), **pipes)
         started.append(process)
         return process
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import os
 import subprocess
 import sys
 import zipfile
@@ -20,13 +21,14 @@ from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from test.fixtures.forked_python import NODE, run_forked
 
 FRAMES = 30
 
 
 @pytest.fixture
 def command(tmp_path: Path, ring: list[Camera], write_session: Any, stand_ins: None) -> list[str]:
-    """Return the command of the demo on a made-up session with an untrained model."""
+    """Return the words that make Python run the demo on a made-up session, untrained."""
     write_session(tmp_path / WHEEL, ring, ring, [0.0] * 4, FRAMES)
     network = initialise(Architecture(widths=(16, 8)), len(HUMAN17), np.random.default_rng(0))
     model = Model("untrained", network, HUMAN17, Normaliser(), np.eye(3, dtype=np.float32))
@@ -34,7 +36,7 @@ def command(tmp_path: Path, ring: list[Camera], write_session: Any, stand_ins: N
     options = {"cache": tmp_path, "output": tmp_path / "out"}
     options["model"] = tmp_path / "untrained.safetensors"
     words = [f"--{name}={value}" for name, value in options.items()]
-    return [sys.executable, "-m", "examples.demo_live", *words]
+    return ["-m", "examples.demo_live", *words]
 
 
 def add_videos(wheel: Path) -> None:
@@ -51,7 +53,7 @@ def add_videos(wheel: Path) -> None:
 
 def test_from_videos_to_the_table(command: list[str], tmp_path: Path) -> None:
     add_videos(tmp_path / WHEEL)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=170)
+    done = run_forked(command, NODE, timeout=170, forks=True, env=dict(os.environ))
     said = done.stdout + done.stderr
     assert done.returncode == 0, said
     assert said.count(f"{FRAMES} images, {FRAMES - 1} with a person") == 4
@@ -68,6 +70,6 @@ def test_from_videos_to_the_table(command: list[str], tmp_path: Path) -> None:
 
 
 def test_a_session_without_videos_is_told(command: list[str], tmp_path: Path) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=170)
+    done = subprocess.run([sys.executable, *command], capture_output=True, text=True, timeout=170)
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert "no videos of the trial 'Balancing'" in done.stderr

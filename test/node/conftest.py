@@ -36,7 +36,7 @@ from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
-from test.fixtures.forked_python import NODE, ROOT, ForkedPython
+from test.fixtures.forked_python import NODE, ROOT, TRAINING, ForkedPython
 
 DEADLINE = float(os.environ.get("DEADLINE", "60"))  # seconds; a busy machine may want more
 PROMPT_DISCOVERY = Path(__file__).parents[2] / "config" / "prompt_discovery.xml"
@@ -108,7 +108,12 @@ class LifterProcess:
     """A lifter that runs, its log in a file."""
 
     def __init__(
-        self, program: list[str], parameters: dict[str, Any], folder: Path, fork: bool
+        self,
+        program: list[str],
+        parameters: dict[str, Any],
+        folder: Path,
+        fork: bool = True,
+        trains: bool = False,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         settings = folder / "parameters.yaml"
@@ -123,7 +128,7 @@ class LifterProcess:
                 "env": os.environ | {"PYTHONPATH": str(ROOT)},
             }
             self.process = (
-                ForkedPython(words, NODE, **given)
+                ForkedPython(words, TRAINING if trains else NODE, forks=trains, **given)
                 if fork
                 else subprocess.Popen([sys.executable, *words], text=True, **given)
             )
@@ -160,14 +165,15 @@ class LifterProcess:
 
 
 StartLifter = Callable[..., LifterProcess]
-"""Starts a lifter: start(program, listens, fork, **parameters), see `lifters`."""
+"""Starts a lifter: start(program, listens, fork, trains, **parameters), see `lifters`."""
 
 
 @contextmanager
 def lifters(models: Path, folder: Path) -> Iterator[StartLifter]:
     """Start lifters with the model `person` and the parameters given; each must end cleanly.
 
-    `fork=False` starts Python, for tests of the imports of a start.
+    `fork=False` starts Python, for tests of the imports of a start. With `trains=True` the lifter
+    has torch in memory, and its trainings are forked as well.
     """
     started: list[LifterProcess] = []
 
@@ -175,12 +181,14 @@ def lifters(models: Path, folder: Path) -> Iterator[StartLifter]:
         program: tuple[str, ...] = ("-m", "deep_nrsfm_ros.node.lifter"),
         listens: bool = True,
         fork: bool = True,
+        trains: bool = False,
         **parameters: Any,
     ) -> LifterProcess:
         folders = {"models_dir": str(models), "bags_dir": str(folder)}
         usual = {"model": "person", "input_type": POINT_CLOUD}
         parameters = usual | folders | parameters
-        lifter = LifterProcess([*program], parameters, folder / f"lifter{len(started)}", fork)
+        own = folder / f"lifter{len(started)}"
+        lifter = LifterProcess([*program], parameters, own, fork, trains)
         started.append(lifter)
         if listens:
             lifter.wait_for_log("subscribed to")

@@ -20,6 +20,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray
 
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
+from test.fixtures.forked_python import children_of
 from test.node.conftest import Connect, StartLifter
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,11 +43,6 @@ def cloud(second: int = 0) -> PointCloud2:
     ]
     message.data = array("B", pack_points(points, np.ones((1, P))))
     return message
-
-
-def children_of(pid: int) -> list[int]:
-    tasks = Path(f"/proc/{pid}/task")
-    return [int(w) for t in tasks.iterdir() for w in (t / "children").read_text().split()]
 
 
 def state_of(pid: int) -> str:

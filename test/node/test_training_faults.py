@@ -28,6 +28,7 @@ from deep_nrsfm_ros.node.publishing import point_cloud
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint
 from deep_nrsfm_ros.training.record import checkpoint_file, read_record, record_file
+from test.fixtures.forked_python import children_of
 from test.node.conftest import Connect, StartLifter
 
 P = 17
@@ -88,14 +89,6 @@ class Stream:
         assert [message.header.stamp.sec for message in heard] == [*range(self.sent)]
 
 
-def children_of(pid: int) -> list[int]:
-    return [
-        int(word)
-        for t in Path(f"/proc/{pid}/task").iterdir()
-        for word in (t / "children").read_text().split()
-    ]
-
-
 def recorded(models: Path) -> bool:
     """Tell whether the training "fresh" has its record; for a moment there is an empty one."""
     record = record_file(models, "fresh")
@@ -107,6 +100,7 @@ def test_kills_at_random_moments_cost_no_message_and_no_model(
 ) -> None:
     (models / "broken.safetensors").unlink()
     lifter = start_lifter(
+        trains=True,
         qos_overrides=EVERY_MESSAGE,
         train={"bags": [write(tmp_path / "bag")], "name": "fresh", "steps": 300, "seeds": 1,
                "batch": 8},
@@ -235,7 +229,7 @@ def test_a_new_lifter_finds_what_was_cut_off(
     start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path
 ) -> None:
     train = {"bags": [write(tmp_path / "bag")], "name": "fresh", "steps": 1000000, "seeds": 1}
-    first = start_lifter(train=train)
+    first = start_lifter(trains=True, train=train)
     client = connect()
     assert client.call("/lifter/train").success
     client.wait(lambda: recorded(models), "the record")
@@ -258,7 +252,8 @@ def test_a_training_can_be_cancelled_in_any_state(
     start_lifter: StartLifter, connect: Connect, models: Path, tmp_path: Path, state: str
 ) -> None:
     bag = write(tmp_path / "bag")
-    start_lifter(train={"bags": [bag], "name": "fresh", "steps": 1000000, "seeds": 1})
+    train = {"bags": [bag], "name": "fresh", "steps": 1000000, "seeds": 1}
+    start_lifter(trains=True, train=train)
     client = connect()
     assert client.call("/lifter/train").success
     if state != "starting":
@@ -279,7 +274,7 @@ def test_data_that_cannot_be_trained_on_is_refused_with_advice(
 ) -> None:
     good = write(tmp_path / "bag")
     flat = write(tmp_path / "flat", flat=True)
-    start_lifter(train={"name": "fresh", "steps": 5, "seeds": 1, "batch": 8})
+    start_lifter(trains=True, train={"name": "fresh", "steps": 5, "seeds": 1, "batch": 8})
     client = connect()
     client.set_parameters(train__bags=[good], train__topic="/elsewhere")
     refused = client.call("/lifter/train")  # before the answer, not after it
@@ -317,7 +312,7 @@ def test_a_cut_bag_is_used_as_far_as_it_goes_and_the_loss_is_told(
     (file,) = (f for f in (tmp_path / "bag").iterdir() if f.suffix != ".yaml")
     os.truncate(file, int(0.8 * file.stat().st_size))
     lifter = start_lifter(
-        train={"bags": [bag], "name": "fresh", "steps": 5, "seeds": 1, "batch": 8}
+        trains=True, train={"bags": [bag], "name": "fresh", "steps": 5, "seeds": 1, "batch": 8}
     )
     client = connect()
     assert client.call("/lifter/train").success

@@ -193,7 +193,7 @@ def test_an_object_that_is_no_preset_is_trained_by_number_and_its_model_is_used(
     save_model(models / "paw.safetensors", paw)
     train: dict[str, Any] = {"bags": [str(tmp_path / "bag")], "topic": "/keypoints"}
     train |= {"name": "counted", "steps": 1, "seeds": 1, "activate": "always", "from": "nobody"}
-    start_lifter(input_type="std_msgs/Float32MultiArray", model="paw", train=train)
+    start_lifter(trains=True, input_type="std_msgs/Float32MultiArray", model="paw", train=train)
     client = connect()
     publisher = client.publisher(Float32MultiArray)
     before = client.exchange(publisher, keypoints(p=len(PAW))).data

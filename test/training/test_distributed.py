@@ -43,7 +43,7 @@ def found(figure: Any, tmp_path_factory: pytest.TempPathFactory) -> list[dict[st
     folder = tmp_path_factory.mktemp("processes")
     np.save(folder / "points.npy", figure.points)
     words = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", WORK, folder)
-    run_forked(words, TRAINING).check_returncode()
+    run_forked(words, TRAINING, forks=True).check_returncode()
     assert (folder / "checkpoint").exists()
     return [load_file(folder / f"{i}.safetensors") for i in range(2)]
 

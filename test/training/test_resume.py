@@ -48,7 +48,7 @@ class Folder:
 
     def start(self, *words: str, cwd: Path | None = None) -> subprocess.Popen[str]:
         """Start a training, or one that goes on."""
-        pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+        pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
         words = (*PROGRAM, *words, *self.common())
         process = ForkedPython(words, TRAINING, cwd=cwd or "/", **pipes)
         self.started.append(process)

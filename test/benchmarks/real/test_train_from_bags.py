@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import gzip
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,12 +16,20 @@ from benchmarks.real import train_from_bags
 from deep_nrsfm_ros.data.bags import read_bags
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
+from test.fixtures.forked_python import TRAINING, forked_programs
 
 
 @pytest.fixture(autouse=True)
 def _environment(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
         monkeypatch.setenv(name, "0")  # the benchmark sets them for itself alone
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forks() -> Iterator[None]:
+    """Fork lifters and trainings, as that saves the seconds of their imports."""
+    with forked_programs(TRAINING):
+        yield
 
 
 def rows(path: Path) -> list[dict[str, str]]:
