@@ -143,7 +143,7 @@ class Session:
                 dataset.points,
                 dataset.visible,
                 preset,
-                Setup(parts=Parts(dataset.layout) if preset.recipe.parts else None),
+                Setup(parts=Parts.of(dataset.layout)),
                 callbacks=Callbacks(on_step=keep, on_progress=show),
                 checkpointing=Checkpointing(checkpoint, CHECKPOINT_SECONDS),
             )

@@ -13,7 +13,7 @@ from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 AUTOMATIC = -1
-"""Number of steps that stands for one that follows from the start and the frames."""
+"""Number of steps, or share of parts, that stands for one that follows from start and frames."""
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,14 @@ class Recipe:
         high=100.0,
     )
     parts: float = option(
-        0.0,
+        float(AUTOMATIC),
         "share of the known shapes of the cycle loss in which limbs are exchanged between shapes "
         "and turned at the joints, at the first step; it falls to 0 by the last step; lifts people "
         "and motions that the frames do not show better, and those of the frames a little worse; "
         "a limb is what one edge of the layout joins to the rest; without effect where cycle is 0; "
-        "0 = off, 1 typical",
-        low=0.0,
+        "0 = off, 1 = all; -1 = 1 where the training starts from a model of a layout with limbs, "
+        "else 0",
+        low=float(AUTOMATIC),
         high=1.0,
     )
     few_frames: int = option(

@@ -85,7 +85,6 @@ def train(
     check_name("name", name)
     if isinstance(layout, str):
         layout = find_layout("layout", layout)
-    parts = Parts(layout) if recipe and recipe.parts else None
     seen = from_arrays(points, confidence, layout)
     starts = np.array(sequence_starts, np.int64)
     visible = seen.confidence > 0
@@ -101,7 +100,10 @@ def train(
             warnings.warn(warning, stacklevel=2)
     rival = origin or _shipped(layout)
     frames = split(curated.dataset, Curation().held_out if rival else 0.0)
-    preset, setup = PRESETS["default"]._replace(recipe=recipe or Recipe()), Setup(parts=parts)
+    preset, setup = (
+        PRESETS["default"]._replace(recipe=recipe or Recipe()),
+        Setup(parts=Parts.of(layout)),
+    )
     if origin:
         preset = preset._replace(
             architecture=origin.network.architecture, normaliser=origin.normaliser

@@ -23,7 +23,7 @@ from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Network
-from deep_nrsfm_ros.nrsfm.recipe import Preset
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Preset, Recipe
 from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
@@ -50,7 +50,7 @@ class Setup:
         start: network to begin with, of the preset's architecture (see `fine_tuning`); None
             begins with random networks, of which the screening chooses one.
         layout_loss: loss of the keypoint layout that is added to the recipe's; None is none.
-        parts: the limbs of the keypoint layout, which `Recipe.parts` needs.
+        parts: the limbs of the keypoint layout, which `Recipe.parts` needs; None: it has none.
         limits: when the training ends before its last step, and which state it keeps.
         group: the processes that share the training.
         own_frames: whether each process has frames of its own; else all have all frames.
@@ -130,8 +130,9 @@ def train(
         training that was stopped while seeds were screened returns the best seed so far.
 
     Raises:
-        ValueError: for options out of range, for data without two points apart, or for a
-            checkpoint that is damaged or belongs to another training.
+        ValueError: for options out of range, for data without two points apart, for exchanged
+            limbs of a layout that has none, or for a checkpoint that is damaged or belongs to
+            another training.
     """
     for config in (*preset, setup.limits):
         check(config)
@@ -142,7 +143,8 @@ def train(
     count = torch.tensor(len(frames))
     if setup.own_frames:
         group.sum_in_place(count)
-    preset = preset._replace(recipe=with_steps(preset.recipe, int(count), setup.start))
+    recipe = with_steps(preset.recipe, int(count), setup.start)
+    preset = preset._replace(recipe=_with_parts(recipe, setup))
     if group.size > min(len(frames) * (group.size if setup.own_frames else 1), preset.recipe.batch):
         raise ValueError(
             f"{group.size} processes are more than the {len(frames)} frames or the batch of "
@@ -162,6 +164,26 @@ def train(
     if saved is not None:
         loop.restore(saved)
     return loop.train()
+
+
+def _with_parts(recipe: Recipe, setup: Setup) -> Recipe:
+    """Return the recipe with the share of exchanged limbs in place of `AUTOMATIC`.
+
+    Frames of a training that starts from a model are often of one person or of few motions, from
+    which the network would learn that limbs move together.
+
+    Raises:
+        ValueError: the recipe exchanges limbs, and the layout has none.
+    """
+    if recipe.parts == AUTOMATIC:
+        automatic = setup.start is not None and setup.parts is not None
+        recipe = dataclasses.replace(recipe, parts=float(automatic))
+    if recipe.parts and setup.parts is None:
+        raise ValueError(
+            f"parts is {recipe.parts:g}, but there are no limbs to exchange: no edge of the layout "
+            "divides it"
+        )
+    return recipe
 
 
 class _Loop:

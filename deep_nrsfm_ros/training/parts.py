@@ -61,12 +61,12 @@ class Parts:
         limbs, joints, ends = [], [], []
         for i, (a, b) in enumerate(edges):
             others = [*edges[:i], *edges[i + 1 :]]
-            near_a, near_b = (np.isfinite(_distances(others, p)[end]) for end in (a, b))
-            if near_a[b]:
+            side_a, side_b = _joined(others, a), _joined(others, b)
+            if b in side_a:
                 continue
-            if near_b.sum() > near_a.sum():
-                a, b, near_b = b, a, near_a
-            limbs.append(near_b)
+            if len(side_b) > len(side_a):
+                a, b, side_b = b, a, side_a
+            limbs.append(np.isin(np.arange(p), list(side_b)))
             joints.append(a)
             ends.append(b)
         if not limbs:
@@ -79,6 +79,14 @@ class Parts:
         distance = _distances(edges, p)[self.joints]
         self._weights = (np.exp(-distance / _REACH) * ~self.limbs)[..., None]
         self._ends = np.array(ends)
+
+    @classmethod
+    def of(cls, layout: KeypointLayout) -> Parts | None:
+        """Return the limbs of a layout; None if it has none."""
+        try:
+            return cls(layout)
+        except ValueError:
+            return None
 
     def recombine(self, S: Floats, count: int, rng: np.random.Generator) -> Floats:
         """Return shapes that are recombined of the first `count` and of limbs of all.
@@ -124,6 +132,15 @@ class Parts:
         """Return the total length (b, 1, 1) of the edges of shapes S (b, p, 3)."""
         total: Floats = np.linalg.norm(self._edges(S), axis=2).sum(1)[:, None, None]
         return total
+
+
+def _joined(edges: Sequence[tuple[int, int]], start: int) -> set[int]:
+    """Return the keypoints that edges join to a keypoint, itself included."""
+    found, new = {start}, {start}
+    while new:
+        new = {b for edge in edges for a, b in (edge, edge[::-1]) if a in new} - found
+        found |= new
+    return found
 
 
 def _distances(edges: Sequence[tuple[int, int]], p: int) -> NDArray[np.float64]:

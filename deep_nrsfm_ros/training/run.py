@@ -197,7 +197,7 @@ def _train(
             loss,
             limits=config.limits,
             group=group,
-            parts=Parts(dataset.layout) if config.recipe.parts else None,
+            parts=Parts.of(dataset.layout),
             own_frames=not config.data.cmu,
         ),
         Callbacks(on_progress=reporter.training, should_stop=should_stop, on_message=reporter.say),

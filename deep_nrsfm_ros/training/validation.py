@@ -54,7 +54,7 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
     if target != _NUMBERED_LAYOUT:
         KeypointMap(source, target)
     config.layout_loss.check(target, names)
-    if config.recipe.parts:
+    if config.recipe.parts > 0:
         try:
             Parts(target)
         except ValueError as error:

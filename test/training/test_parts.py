@@ -13,7 +13,9 @@ import pytest
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, rotation_from_vector
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.loop import Setup, train
 from deep_nrsfm_ros.training.parts import PartOptions, Parts
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -148,3 +150,38 @@ def test_only_the_first_shapes_are_recombined_and_fewer_with_progress(
         assert known is not None
         changed = (known != trainer.shapes).any(-1).any(-1).numpy()
         np.testing.assert_array_equal(changed, np.arange(64) < recombined)
+
+
+@pytest.mark.parametrize(
+    ("asked", "from_model", "has_limbs", "taken"),
+    [
+        (AUTOMATIC, True, True, 1),
+        (AUTOMATIC, True, False, 0),
+        (AUTOMATIC, False, True, 0),
+        (0.5, False, True, 0.5),
+        (0, True, True, 0),
+    ],
+)
+def test_limbs_are_exchanged_by_themselves_only_where_a_model_is_the_start(
+    figure: Any,
+    trained: Trainer,
+    limbs: Parts,
+    asked: float,
+    from_model: bool,
+    has_limbs: bool,
+    taken: float,
+) -> None:
+    recipe = dataclasses.replace(trained.preset.recipe, parts=asked, steps=1, seeds=1)
+    start = trained.net.map(lambda w: w.numpy()) if from_model else None
+    setup = Setup(start, parts=limbs if has_limbs else None)
+    visible = np.ones(figure.points.shape[:2], bool)
+    trainer = train(figure.points, visible, trained.preset._replace(recipe=recipe), setup)
+    assert trainer.preset.recipe.parts == taken
+
+
+def test_limbs_that_a_layout_lacks_cannot_be_exchanged(figure: Any, trained: Trainer) -> None:
+    recipe = dataclasses.replace(trained.preset.recipe, parts=1, steps=1)
+    visible = np.ones(figure.points.shape[:2], bool)
+    with pytest.raises(ValueError, match="parts is 1, but there are no limbs to exchange"):
+        train(figure.points, visible, trained.preset._replace(recipe=recipe))
+    assert Parts.of(figure.layout) is None
