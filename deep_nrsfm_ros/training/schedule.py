@@ -13,8 +13,8 @@ from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Recipe
 
 FROM_RANDOM = 30_000
 """Steps of a training from random weights, and the most of one that starts from a model."""
-_FRAMES_A_STEP = 3  # of a training that starts from a model: each frame is seen 21 times
-_FEWEST = 30
+_FRAMES_A_STEP = 3  # of a training that starts from a model: each frame is seen 21 times or more
+_FEWEST = 300
 _OTHER_KEYPOINTS = 10  # times as many steps, as new keypoints are learned from nothing
 
 
