@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +85,7 @@ def find_types(name: str, text: str, type_hash: str) -> tuple[Typestore, str]:
     problem = "does not carry the definition of"
     if text:
         try:
-            return _store(name, lambda wanted: _parse(text, name)), ""
+            return _of_bag(name, text, os.environ.get("AMENT_PREFIX_PATH", "")), ""
         except Exception as error:  # a damaged definition fails in many ways
             problem = f"has no readable definition ({error!r}) of"
     differing = ""
@@ -113,6 +113,16 @@ def find_types(name: str, text: str, type_hash: str) -> tuple[Typestore, str]:
         f"{problem} {kind}, and {package} is not installed here: source a workspace with "
         f"{package} (AMENT_PREFIX_PATH)"
     )
+
+
+@lru_cache(maxsize=16)
+def _of_bag(name: str, text: str, prefixes: str) -> Typestore:
+    """Return a store with the definition of a bag; raise any exception.
+
+    The store is kept, since parsing takes some 25 ms and many bags have the same definition. What
+    the definition lacks may come from packages installed in the folders `prefixes`.
+    """
+    return _store(name, lambda wanted: _parse(text, name))
 
 
 def ros1_types(name: str, text: str) -> Typestore:

@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.bags import keypoint_count, point_cloud, read_bags
+from deep_nrsfm_ros.data.definitions import find_types
 from deep_nrsfm_ros.data.keypoint_files import read_keypoints
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -368,3 +369,10 @@ def test_a_type_that_a_shipped_mapping_reads_is_said(tmp_path: Path, recorded: A
         read_keypoints(bag)
     with pytest.raises(BagError, match=r"has type yolov8_msgs.*yolov8\.yaml is a field mapping"):
         read_keypoints(bag, ReadOptions(topic="/d"))
+
+
+def test_a_type_has_a_store_for_each_of_its_definitions() -> None:
+    texts = ("float32 x", "float64 x", "float32 x")
+    first, other, again = (find_types("my_msgs/msg/Point", text, "")[0] for text in texts)
+    assert first is again
+    assert first.fielddefs["my_msgs/msg/Point"] != other.fielddefs["my_msgs/msg/Point"]
