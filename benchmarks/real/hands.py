@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model of hands from 2D detections alone, and its errors on another person's labelled hand.
+"""A model of hands from 2D detections and virtual hands; errors on another person's labelled hand.
 
     python -m benchmarks.real.hands --data DIR           train on Apache and MIT data
     python -m benchmarks.real.hands --data DIR --model hand21      only print
     python -m benchmarks.real.hands --data DIR --collections signs sila kinivi signers
+    python -m benchmarks.real.hands --data DIR --virtual-hands 0   from 2D detections alone
+    python -m benchmarks.real.hands --data DIR --network-of hand21   learn the last step alone
+
+The network learns from detected hands, and from virtual ones in random views
+(`deep_nrsfm_ros.data.virtual_hands`). The last step learns error covariance and bones from other
+virtual hands and a third as many detected ones.
 
 Left and right hands are mixed in the collections. `deep_nrsfm_ros.data.hands` sorts them by place,
 by the detector's handedness, or as palms, and mirrors the left ones.
@@ -22,10 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.table import Table, bars, print_tables
+from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.hands import mirrored, palms_as_right_hands, right_hands
+from deep_nrsfm_ros.data.virtual_hands import virtual_hands
 from deep_nrsfm_ros.layouts.presets import preset
-from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
+from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
@@ -48,6 +57,7 @@ _LEGEND = COLUMNS | {
     "rigid": "the mean of the labelled shapes, turned to fit each frame: of the labels themselves",
 }
 _MIN_CONFIDENCE = 0.3  # of each keypoint of a hand that is learned from
+_DETECTED = 1 / 3  # detected hands for each virtual one in the last step
 _SILA_ASPECT = 4 / 3  # width over height of a webcam's image, by which x is normalised
 
 
@@ -58,17 +68,17 @@ class Labelled(NamedTuple):
         points: (f, 21, 2) pixels.
         confidence: (f, 21) 1 where the detector has the joint, else 0.
         truth: (f, 21, 3) mm in the camera's axes, NaN without a label.
-        camera: (3, 3) intrinsics.
+        intrinsics: of the camera.
     """
 
     points: Float32
     confidence: Float32
     truth: NDArray[np.float64]
-    camera: NDArray[np.float64]
+    intrinsics: Intrinsics
 
 
 def collection(folder: Path, name: str) -> Float32:
-    """Return a collection as right hands (f, 21, 2), each centred and of one size.
+    """Return a collection as right hands (f, 21, 2), as `_of_one_size` returns them.
 
     Raises:
         ValueError: there is no such collection.
@@ -84,6 +94,11 @@ def collection(folder: Path, name: str) -> Float32:
             hands = palms_as_right_hands(points * np.array([aspect, 1], np.float32))
     else:
         raise ValueError(f"no collection {name!r}; there are {', '.join(COLLECTIONS)}")
+    return _of_one_size(hands)
+
+
+def _of_one_size(hands: Float32) -> Float32:
+    """Return hands (f, 21, 2) centred and of one size, without those that are incomplete."""
     hands = centre(hands)
     size = np.linalg.norm(hands, axis=(1, 2))
     known = np.isfinite(size) & (size > 0)
@@ -121,22 +136,21 @@ def labelled(folder: Path) -> Labelled:
         points[:, i] = recording["points"][:, 0, 0, joints].mean(1)
         truth[:, i] = recording["truth"][:, 0, joints].mean(1)
         confidence[:, i] = 1
-    return Labelled(points, confidence, truth, recording["K"][0])
+    K = recording["K"][0]
+    intrinsics = Intrinsics((K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
+    return Labelled(points, confidence, truth, intrinsics)
 
 
 def errors(model: Model, hand: Labelled, *, intrinsics: bool) -> dict[str, float]:
-    """Return the `COLUMNS` of a model on a labelled hand."""
-    lifter = Lifter(model, LiftingOptions())
-    points = hand.points
-    if intrinsics:
-        focal, principal = hand.camera[[0, 1], [0, 1]], hand.camera[:2, 2]
-        points = ((points - principal) / focal * (hand.confidence[..., None] > 0)).astype(
-            np.float32
-        )
-    lifted = lift_all(
-        lambda p, c: lifter.lift(p, c, perspective=intrinsics), points, hand.confidence
-    )
-    return _shown(lifted.shapes, hand)
+    """Return the `COLUMNS` of a model on a labelled hand, lifted frame by frame."""
+    lifter = Lifter(model)
+
+    def lift(points: Float32, confidence: Float32) -> Lifted:
+        if intrinsics:
+            return lift_perspective(lifter, hand.intrinsics, points, confidence)
+        return lifter.lift(points, confidence)
+
+    return _shown(lift_all(lift, hand.points, hand.confidence).shapes, hand)
 
 
 def _shown(shapes: NDArray[Any], hand: Labelled) -> dict[str, float]:
@@ -159,9 +173,27 @@ def rigid_errors(hand: Labelled) -> dict[str, float]:
     return _shown(shapes, hand)
 
 
-def train(
-    folder: Path, collections: Sequence[str], steps: int, seed: int, handedness_weight: float
-) -> tuple[Model, float]:
+class Options(NamedTuple):
+    """How a model of hands is trained.
+
+    Attributes:
+        steps: of the training.
+        seed: of the training and of the virtual hands.
+        handedness_weight: of the loss of the layout's front; 0: off.
+        virtual_hands: number of virtual hands that the network learns from, and of others that the
+            last step learns from; 0: both learn from detected hands alone.
+        network_of: name or file of a model whose network is kept, so that only the last step is
+            learned; "": a network is trained.
+    """
+
+    steps: int = 4000
+    seed: int = 0
+    handedness_weight: float = 1.0
+    virtual_hands: int = 10000
+    network_of: str = ""
+
+
+def train(folder: Path, collections: Sequence[str], options: Options) -> tuple[Model, float]:
     """Return a model of right hands of some collections, and the seconds that it took."""
     from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
     from deep_nrsfm_ros.training.finish import finish
@@ -169,15 +201,49 @@ def train(
     from deep_nrsfm_ros.training.loop import train as run
 
     began = time.process_time()
-    points = np.concatenate([collection(folder, name) for name in collections])
-    default = PRESETS["default"]
-    recipe = dataclasses.replace(default.recipe, steps=steps, seed=seed)
-    weights, visible = LayoutLossWeights(0.0, handedness_weight), np.ones(points.shape[:2], bool)
-    loss = LayoutLoss(weights, preset("hand21")) if handedness_weight else None
-    trainer = run(points, visible, default._replace(recipe=recipe), Setup(layout_loss=loss))
-    source = f"hands detected by MediaPipe and OpenPose: {', '.join(collections)}"
-    model = finish(trainer, "hand21", preset("hand21"), source)
+    detected = np.concatenate([collection(folder, name) for name in collections])
+    points, source = detected, f"hands detected by MediaPipe and OpenPose: {', '.join(collections)}"
+    last_step_hands = None
+    if options.virtual_hands:
+        virtual = virtual_hands(options.virtual_hands, options.seed)
+        points = np.concatenate((detected, _of_one_size(virtual.points)))
+        source += f"; {len(virtual)} {virtual.source}"
+        last_step_hands = _last_step_hands(detected, options)
+    # The loss of the front leaves no seed mirrored, so one is enough.
+    recipe = dataclasses.replace(
+        PRESETS["default"].recipe, steps=options.steps, seed=options.seed, seeds=1
+    )
+    weights = LayoutLossWeights(0.0, options.handedness_weight)
+    loss = LayoutLoss(weights, preset("hand21")) if options.handedness_weight else None
+    start = _model(options.network_of) if options.network_of else None
+    if start:
+        recipe = dataclasses.replace(recipe, steps=0)
+    trainer = run(
+        points,
+        np.ones(points.shape[:2], bool),
+        PRESETS["default"]._replace(recipe=recipe),
+        Setup(start=start.network if start else None, layout_loss=loss),
+    )
+    model = finish(trainer, "hand21", preset("hand21"), source, last_step_hands)
+    if start:
+        last_step = {"last_step": model.provenance.get("last_step")}
+        model = dataclasses.replace(model, provenance=start.provenance | last_step)
     return model, time.process_time() - began
+
+
+def _last_step_hands(detected: Float32, options: Options) -> Dataset:
+    """Return virtual hands that the network has not learned from, and some of the detected ones."""
+    virtual = virtual_hands(options.virtual_hands, options.seed + 1)
+    order = np.random.default_rng(options.seed).permutation(len(detected))
+    chosen = detected[order[: int(_DETECTED * len(virtual))]]
+    points = np.concatenate((virtual.points, chosen))
+    source = f"{len(virtual)} {virtual.source}, {len(chosen)} detected hands"
+    return Dataset(points, np.ones(points.shape[:2], bool), virtual.layout, source)
+
+
+def _model(name: str) -> Model:
+    """Return the model of a name or a file."""
+    return load_model(Path(name) if name.endswith(MODEL_SUFFIX) else name)
 
 
 def benchmark(models: Sequence[tuple[str, float, Model]], hand: Labelled) -> Table:
@@ -206,21 +272,31 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     parser.add_argument("--collections", nargs="+", default=list(FREE), choices=COLLECTIONS)
     parser.add_argument("--model", help="name or file of a model, instead of a training")
-    parser.add_argument("--steps", type=int, default=6000)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=Options().steps)
+    parser.add_argument("--seed", type=int, default=Options().seed)
     parser.add_argument(
-        "--handedness-weight", type=float, default=1.0, help="of the layout's front; 0: off"
+        "--handedness-weight",
+        type=float,
+        default=Options().handedness_weight,
+        help="of the layout's front; 0: off",
+    )
+    parser.add_argument(
+        "--virtual-hands",
+        type=int,
+        default=Options().virtual_hands,
+        help="virtual hands to learn from, beside the detected ones; 0: none",
+    )
+    parser.add_argument(
+        "--network-of", default="", help="keep the network of this model; learn the last step anew"
     )
     args = parser.parse_args(argv)
 
     def tables() -> list[Table]:
         if args.model:
-            path = Path(args.model)
-            row = (args.model, 0.0, load_model(path if path.suffix == MODEL_SUFFIX else args.model))
+            row = (args.model, 0.0, _model(args.model))
         else:
-            model, seconds = train(
-                args.data, args.collections, args.steps, args.seed, args.handedness_weight
-            )
+            options = Options(*(getattr(args, name) for name in Options._fields))
+            model, seconds = train(args.data, args.collections, options)
             save_model(args.output / f"hand21{MODEL_SUFFIX}", model)
             row = (", ".join(args.collections), seconds / 60, model)
         return [benchmark([row], labelled(args.data))]

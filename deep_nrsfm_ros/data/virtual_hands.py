@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Virtual hands: a kinematic right hand of published proportions, in random postures.
+
+Hands that are shown to a webcam have few postures and few views, and a model of them has bones of
+wrong proportions. A virtual hand has bones of lengths drawn about the published means, joints that
+bend within their ranges, and keypoints that are drawn near the joints, since detectors define them
+in their own ways. A lifter's error covariance and bones are learned from such hands.
+
+Source of the lengths: Buryanov and Kotiuk, "Proportions of hand segments", International Journal of
+Morphology 28 (2010), radiographs of 66 adults; of DIP joints, which bend two thirds as far as PIP
+joints: Rijpkema and Girard, "Computer animation of knowledge-based human grasping", SIGGRAPH 1991.
+Ranges of angles are rounded from clinical norms; directions in the palm are ours.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.layouts.presets import preset
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+
+Floats = NDArray[Any]
+
+FINGERS = ("index", "middle", "ring", "pinky")
+METACARPALS = (68.1, 64.6, 58.0, 53.7)
+"""Lengths in mm of the metacarpal bones of the four `FINGERS`."""
+PHALANGES = ((39.8, 22.4, 19.6), (44.6, 26.3, 21.4), (41.4, 25.7, 21.3), (32.7, 18.1, 19.7))
+"""Lengths in mm of the phalanges of each finger from the knuckle on, its soft tip included."""
+THUMB = (46.2, 31.6, 27.4)
+"""Lengths in mm of the metacarpal and the phalanges of the thumb, its soft tip included."""
+CARPUS = 30.0  # mm from the wrist to the metacarpal bones
+
+PART_SPREAD = 0.05  # of the length of palm, fingers and thumb, each relative to its mean
+BONE_SPREAD = 0.07  # of the length of a phalanx relative to its part
+LIMIT = 2.5  # of every normal deviate, in spreads
+KEYPOINT_SPREAD, WRIST_SPREAD, THUMB_BASE_SPREAD = 2.5, 6.0, 4.0  # mm per axis, of definitions
+MCP, PIP, DIP_SHARE = (-20.0, 85.0), (-3.0, 105.0), 2 / 3
+"""Degrees from straight to bent, negative to the back; bend of a DIP joint relative to the PIP."""
+THUMB_MCP, THUMB_IP = (-8.0, 47.0), (-12.0, 63.0)
+THUMB_FORWARD, THUMB_ASIDE = (-5.0, 55.0), (-5.0, 55.0)
+"""Degrees of the thumb's metacarpal out of the palm's plane, and from the fingers within it."""
+
+_FAN = (-15.0, 0.0, 12.0, 24.0)  # degrees of the metacarpals from the middle one, to the left
+_ARCH = (5.0, 2.0, 5.0, 11.0)  # mm of the knuckles before the wrist
+_ROLL = (8.0, 0.0, -8.0, -15.0)  # degrees by which bent fingers converge
+_ABDUCTION = (-14.0, 0.0, 11.0, 20.0)  # degrees of fingers that are spread
+_PARALLEL = 0.6  # share of the fan that fingers keep which are not spread
+_THUMB_BASE = (16.0, -24.0, -31.0)  # mm from the wrist: front, left, up
+
+
+def virtual_hands(count: int, seed: int = 0) -> Dataset:
+    """Return virtual right hands as a dataset, each before an orthonormal camera of its own.
+
+    Args:
+        count: of hands.
+        seed: of all random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    S = centre(hand_shapes(count, rng)).astype(np.float32)
+    W = (S @ random_cameras(count, rng)).astype(np.float32)
+    source = "virtual hands of published proportions"
+    return Dataset(W, np.ones(W.shape[:2], bool), preset("hand21"), source, S)
+
+
+def hand_shapes(count: int, rng: np.random.Generator) -> Floats:
+    """Return n random right hands (n, 21, 3) in mm, in the axes of the layout hand21.
+
+    Args:
+        count: n.
+        rng: draws proportions, postures and definitions of the keypoints.
+    """
+    layout, draw = preset("hand21"), _Draw(count, rng)
+    shapes = np.zeros((count, len(layout), 3))
+    fingers, thumb = _fingers(draw), _thumb(draw)
+    for i, finger in enumerate(FINGERS):
+        for k, joint in enumerate(("mcp", "pip", "dip", "tip")):
+            shapes[:, layout.index(f"{finger}_{joint}")] = fingers[:, i, k]
+    for k, joint in enumerate(("cmc", "mcp", "ip", "tip")):
+        shapes[:, layout.index(f"thumb_{joint}")] = thumb[:, k]
+    spread = np.full((len(layout), 1), KEYPOINT_SPREAD)
+    spread[layout.index("wrist")] = WRIST_SPREAD
+    spread[layout.index("thumb_cmc")] = THUMB_BASE_SPREAD
+    return np.asarray(shapes + spread * draw.normal(len(layout), 3))
+
+
+class _Draw:
+    """Draws random numbers for n hands."""
+
+    def __init__(self, count: int, rng: np.random.Generator) -> None:
+        self.count, self.rng = count, rng
+
+    def normal(self, *shape: int) -> Floats:
+        """Return standard normal deviates (n, ...) within the limit."""
+        deviates = self.rng.standard_normal((self.count, *shape))
+        return np.asarray(np.clip(deviates, -LIMIT, LIMIT))
+
+    def uniform(self, low: float, high: float, *shape: int) -> Floats:
+        """Return uniform deviates (n, ...)."""
+        return np.asarray(self.rng.uniform(low, high, (self.count, *shape)))
+
+
+def _fingers(draw: _Draw) -> Floats:
+    """Return the joints (n, 4, 4, 3) of the four fingers, each from its knuckle to its tip."""
+    palm = 1 + PART_SPREAD * draw.normal(1)
+    reach = (np.array(METACARPALS) + CARPUS + 5 * draw.normal(1)) * palm
+    reach = reach * (1 + 0.03 * draw.normal(4))
+    fan = np.radians(np.array(_FAN) * (1 + 0.12 * draw.normal(1)) + 1.5 * draw.normal(4))
+    front = np.array(_ARCH) * (1 + 0.5 * draw.normal(1)) + 3 * draw.normal(4)
+    knuckles = np.stack((front, reach * np.sin(fan), -reach * np.cos(fan)), -1)
+
+    curl = _curl(draw)
+    mcp = _within(MCP, curl + 0.25 * draw.normal(4))
+    pip = _within(PIP, curl + 0.2 * draw.normal(4))
+    dip = DIP_SHARE * pip * (1 + 0.25 * draw.normal(4)) + np.radians(5) * draw.normal(4)
+    abduction = np.array(_ABDUCTION) * draw.uniform(-0.5, 1, 1) + 4 * draw.normal(4)
+    # Bent fingers cannot be spread.
+    aside = _PARALLEL * fan + np.radians(abduction) * np.cos(np.clip(mcp, 0, None))
+    ahead = np.stack((np.zeros_like(aside), np.sin(aside), -np.cos(aside)), -1)
+    roll = np.radians(np.array(_ROLL) * (1 + 0.3 * draw.normal(1)) + 5 * draw.normal(4))
+    palmar = np.stack((np.cos(roll), np.sin(roll), np.zeros_like(roll)), -1)
+    lengths = np.array(PHALANGES) * (1 + PART_SPREAD * draw.normal(1, 1))
+    lengths = lengths * (1 + BONE_SPREAD * draw.normal(4, 3))
+    return _chain(knuckles, _Bend(ahead, palmar), np.stack((mcp, pip, dip), -1), lengths)
+
+
+def _curl(draw: _Draw) -> Floats:
+    """Return how far (n, 4) the fingers are bent, from 0 to 1: together, or each for itself."""
+    together = draw.uniform(0, 1, 1) + 0.12 * draw.normal(4)
+    shut = 0.05 + 0.85 * (draw.uniform(0, 1, 4) < 0.5)
+    alone = np.where(draw.uniform(0, 1, 4) < 0.6, shut, draw.uniform(0, 1, 4))
+    return np.clip(np.where(draw.uniform(0, 1, 1) < 0.55, together, alone), 0, 1)
+
+
+def _thumb(draw: _Draw) -> Floats:
+    """Return the joints (n, 4, 3) of the thumb."""
+    base = np.array(_THUMB_BASE) * (1 + PART_SPREAD * draw.normal(1))
+    base = base + 4 * draw.normal(3)
+    forward = draw.uniform(*THUMB_FORWARD)
+    # A thumb that opposes the fingers lies before the palm, not beside it.
+    aside = draw.uniform(*THUMB_ASIDE) - 0.35 * forward.clip(0) * draw.uniform(0, 1)
+    a, b = np.radians(forward), np.radians(aside)
+    ahead = np.stack((np.sin(a), -np.cos(a) * np.sin(b), -np.cos(a) * np.cos(b)), -1)
+    turn = np.radians(45 - 1.1 * forward + 15 * draw.normal())
+    across = np.stack((np.sin(turn), np.cos(turn), np.zeros_like(turn)), -1)
+    lengths = np.array(THUMB) * (1 + PART_SPREAD * draw.normal(1))
+    lengths = lengths * (1 + BONE_SPREAD * draw.normal(3))
+    curl = draw.uniform(0, 1, 1) + 0.25 * draw.normal(2)
+    mcp, ip = _within(THUMB_MCP, curl[:, 0]), _within(THUMB_IP, curl[:, 1])
+    bends = np.stack((np.zeros_like(mcp), mcp, ip), -1)
+    return _chain(base, _Bend(ahead, across), bends, lengths)
+
+
+def _within(limits: tuple[float, float], share: Floats) -> Floats:
+    """Return the angle in radians at a share of the way between two limits in degrees."""
+    low, high = np.radians(limits)
+    return np.asarray(low + (high - low) * np.clip(share, 0, 1))
+
+
+class _Bend:
+    """The plane in which a finger bends.
+
+    Attributes:
+        ahead: (..., 3) unit vector of the straight finger.
+        bent: (..., 3) unit vector to which it bends, at a right angle to `ahead`.
+    """
+
+    def __init__(self, ahead: Floats, side: Floats) -> None:
+        self.ahead = ahead
+        bent = side - (side * ahead).sum(-1, keepdims=True) * ahead
+        self.bent = bent / np.linalg.norm(bent, axis=-1, keepdims=True)
+
+
+def _chain(base: Floats, plane: _Bend, bends: Floats, lengths: Floats) -> Floats:
+    """Return the joints (..., 4, 3) of a finger from its base (..., 3), three bones on.
+
+    Args:
+        base: (..., 3) mm.
+        plane: in which the finger bends.
+        bends: (..., 3) radians at the beginning of each bone.
+        lengths: (..., 3) mm of the bones.
+    """
+    angles = np.cumsum(bends, -1)[..., None]
+    directions = (
+        np.cos(angles) * plane.ahead[..., None, :] + np.sin(angles) * plane.bent[..., None, :]
+    )
+    ends = base[..., None, :] + np.cumsum(lengths[..., None] * directions, -2)
+    return np.concatenate((base[..., None, :], ends), -2)
