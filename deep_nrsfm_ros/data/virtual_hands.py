@@ -4,12 +4,12 @@
 Hands that are shown to a webcam have few postures and few views, and a model of them has bones of
 wrong proportions. A virtual hand has bones of lengths drawn about the published means, joints that
 bend within their ranges, and keypoints that are drawn near the joints, since detectors define them
-in their own ways. A lifter's error covariance and bones are learned from such hands.
+in their own ways. Network, error covariance and bones of `hand21` are learned from such hands too.
 
 Source of the lengths: Buryanov and Kotiuk, "Proportions of hand segments", International Journal of
 Morphology 28 (2010), radiographs of 66 adults; of DIP joints, which bend two thirds as far as PIP
 joints: Rijpkema and Girard, "Computer animation of knowledge-based human grasping", SIGGRAPH 1991.
-Ranges of angles are rounded from clinical norms; directions in the palm are ours.
+Ranges of angles are rounded from clinical norms; carpus and directions in the palm are ours.
 """
 
 from __future__ import annotations
