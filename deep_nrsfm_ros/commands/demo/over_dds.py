@@ -41,7 +41,7 @@ TRAINED = "demo"
 LOG = "lifter.log"
 
 _SECOND = 1_000_000_000
-_MOST_MINUTES = 0.4  # of the training: a demo, not a model to keep
+_MOST_MINUTES = 1.0  # of the training: a demo, not a model to keep
 
 
 def detections(session: Session) -> Iterator[Frame]:
