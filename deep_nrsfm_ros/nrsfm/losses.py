@@ -95,11 +95,17 @@ class Objective:
 
     @torch.no_grad()
     def task(
-        self, net: Network, batch: Batch, known: Tensor | None, generator: torch.Generator
+        self,
+        net: Network,
+        batch: Batch,
+        known: Tensor | None,
+        generator: torch.Generator,
+        cameras: Tensor | None = None,
     ) -> Task:
         """Return input and targets of a batch, and of known shapes (c, p, 3) by random cameras.
 
-        Args and `generator` as in `__call__`; only the whitening of `net` is used.
+        Args and `generator` as in `__call__`; only the whitening of `net` is used. `cameras`
+        (k, 2, 3) are M^T of the first k known shapes, in place of random ones.
         """
         b, points, mask = len(batch.points), batch.points, batch.mask
         complete = bool(mask.all())
@@ -107,7 +113,10 @@ class Objective:
             mask = mask[:1]  # serves all objects
         T = known.mT.contiguous() if known is not None and self.recipe.cycle else None
         if T is not None:
-            points = torch.cat((points.mT, _random_cameras(T, generator) @ T)).mT
+            M = _random_cameras(T, generator)
+            if cameras is not None:
+                M[: len(cameras)] = cameras
+            points = torch.cat((points.mT, M @ T)).mT
             mask = mask if complete else torch.cat((mask, torch.ones_like(T[:, :1]).mT))
         visible = self._observe(net, Batch(points, mask), generator)
         unit = visible.unit.expand(len(points), 1, 1)

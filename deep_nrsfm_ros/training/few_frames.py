@@ -3,7 +3,8 @@
 
 Below about a thousand frames a network overfits: it explains the images by shapes that are wrong in
 depth. Factorisations have fewer parameters and no local minima of this kind. Their shapes, seen by
-random cameras, are what the network must return. The model lifts new frames like any other.
+their own and by random cameras, are what the network must return. The model lifts new frames like
+any other.
 """
 
 from __future__ import annotations
@@ -86,15 +87,27 @@ def factorise(
     return found if found.spread <= MAX_SPREAD else None
 
 
-def taught_shapes(known: Tensor, size: int, generator: torch.Generator) -> Tensor:
-    """Return `size` random shapes (size, p, 3): half of them known, half between two known ones.
+class Lesson:
+    """The shapes of a factorisation as known shapes of the cycle loss."""
 
-    Args:
-        known: (f, p, 3) in one object frame.
-        size: number of shapes.
-        generator: source of the random numbers.
-    """
-    first, second = torch.randint(len(known), (2, size), generator=generator)
-    share = torch.rand((size, 1, 1), generator=generator)
-    share[: size // 2] = 0
-    return torch.lerp(known[first], known[second], share)
+    def __init__(self, known: Consensus) -> None:
+        """Keep shapes (f, p, 3) and cameras M^T (f, 2, 3) of the frames."""
+        self.shapes = torch.from_numpy(known.shapes.astype(np.float32))
+        self.cameras = torch.from_numpy(known.rotations[:, :2].astype(np.float32))
+
+    def draw(self, size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return `size` random shapes (size, p, 3) and cameras (size // 2, 2, 3) of the first half.
+
+        The first half are those of frames, with the cameras of these. Without them a network may
+        tell the frames from what it is taught, and lift them in other axes or mirrored. The others
+        lie between those of two frames, and are for random cameras.
+
+        Args:
+            size: number of shapes.
+            generator: source of the random numbers.
+        """
+        first, second = torch.randint(len(self.shapes), (2, size), generator=generator)
+        share = torch.rand((size, 1, 1), generator=generator)
+        share[: size // 2] = 0
+        shapes = torch.lerp(self.shapes[first], self.shapes[second], share)
+        return shapes, self.cameras[first[: size // 2]]

@@ -39,7 +39,12 @@ class GradientFunction:
         return torch_on_one_thread() if self._compiled else nullcontext()
 
     def __call__(
-        self, weights: Tensor, batch: Batch, known: Tensor | None, generator: torch.Generator
+        self,
+        weights: Tensor,
+        batch: Batch,
+        known: Tensor | None,
+        generator: torch.Generator,
+        cameras: Tensor | None = None,
     ) -> tuple[Losses, Tensor]:
         """Return the losses of `Objective` and the gradient of their total.
 
@@ -48,11 +53,12 @@ class GradientFunction:
             batch: the frames.
             known: (c, p, 3) shapes of an earlier call for the cycle loss, or None.
             generator: source of all random numbers.
+            cameras: (k, 2, 3) M^T of the first k known shapes, in place of random ones.
 
         Returns:
             The losses, detached, and the gradient (n,) by the weights.
         """
-        task = self._objective.task(self._net, batch, known, generator)
+        task = self._objective.task(self._net, batch, known, generator, cameras)
         weights = weights.detach().requires_grad_()
         S, M = self._network(weights, task.x)
         losses = self._objective.losses(self._net, task, S, M)

@@ -28,7 +28,7 @@ from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
-from deep_nrsfm_ros.training.few_frames import factorise
+from deep_nrsfm_ros.training.few_frames import Lesson, factorise
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
@@ -214,8 +214,8 @@ class _Loop:
         self.leader_error = math.inf
         self.best = BestCheckpoint(setup.limits, recipe)
         self.mirror = MirrorCheck(frames, preset.normaliser, most_frames(recipe), self.group)
-        shapes = None if known is None else torch.from_numpy(known.shapes.astype(np.float32))
-        self.teacher = Teacher(self.mirror, recipe, shapes)
+        lesson = None if known is None else Lesson(known)
+        self.teacher = Teacher(self.mirror, recipe, lesson)
         self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
         self.saved = time.monotonic()
         self.stopped, self.time_fraction = False, 0.0

@@ -40,7 +40,7 @@ from deep_nrsfm_ros.nrsfm.network import (
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
-from deep_nrsfm_ros.training.few_frames import taught_shapes
+from deep_nrsfm_ros.training.few_frames import Lesson
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.trainer import Trainer, second_moment
 
@@ -213,16 +213,15 @@ class Teacher:
         known: (m, p, 3) the reference shapes in the network's axes while it is taught, else None.
     """
 
-    def __init__(self, check: MirrorCheck, recipe: Recipe, shapes: Tensor | None = None) -> None:
+    def __init__(self, check: MirrorCheck, recipe: Recipe, lesson: Lesson | None = None) -> None:
         """Start without reference shapes.
 
         Args:
             check: the mirror test.
             recipe: of the training.
-            shapes: (f, p, 3) that are taught from the first step to the last instead; see
-                `few_frames`.
+            lesson: what is taught from the first step to the last instead; see `few_frames`.
         """
-        self.shapes = shapes
+        self.lesson = lesson
         self.check, self.mode = check, recipe.reference
         self.interval = max(recipe.steps // 10, 1)
         self.first = max(min(recipe.screening, self.interval), 1)  # a random network has no axes
@@ -231,10 +230,11 @@ class Teacher:
     def prepare(self, trainer: Trainer) -> None:
         """Set the known shapes of the trainer's next step, if it is to be taught."""
         step = trainer.step
-        if self.shapes is not None:
+        if self.lesson is not None:
             generator = torch.Generator().manual_seed((trainer.seed << 32) + step)
-            taught = taught_shapes(self.shapes, trainer.batch, generator)
-            trainer.shapes = taught.to(trainer.weights.device)
+            shapes, cameras = self.lesson.draw(trainer.batch, generator)
+            device = trainer.weights.device
+            trainer.shapes, trainer.cameras = shapes.to(device), cameras.to(device)
             return
         if self.mode == "off" or not trainer.preset.recipe.cycle:
             return

@@ -43,6 +43,7 @@ class Trainer:
         net: the network; its learned weights are views of `weights`.
         weights: (n,) all learned weights.
         shapes: (b, p, 3) reconstructions of the last batch, for the cycle loss; None at first.
+        cameras: (k, 2, 3) M^T of the first k known shapes in the next step; None: random ones.
         step: steps taken.
         time_fraction: fraction of the time limit that has elapsed, 0 without a limit.
         kept_step: step of the weights where they are not those of the last step, else None.
@@ -115,6 +116,7 @@ class Trainer:
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)
         self.shapes: Tensor | None = None
+        self.cameras: Tensor | None = None
         self.probe = self.sample(1024)
 
     @property
@@ -156,8 +158,10 @@ class Trainer:
         began = time.process_time()
         batch = self.sample(self.batch, self.step)
         known = self.known_shapes()
-        losses, gradient = self.gradient_function(self.weights, batch, known, self.generator)
-        self.shapes = losses.shapes
+        losses, gradient = self.gradient_function(
+            self.weights, batch, known, self.generator, self.cameras
+        )
+        self.shapes, self.cameras = losses.shapes, None
         if self.group.size > 1:
             gradient = gradient * (self.batch / self.preset.recipe.batch)
             self.group.sum_in_place(gradient)

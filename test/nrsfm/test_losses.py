@@ -128,6 +128,20 @@ def test_frames_without_a_gap_have_the_losses_of_a_mask_of_ones(scale: str, whit
         torch.testing.assert_close(fast, masked)
 
 
+def test_known_shapes_are_seen_by_the_cameras_that_are_given_for_them() -> None:
+    net = network(whitening=1.0).map(torch.from_numpy).map(torch.Tensor.float)
+    points, visible = (torch.from_numpy(array) for array in batch(incomplete=False))
+    known = torch.from_numpy(centre(np.random.default_rng(2).standard_normal((BATCH, P, 3))))
+    frames = Batch(points.float(), visible[..., None].float())
+    objective = Objective(Normaliser("none"), Recipe())
+    args = net, frames, known.float(), torch.Generator()
+    random = objective.task(*args[:3], args[3].manual_seed(5)).x[BATCH:]
+    x = objective.task(*args[:3], args[3].manual_seed(5), torch.eye(2, 3)[None]).x[BATCH:]
+    torch.testing.assert_close(x[0], known[0, :, :2].float())
+    torch.testing.assert_close(x[1:], random[1:])
+    assert not torch.allclose(x[0], random[0])
+
+
 def test_what_a_missing_point_holds_does_not_matter() -> None:
     points, visible = batch(incomplete=True)
     filled = np.where(visible[..., None], points, 123.0)

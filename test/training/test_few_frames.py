@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
+from deep_nrsfm_ros.nrsfm.geometry import rotation_from_camera
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.training import few_frames, loop
-from deep_nrsfm_ros.training.few_frames import MAX_SPREAD, MIN_FRAMES, factorise, taught_shapes
+from deep_nrsfm_ros.training.few_frames import MAX_SPREAD, MIN_FRAMES, Lesson, factorise
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
 
@@ -86,8 +87,12 @@ def test_missing_keypoints_are_filled_in(figure: Any, monkeypatch: pytest.Monkey
 
 
 def test_taught_shapes_are_known_or_lie_between_known_ones() -> None:
-    known = torch.stack((torch.zeros(5, 3), torch.ones(5, 3)))
-    taught = taught_shapes(known, 64, torch.Generator().manual_seed(0))
+    known = np.stack((np.zeros((5, 3)), np.ones((5, 3))))
+    rotations = np.stack((np.eye(3), np.diag([-1.0, -1.0, 1.0])))
+    lesson = Lesson(Consensus(known, rotations, np.ones(2), 0.01, 5))
+    taught, cameras = lesson.draw(64, torch.Generator().manual_seed(0))
+    own = torch.where(taught[:32, 0, 0] > 0, -1.0, 1.0)  # the camera of the same frame
+    torch.testing.assert_close(cameras[:, 0, 0], own)
     assert taught.shape == (64, 5, 3)
     assert set(taught[:32].unique().tolist()) == {0.0, 1.0}
     between = taught[32:]
@@ -100,7 +105,9 @@ def test_the_network_is_taught_the_factorisation(
 ) -> None:
     monkeypatch.setattr(few_frames, "MIN_STEPS", 1)
     points, truth = figure.points[:FRAMES], figure.shapes[:FRAMES]
-    turned = Consensus(truth * [1, 1, -1], np.zeros((FRAMES, 3, 3)), np.ones(FRAMES), 0.01, 5)
+    mirror = np.array([1, 1, -1])
+    rotations = rotation_from_camera(figure.cameras[:FRAMES] * mirror[:, None])
+    turned = Consensus(truth * mirror, rotations, np.ones(FRAMES), 0.01, 5)
     monkeypatch.setattr(few_frames, "consensus", lambda W, _: turned)
     small = preset(steps=300)
     small = small._replace(architecture=dataclasses.replace(small.architecture, widths=(64, 32)))
