@@ -96,11 +96,11 @@ class Lesson:
         self.cameras = torch.from_numpy(known.rotations[:, :2].astype(np.float32))
 
     def draw(self, size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return `size` random shapes (size, p, 3) and cameras (size // 2, 2, 3) of the first half.
+        """Return `size` random shapes (size, p, 3) and cameras (size // 4, 2, 3) of the first ones.
 
-        The first half are those of frames, with the cameras of these. Without them a network may
-        tell the frames from what it is taught, and lift them in other axes or mirrored. The others
-        lie between those of two frames, and are for random cameras.
+        Half of the shapes are those of frames, and half of these have the cameras of their frames.
+        Without them a network may tell the frames from what it is taught, and lift them in other
+        axes or mirrored. The other shapes lie between those of two frames.
 
         Args:
             size: number of shapes.
@@ -110,4 +110,4 @@ class Lesson:
         share = torch.rand((size, 1, 1), generator=generator)
         share[: size // 2] = 0
         shapes = torch.lerp(self.shapes[first], self.shapes[second], share)
-        return shapes, self.cameras[first[: size // 2]]
+        return shapes, self.cameras[first[: size // 4]]
