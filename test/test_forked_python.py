@@ -133,13 +133,13 @@ def test_programs_that_it_starts_are_forked_too(tmp_path: Path) -> None:
 
 def test_programs_of_this_process_are_forked_within_the_context(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text("import sys; print('colorsys' in sys.modules)\n")
-    words = [sys.executable, "program.py"]
+    words, before = [sys.executable, "program.py"], children_of(os.getpid())
     with forked_programs(IMPORTS):
         within = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
         other = subprocess.run(["echo", "not Python"], capture_output=True, text=True)
     after = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert [done.stdout for done in (within, other, after)] == ["True\n", "not Python\n", "False\n"]
-    assert children_of(os.getpid()) == []
+    assert set(children_of(os.getpid())) <= set(before)
 
 
 def test_modules_are_found_where_its_environment_says(tmp_path: Path) -> None:
