@@ -144,6 +144,8 @@ class Trainer:
             return shapes
         share = self.preset.recipe.parts * max(1 - self.progress, 0.0)
         count = round(share * len(shapes))
+        if not count:
+            return shapes
         rng = np.random.default_rng((self.seed, self.group.rank, self.step))
         recombined = self.parts.recombine(shapes.cpu().numpy(), count, rng)
         first = torch.from_numpy(recombined.astype(np.float32)).to(shapes.device)
