@@ -74,8 +74,7 @@ class KeypointMap:
         if len(mapped) < _MIN_SHARED:
             raise ValueError(
                 f"layouts {source.name!r} and {target.name!r} share {len(mapped)} keypoints by "
-                f"name; "
-                f"at least {_MIN_SHARED} are needed. {source.name!r} has "
+                f"name; at least {_MIN_SHARED} are needed. {source.name!r} has "
                 f"{_shown(source.keypoints)}; {target.name!r} has {_shown(target.keypoints)}"
             )
         self.derivations = self._find_derivations()

@@ -100,10 +100,8 @@ def train(
             warnings.warn(warning, stacklevel=2)
     rival = origin or _shipped(layout)
     frames = split(curated.dataset, Curation().held_out if rival else 0.0)
-    preset, setup = (
-        PRESETS["default"]._replace(recipe=recipe or Recipe()),
-        Setup(parts=Parts.of(layout)),
-    )
+    preset = PRESETS["default"]._replace(recipe=recipe or Recipe())
+    setup = Setup(parts=Parts.of(layout))
     if origin:
         preset = preset._replace(
             architecture=origin.network.architecture, normaliser=origin.normaliser

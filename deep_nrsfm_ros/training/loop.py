@@ -173,8 +173,10 @@ def _with_parts(recipe: Recipe, setup: Setup) -> Recipe:
     which the network would learn that limbs move together.
 
     Raises:
-        ValueError: the recipe exchanges limbs, and the layout has none.
+        ValueError: the recipe exchanges limbs, and the layout has none; or the share is no share.
     """
+    if AUTOMATIC < recipe.parts < 0:
+        raise ValueError(f"parts is {recipe.parts:g}; it must be {AUTOMATIC} or from 0 to 1")
     if recipe.parts == AUTOMATIC:
         automatic = setup.start is not None and setup.parts is not None
         recipe = dataclasses.replace(recipe, parts=float(automatic))

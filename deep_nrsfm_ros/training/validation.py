@@ -19,6 +19,7 @@ from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
 from deep_nrsfm_ros.model_files.model_file import check_name, load_once
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.training.config import DataConfig, OptionNames, TrainingConfig
 from deep_nrsfm_ros.training.disk import check_room
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
@@ -54,6 +55,10 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
     if target != _NUMBERED_LAYOUT:
         KeypointMap(source, target)
     config.layout_loss.check(target, names)
+    if AUTOMATIC < config.recipe.parts < 0:
+        raise ValueError(
+            f"{names('parts')} is {config.recipe.parts:g}; it must be {AUTOMATIC} or from 0 to 1"
+        )
     if config.recipe.parts > 0:
         try:
             Parts(target)

@@ -185,3 +185,10 @@ def test_limbs_that_a_layout_lacks_cannot_be_exchanged(figure: Any, trained: Tra
     with pytest.raises(ValueError, match="parts is 1, but there are no limbs to exchange"):
         train(figure.points, visible, trained.preset._replace(recipe=recipe))
     assert Parts.of(figure.layout) is None
+
+
+def test_a_share_below_zero_is_refused(figure: Any, trained: Trainer) -> None:
+    recipe = dataclasses.replace(trained.preset.recipe, parts=-0.5, steps=1)
+    visible = np.ones(figure.points.shape[:2], bool)
+    with pytest.raises(ValueError, match="parts is -0.5; it must be -1 or from 0 to 1"):
+        train(figure.points, visible, trained.preset._replace(recipe=recipe))

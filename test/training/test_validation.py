@@ -86,6 +86,7 @@ def test_a_name_that_is_no_plain_file_name_is_refused(config: TrainingConfig, na
             "--parts is 1, but layout .numbered. has no limbs: .*; give it edges .*, or set it",
             "train.parts is 1, but layout 'numbered' has no limbs",
         ),
+        ({"parts": -0.5}, "--parts is -0.5; it must be -1 or", "train.parts is -0.5; it must be"),
         ({"free_disk": 1e9}, r"needs 1000000000 MB \(--free-disk\)", r"\(train.free_disk\)"),
         ({"start": "/gone.safetensors"}, "cannot read model", "cannot read model"),
     ],
