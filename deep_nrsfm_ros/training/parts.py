@@ -61,12 +61,12 @@ class Parts:
         limbs, joints, ends = [], [], []
         for i, (a, b) in enumerate(edges):
             others = [*edges[:i], *edges[i + 1 :]]
-            side_a, side_b = _joined(others, a), _joined(others, b)
-            if b in side_a:
+            side_a, side_b = (np.isfinite(_distances(others, end, p)) for end in (a, b))
+            if side_a[b]:
                 continue
-            if len(side_b) > len(side_a):
+            if side_b.sum() > side_a.sum():
                 a, b, side_b = b, a, side_a
-            limbs.append(np.isin(np.arange(p), list(side_b)))
+            limbs.append(side_b)
             joints.append(a)
             ends.append(b)
         if not limbs:
@@ -76,7 +76,7 @@ class Parts:
         self.options = options
         self.limbs: NDArray[np.bool_] = np.array(limbs)
         self.joints: NDArray[np.intp] = np.array(joints)
-        distance = _distances(edges, p)[self.joints]
+        distance = np.array([_distances(edges, joint, p) for joint in joints])
         self._weights = (np.exp(-distance / _REACH) * ~self.limbs)[..., None]
         self._ends = np.array(ends)
 
@@ -134,20 +134,12 @@ class Parts:
         return total
 
 
-def _joined(edges: Sequence[tuple[int, int]], start: int) -> set[int]:
-    """Return the keypoints that edges join to a keypoint, itself included."""
-    found, new = {start}, {start}
-    while new:
-        new = {b for edge in edges for a, b in (edge, edge[::-1]) if a in new} - found
-        found |= new
-    return found
-
-
-def _distances(edges: Sequence[tuple[int, int]], p: int) -> NDArray[np.float64]:
-    """Return the number of edges (p, p) from each keypoint to each other, inf without a path."""
-    distance = np.where(np.eye(p, dtype=bool), 0.0, np.inf)
-    for a, b in edges:
-        distance[a, b] = distance[b, a] = 1
-    for k in range(p):
-        distance = np.minimum(distance, distance[:, k : k + 1] + distance[k])
+def _distances(edges: Sequence[tuple[int, int]], start: int, p: int) -> NDArray[np.float64]:
+    """Return the number of edges (p,) from a keypoint to each other, inf without a path."""
+    distance, found, steps = np.full(p, np.inf), {start}, 0
+    while found:
+        distance[list(found)] = steps
+        steps += 1
+        near = {b for edge in edges for a, b in (edge, edge[::-1]) if a in found}
+        found = {keypoint for keypoint in near if np.isinf(distance[keypoint])}
     return distance
