@@ -115,7 +115,9 @@ def test_every_encoder_layer_is_the_papers(
             if np.linalg.norm(Psi) < 1e-6:
                 return  # all is silent from here on: 0 / 0 in the explicit form
             Psi = h(np.kron(net.D[layers - 1], I3).T @ Psi, net.b[layers - 1])
-        np.testing.assert_allclose(stacked(encode(net, W)[layers - 1]), Psi, atol=1e-9)
+        # The norm of a block is smoothed by 1e-6, so that it has a gradient at zero.
+        atol = 1e-5 if threshold == "block" else 1e-9
+        np.testing.assert_allclose(stacked(encode(net, W)[layers - 1]), Psi, atol=atol)
 
 
 @some
