@@ -65,7 +65,7 @@ test: lint
 lint: $(READY)
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
-	$(PYTHON) -m mypy
+	$(PYTHON) -m mypy --num-workers auto
 
 docs: $(READY)
 	$(PYTHON) -m sphinx -W --keep-going -q -b html docs build/site
