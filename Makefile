@@ -1,6 +1,6 @@
 # make demo        from a fresh clone to a person in 3D on a page
 # make demo-live   from videos to 3D, with MediaPipe Pose as the detector
-# make test        environment, lint, types and all tests; TEST_PROCESSES=2: two files at a time
+# make test        environment, lint, types and all tests, several files at a time; TEST_PROCESSES=1: one after the other
 # make lint        lint and types only
 # make docs        the documentation site in build/site, warnings are errors
 # make reference   docs/reference/ from the code
@@ -38,8 +38,9 @@ SANITIZE_TESTS := test/kernel test/fuzz/test_kernel.py test/lifting/test_compile
     test/lifting/test_tracking.py test/lifting/test_steady_depth.py test/body/test_kinematic_tree.py test/messages/test_serialised.py $(wildcard test/training/test_compiled_*.py)
 SANITIZE_FUZZ ?= 1000
 
-# Test files that run at the same time, each on a DDS domain of its own.
-TEST_PROCESSES ?= 1
+# Test files that run at the same time, each on a DDS domain of its own. One more than there are cores, as
+# many tests wait for other processes.
+TEST_PROCESSES ?= $(shell echo $$(($$(nproc 2>/dev/null || echo 1) + 1)))
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready

@@ -137,7 +137,7 @@ setup(
         ],
         "test": [
             "pytest",  # runs the tests; colcon test needs its name here to run any
-            "pytest-xdist",  # several test files at a time: make test TEST_PROCESSES=2
+            "pytest-xdist",  # several test files at a time
             "pytest-timeout",  # a process that never answers fails its test instead of hanging all
             "h5py",  # writes files as DeepLabCut does
             "kinpy",  # reads the URDF of a person; its forward kinematics must be ours
