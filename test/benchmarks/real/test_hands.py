@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.real import hands
-from deep_nrsfm_ros.model_files.model_file import save_model
+from deep_nrsfm_ros.data.virtual_hands import virtual_hands
+from deep_nrsfm_ros.model_files.model_file import load_model, save_model
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
@@ -43,3 +44,14 @@ def test_the_last_step_learns_from_virtual_and_detected_hands(
     assert model.provenance["step"] == 4
     assert model.provenance["last_step"]["frames"] == 90 + 30
     assert "30 detected" in model.provenance["last_step"]["data"]
+
+
+def test_a_hidden_keypoint_is_expected_where_the_model_lifts_it() -> None:
+    model = load_model("hand21")
+    virtual = virtual_hands(40, 5).points
+    exact = hands.hidden_keypoint_errors(model, virtual)
+    assert 0 < exact < 30
+    moved = virtual.copy()
+    moved[:, ::4] += 50  # each fourth keypoint is elsewhere, so none is where the others tell
+    assert hands.hidden_keypoint_errors(model, moved) > 2 * exact
+    assert hands.hidden_keypoint_errors(model, 7 * virtual + 300) == pytest.approx(exact, rel=1e-3)
