@@ -120,8 +120,9 @@ LEGEND = {
     "smoothing before": "the network's shape and rotation, smoothed before the correction",
     "own bones": "the person's bones, learned so far",
     "gravity": "the camera's direction of gravity is given",
-    "in time": "smoothing before and own bones: the default of node and lift; one person a stream, "
-    "causal",
+    "steady depth": "the depths, filtered over time after the correction, each point on its ray",
+    "in time": "smoothing before, own bones and steady depth: the default of node and lift; one "
+    "person a stream, causal",
     "looking ahead": "lift --smooth both",
     "intrinsics": "whether the lifter is given the camera's intrinsics",
     MEDIAPIPE: "its own 3D (world landmarks) from the images, trained with 3D labels, smoothed",
