@@ -297,13 +297,17 @@ def orders(result: Result) -> dict[str, float]:
 
 
 def decisions(result: Result) -> dict[str, float]:
-    """Return what the rule decides in each pair of models of a scene, one at hand and one new."""
-    regrets: dict[str, list[float]] = {"rule": [], "always": [], "never": []}
+    """Return what the rule decides in each pair of models of a scene, one at hand and one new.
+
+    Without a judge, "always switch" and "never switch" have the same mean regret, since each pair
+    counts in both orders.
+    """
+    regrets: dict[str, list[float]] = {"rule": [], "without a judge": []}
     counts = dict.fromkeys(("pairs", "switches", "worse", "mirrored", "missed"), 0)
     for old, new in permutations(range(len(result.titles)), 2):
         better = not worse_figures(result.figures[new][old], result.figures[old][old])
         best = min(result.error[old], result.error[new])
-        for name, kept in (("rule", new if better else old), ("always", new), ("never", old)):
+        for name, kept in (("rule", new if better else old), ("without a judge", new)):
             regrets[name].append(100 * (result.error[kept] / best - 1))
         gain = result.error[old] / result.error[new] - 1
         counts["pairs"] += 1

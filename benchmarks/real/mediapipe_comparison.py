@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,8 @@ Floats = NDArray[Any]
 
 SUBJECTS = ("01", "02", "05", "14", "49", "60", "61", "86", "127")
 """The subjects that the model `human` was trained on."""
+MEAN_STRIDE = 30
+"""Frames of the motion capture of which the mean shape takes one."""
 ON_CLIP, ON_MEDIAPIPE = "ours, clip's 2D", "ours, MediaPipe's 2D"
 WITH_INTRINSICS = ", intrinsics"
 WORLD, MEAN_SHAPE = "MediaPipe 3D", "mean shape"
@@ -73,12 +76,7 @@ def benchmark(session: Session) -> Table:
     """Return the table of errors of each system for each camera and their mean."""
     balancing, standing, pixels = scenes(session.output)
     lifter = Lifter(load_model(find_model("human", model_folders(session.output / "models"))))
-    folder = session.data / "cmu"
-    capture = read_split(
-        TrialSelection(folder, session.subjects, "all", 30 * session.stride), HUMAN17
-    )
-    assert capture.shapes is not None
-    mean = mean_shape(capture.shapes)[[HUMAN17.index(joint) for joint in JOINTS]]
+    mean = mean_person(session.data / "cmu", session.subjects, MEAN_STRIDE * session.stride)
     trials = {
         "balancing": "100 frames; the truth is triangulated from the detections that come with the "
         f"clip ({pixels[0]:.1f} px mean reprojection error), refined as in the demo",
@@ -175,6 +173,15 @@ def jitter(shapes: Floats) -> float:
     """Return the median angle, in degrees, from each shape of (f, p, 3) to the next."""
     S = centre(shapes[np.isfinite(shapes).all((1, 2))].astype(float))
     return float(np.median(rotation_angles(align(S[:-1], S[1:]).rotation)))
+
+
+def mean_person(
+    folder: Path, subjects: Sequence[str] = SUBJECTS, stride: int = MEAN_STRIDE
+) -> Floats:
+    """Return the mean shape (12, 3) of every stride-th frame of all trials of some subjects."""
+    capture = read_split(TrialSelection(folder, subjects, "all", stride), HUMAN17)
+    assert capture.shapes is not None
+    return mean_shape(capture.shapes)[[HUMAN17.index(joint) for joint in JOINTS]]
 
 
 def mean_shape(shapes: Floats) -> Floats:

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 from benchmarks.data.people_scenes import Track, people_scenes
 from benchmarks.real import plausibility
-from benchmarks.real.mediapipe_comparison import SUBJECTS, mean_shape
+from benchmarks.real.mediapipe_comparison import mean_person
 from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.mocap import read_trials, trials
 from deep_nrsfm_ros.data.over_time import BOTH, CAUSAL, NONE, OverTime, Stream, lift_stream
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -85,7 +84,6 @@ SYSTEMS = {
 PARTS = {"face": ("nose", "eye", "ear"), "feet": ("toe", "heel")}
 """Keypoints that some detectors lack, by the ends of their names."""
 MEDIAPIPE, MEAN_SHAPE = "MediaPipe", "mean shape"
-MEAN_STRIDE = 30
 FIGURES = {
     "PA mm": "mean distance after the best similarity with a proper rotation, frame by frame",
     "camera mm": "the same after the best scale and translation only: in the camera's axes",
@@ -120,13 +118,14 @@ LEGEND = {
     "smoothing before": "the network's shape and rotation, smoothed before the correction",
     "own bones": "the person's bones, learned so far",
     "gravity": "the camera's direction of gravity is given",
-    "in time": "smoothing before and own bones: the default of node and lift; one person a stream, "
-    "causal",
+    "steady depth": "the depths, filtered over time after the correction, each point on its ray",
+    "in time": "smoothing before, own bones and steady depth: the default of node and lift; one "
+    "person a stream, causal",
     "looking ahead": "lift --smooth both",
     "intrinsics": "whether the lifter is given the camera's intrinsics",
     MEDIAPIPE: "its own 3D (world landmarks) from the images, trained with 3D labels, smoothed",
-    MEAN_SHAPE: "the mean of the first trials of the subjects that `human` was trained on, with "
-    "the rotation and scale that fit the truth of each frame best",
+    MEAN_SHAPE: "the mean of the motion capture that `human` was trained on, with the rotation and "
+    "scale that fit the truth of each frame best",
     **FIGURES,
 }
 _DELAYS = np.arange(-0.1, 0.301, 0.02)  # s; the best is found between them
@@ -182,10 +181,7 @@ def benchmark(
         *("people", "People before calibrated cameras", ("scene", "system", "intrinsics")),
         *(tuple(FIGURES), LEGEND, bars("PA mm", "camera mm")),
     )
-    first = [trials(data / "cmu", subject)[0] for subject in SUBJECTS]
-    capture = read_trials(first, HUMAN17, stride=MEAN_STRIDE)
-    assert capture.shapes is not None
-    mean = mean_shape(capture.shapes)[[HUMAN17.index(joint) for joint in JOINTS]]
+    mean = mean_person(data / "cmu")
     for scene, complete in people_scenes(data, output, choice.stride, choice.scenes):
         tracks = [without(track, choice.without) for track in complete]
         for intrinsics in (True, False):

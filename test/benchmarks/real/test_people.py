@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.data import people_scenes
 from benchmarks.data.people_scenes import Track, filmed, noisy
 from benchmarks.real import people
+from benchmarks.real.mediapipe_comparison import mean_person
 from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
 
@@ -138,10 +140,9 @@ def test_the_program_prints_a_row_for_each_system(
         points_annotated=np_mpii["points"],
         missing=np.zeros((4, 16), bool),
     )
-    monkeypatch.setattr(people, "SUBJECTS", ("01",))
+    monkeypatch.setattr(people, "mean_person", partial(mean_person, subjects=("01",), stride=1))
     monkeypatch.setattr(people_scenes, "HELD_OUT", ("01",))
     monkeypatch.setattr(people_scenes, "CMU_STRIDE", 1)
-    monkeypatch.setattr(people, "MEAN_STRIDE", 1)
 
     def no_clip(output: Path) -> None:
         raise ValueError("no clip here")
