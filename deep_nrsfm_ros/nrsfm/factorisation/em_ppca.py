@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations, rigid_shape
-from deep_nrsfm_ros.nrsfm.geometry import align, rotation_from_camera
+from deep_nrsfm_ros.nrsfm.geometry import align, rotation_from_camera, rotation_from_vector
 
 Floats = NDArray[Any]
 
@@ -133,7 +133,7 @@ def _start(Y: Floats, K: int, rng: np.random.Generator | None = None) -> LinearM
     W = Y.swapaxes(1, 2)
     Q = rotation_from_camera(rigid_rotations(W).swapaxes(1, 2))
     if rng is not None:
-        Q = _rotation(RESTART_ANGLE * rng.standard_normal((len(Y), 3))) @ Q
+        Q = rotation_from_vector(RESTART_ANGLE * rng.standard_normal((len(Y), 3))) @ Q
     mean = rigid_shape(W, Q[:, :2])
     residual = Y - Q[:, :2] @ mean.T
     lifted = (Q[:, :2].swapaxes(1, 2) @ residual).reshape(len(Y), -1)
@@ -240,16 +240,8 @@ def _update_rotations(Y: Floats, model: LinearModel, z: Floats, zz: Floats) -> F
     gradient = np.stack((-E[:, 1, 2], E[:, 0, 2], E[:, 1, 0] - E[:, 0, 1]), 1)
     w = np.linalg.solve(H, gradient[..., None])[..., 0]
     w *= np.minimum(1, 0.3 / np.maximum(np.linalg.norm(w, axis=1), 1e-12))[:, None]
-    updated: Floats = _rotation(w) @ Q
+    updated: Floats = rotation_from_vector(w) @ Q
     return updated
-
-
-def _rotation(w: Floats) -> Floats:
-    """Return exp([w]) (f, 3, 3) of rotation vectors w (f, 3), by Rodrigues' formula."""
-    angle = np.maximum(np.linalg.norm(w, axis=1), 1e-12)[:, None, None]
-    X = np.cross(np.eye(3), w[:, None, :] / angle)
-    rotation: Floats = np.eye(3) + np.sin(angle) * X + (1 - np.cos(angle)) * X @ X
-    return rotation
 
 
 def _fit_basis(Y: Floats, R: Floats, z: Floats, zz: Floats) -> tuple[Floats, float]:
