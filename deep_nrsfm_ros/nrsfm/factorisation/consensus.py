@@ -38,7 +38,12 @@ from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import (
     block_rotations,
     least_nuclear_norm,
 )
-from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import LinearModel, fit, from_shapes, shapes_of
+from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import (
+    LinearModel,
+    fit_from_rigid,
+    fit_from_shapes,
+    shapes_of,
+)
 from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations
 from deep_nrsfm_ros.nrsfm.geometry import align, back_project, centre, rotation_from_camera
 
@@ -154,7 +159,7 @@ def _in_rounds(W: Floats, models: list[LinearModel], before_each: Callable[[], N
     several = [model for model in models if len(model.basis) - 1 in modes]
     for K in modes:
         before_each()
-        several.append(fit(W, K, iterations=_EM_ITERATIONS))
+        several.append(fit_from_rigid(W, K, iterations=_EM_ITERATIONS))
     found = _mean(W, [_of_least_norm(W, model.Q) for model in several])
     spread = found.spread
     for iterations in _ROUNDS:
@@ -257,11 +262,11 @@ def _exact(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     for K in _FEW_MODES:
         for annealed in (False, True):
             before_each()
-            models[K, annealed] = fit(W, K, annealed=annealed, iterations=_EM_ITERATIONS)
+            models[K, annealed] = fit_from_rigid(W, K, annealed=annealed, iterations=_EM_ITERATIONS)
     K, annealed = min(models, key=lambda settings: models[settings].variance)
     if models[K, annealed].variance > _NO_NOISE * float((W**2).mean()):
         return []
-    return [_solution(W, fit(W, K, annealed=annealed, iterations=_MORE_ITERATIONS))]
+    return [_solution(W, fit_from_rigid(W, K, annealed=annealed, iterations=_MORE_ITERATIONS))]
 
 
 def _models(
@@ -274,7 +279,7 @@ def _models(
     """Yield the models of EM-PPCA with different numbers of modes."""
     for K in modes:
         before_each()
-        yield from_shapes(W, start.Q, start.S, K, iterations=iterations)
+        yield fit_from_shapes(W, start.Q, start.S, K, iterations=iterations)
 
 
 def _solution(W: Floats, model: LinearModel) -> _Solution:
