@@ -12,11 +12,11 @@
    from the median are left out. EM-PPCA starts again from the weighted mean of the others. For its
    cameras there are shapes of lowest weighted nuclear norm, too. The result is the weighted mean of
    all these solutions.
-4. Where half or more of the solutions of EM-PPCA are far from the median, its cameras are kept,
-   also those from rigid factorisation, and its shapes are not: the shapes of lowest nuclear norm
-   take their place. In each of three rounds EM-PPCA starts from the mean of these solutions. In the
-   last round the nuclear norm is weighted, which shrinks large singular values less. Where a model
-   of this round leaves no noise, the one with the fewest modes is the result.
+4. Where half or more of the solutions of EM-PPCA are far from the median, only its cameras are
+   kept, with those of EM-PPCA from rigid factorisation. The shapes of lowest nuclear norm take the
+   place of its shapes. In each of three rounds EM-PPCA starts from the mean of these solutions. In
+   the last round the nuclear norm is weighted, which shrinks large singular values less. Where a
+   model of this round leaves no noise, the one with the fewest modes is the result.
 
 The errors of depth of the solutions are partly independent, so that the mean is better than each:
 on pickup, yoga and face_mocap by 15 to 50 %.
@@ -152,8 +152,8 @@ def _once_more(W: Floats, agreeing: list[_Solution], before_each: Callable[[], N
 def _in_rounds(W: Floats, models: list[LinearModel], before_each: Callable[[], None]) -> _Mean:
     """Return the mean of solutions for cameras of EM-PPCA, which starts from the mean each time.
 
-    As many modes as points explain half of an image, whatever the cameras: such models are left
-    out, and those of the fewest modes, which explain too little.
+    Left out: models with as many modes as points or more, which fit any cameras, and models with
+    the fewest modes, which fit too little.
     """
     modes = [K for K in MODES[1:] if K < W.shape[1]] or list(MODES[:1])
     several = [model for model in models if len(model.basis) - 1 in modes]
