@@ -179,8 +179,12 @@ def benchmark(
         choice: of the scenes and their keypoints.
     """
     table = Table(
-        *("people", "People before calibrated cameras", ("scene", "system", "intrinsics")),
-        *(tuple(FIGURES), LEGEND, bars("PA mm", "camera mm")),
+        "people",
+        "People before calibrated cameras",
+        ("scene", "system", "intrinsics"),
+        tuple(FIGURES),
+        LEGEND,
+        bars("PA mm", "camera mm"),
     )
     first = [trials(data / "cmu", subject)[0] for subject in SUBJECTS]
     capture = read_trials(first, HUMAN17, stride=MEAN_STRIDE)
@@ -431,8 +435,12 @@ LOOKED_AT = {
 def look_at(lifters: Mapping[str, Lifter], data: Path, output: Path) -> Table:
     """Lift people without truth; write pictures and return the table of plausibility."""
     table = Table(
-        *("people_without_truth", "People without truth", ("scene", "model")),
-        *(tuple(LOOKED_AT), LOOKED_AT, bars("residual %", "knees %")),
+        "people_without_truth",
+        "People without truth",
+        ("scene", "model"),
+        tuple(LOOKED_AT),
+        LOOKED_AT,
+        bars("residual %", "knees %"),
     )
     for scene, people in people_without_truth(data):
         values = np.concatenate([people.points, people.confidence[..., None]], -1)
