@@ -61,17 +61,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp("workspace")
     source = workspace / "src" / NAME
     left = shutil.ignore_patterns(
-        *(
-            ".*",
-            "build",
-            "install",
-            "log",
-            "runs",
-            "demo_output",
-            "*.egg-info",
-            "__pycache__",
-            "test",
-        )
+        ".*", "build", "install", "log", "runs", "demo_output", "*.egg-info", "__pycache__", "test"
     )
     shutil.copytree(ROOT, source, ignore=left)
     (source / "test").mkdir()
@@ -130,7 +120,8 @@ def test_executable_runs_from_an_installation(prefix: Path, name: str, tmp_path:
     there = sysconfig.get_path("purelib")  # what the package requires
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     shown = run(
-        *(prefix / "lib" / NAME / name, "--help"),
+        prefix / "lib" / NAME / name,
+        "--help",
         cwd=tmp_path,
         PATH=path,
         PYTHONPATH=f"{here}{os.pathsep}{there}",
@@ -179,7 +170,9 @@ def test_share_has_what_the_source_has(prefix: Path) -> None:
 def test_colcon_sees_an_ament_python_package(workspace: Path) -> None:
     # colcon only warns of a package.xml that it cannot parse, and lists another type.
     assert colcon("list", workspace=workspace).split() == [
-        *(NAME, f"src/{NAME}", "(ros.ament_python)")
+        NAME,
+        f"src/{NAME}",
+        "(ros.ament_python)",
     ]
 
 

@@ -150,7 +150,12 @@ def _solve(name: str, dataset: Dataset, known: Dataset | None, count: int) -> So
     errors = _mean((frames, run(frames, setting)) for frames in tqdm(parts, name))
     spent = time.process_time() - searched
     return Solved(
-        *(name, errors, setting, sum(map(len, parts)), spent, searched - began),
+        name,
+        errors,
+        setting,
+        sum(map(len, parts)),
+        spent,
+        searched - began,
         baseline.by_neighbours,
     )
 

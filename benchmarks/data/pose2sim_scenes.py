@@ -63,8 +63,12 @@ def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]
     moving = detect_trial(wheel, "Balancing", output)
     balancing = [
         Scene(
-            *(view.camera.name, view.camera.intrinsics, view.camera.rotation @ UP),
-            *(view.truth, moving[view.camera.name], view),
+            view.camera.name,
+            view.camera.intrinsics,
+            view.camera.rotation @ UP,
+            view.truth,
+            moving[view.camera.name],
+            view,
         )
         for view in session.views
     ]
@@ -76,8 +80,12 @@ def scenes(output: Path) -> tuple[list[Scene], list[Scene], tuple[float, float]]
     world, reprojection = triangulate([c.without_lens() for c in cameras], points, weights)
     truths = [
         Scene(
-            *(camera.name, camera.intrinsics, camera.rotation @ UP),
-            *(camera.to_camera(world), mediapipe, None),
+            camera.name,
+            camera.intrinsics,
+            camera.rotation @ UP,
+            camera.to_camera(world),
+            mediapipe,
+            None,
         )
         for camera, mediapipe in zip(cameras, standing, strict=True)
     ]

@@ -90,8 +90,11 @@ def scene_angles(
     """
     tree = KinematicTree(LIMBS)
     table = Table(
-        *("angles", "Angles of lifted people against those of the truth", ("scene", "angle")),
-        *(tuple(FIGURES), FIGURES | {"angle": "means of left and right"}),
+        "angles",
+        "Angles of lifted people against those of the truth",
+        ("scene", "angle"),
+        tuple(FIGURES),
+        FIGURES | {"angle": "means of left and right"},
         bars("median deg", "fixed deg"),
     )
     layout = lifter.model.layout
@@ -167,8 +170,12 @@ def amc_table(lifter: Lifter, data: Path, stride: int) -> Table:
     """
     tree = KinematicTree(LIMBS)
     table = Table(
-        *("amc", "Elbows and knees against the angles of AMC files", ("angle",)),
-        *(tuple(AMC_FIGURES), AMC_FIGURES, bars("truth deg", "lifted deg", "fixed deg")),
+        "amc",
+        "Elbows and knees against the angles of AMC files",
+        ("angle",),
+        tuple(AMC_FIGURES),
+        AMC_FIGURES,
+        bars("truth deg", "lifted deg", "fixed deg"),
     )
     table.digits["frames"] = 0
     limbs = [lifter.model.layout.index(joint) for joint in JOINTS]
@@ -235,8 +242,12 @@ def closure_table(data: Path, frames: int) -> Table:
     """
     tree = KinematicTree(HUMAN17)
     table = Table(
-        *("closure", "Forward kinematics of a person's angles against the points", ("subject",)),
-        *((*CLOSURE, "poses"), CLOSURE, bars("RMS %", "REP-155 alone %")),
+        "closure",
+        "Forward kinematics of a person's angles against the points",
+        ("subject",),
+        (*CLOSURE, "poses"),
+        CLOSURE,
+        bars("RMS %", "REP-155 alone %"),
     )
     for subject in SUBJECTS:
         skeleton = read_asf(data / "cmu" / subject / f"{subject}.asf")

@@ -179,9 +179,7 @@ def capsule_depth(d: Floats, start: Floats, end: Floats, radius: float) -> Float
         on_axis = t * along - at
         depth = np.where((on_axis >= 0) & (on_axis <= 1), t, np.nan)
         for centre in (start, end):
-            s = _first_root(
-                *((d * d).sum(-1), (d * centre).sum(-1), (centre**2).sum(-1) - radius**2)
-            )
+            s = _first_root((d * d).sum(-1), (d * centre).sum(-1), (centre**2).sum(-1) - radius**2)
             depth = np.fmin(depth, s)
     return depth
 
@@ -374,8 +372,12 @@ def summary(columns: Mapping[str, Floats]) -> dict[str, float]:
 def benchmark(lifter: Lifter, data: Path, stride: int) -> Table:
     """Return the table of errors by size of the people and by case."""
     table = Table(
-        *("depth", "Place and size of people by measured depth", ("people", "metres from")),
-        *(tuple(FIGURES), FIGURES, bars("place mm", "points mm")),
+        "depth",
+        "Place and size of people by measured depth",
+        ("people", "metres from"),
+        tuple(FIGURES),
+        FIGURES,
+        bars("place mm", "points mm"),
     )
     motions = list(held_out_motions(data / "cmu"))[::stride]
     for people, size in SIZES.items():

@@ -59,8 +59,12 @@ def errors(track: Track, shapes: Floats) -> tuple[Floats, Floats, Floats]:
 def benchmark(lifter: Lifter, data: Path, stride: int) -> Table:
     """Return the table of errors by size of the people and by method."""
     table = Table(
-        *("floor", "Place and size of people by the floor", ("people", "metres from")),
-        *(tuple(FIGURES), FIGURES, bars("place mm")),
+        "floor",
+        "Place and size of people by the floor",
+        ("people", "metres from"),
+        tuple(FIGURES),
+        FIGURES,
+        bars("place mm"),
     )
     limbs = [lifter.model.layout.index(joint) for joint in JOINTS]
     motions = list(held_out_motions(data / "cmu"))[::stride]
@@ -109,8 +113,12 @@ def clip_table(lifter: Lifter) -> Table:
         OSError: the clip is not there and cannot be fetched.
     """
     table = Table(
-        *("floor_clip", "Place and size of the person of the pose2sim clip", ("camera", "metres")),
-        *((*FIGURES, "height m"), FIGURES | {"height m": "of the camera"}, bars("place mm")),
+        "floor_clip",
+        "Place and size of the person of the pose2sim clip",
+        ("camera", "metres"),
+        (*FIGURES, "height m"),
+        FIGURES | {"height m": "of the camera"},
+        bars("place mm"),
     )
     limbs = [lifter.model.layout.index(joint) for joint in JOINTS]
     found: dict[str, list[Any]] = {}

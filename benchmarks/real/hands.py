@@ -30,13 +30,13 @@ from numpy.typing import NDArray
 from benchmarks.table import Table, bars, print_tables
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.hands import mirrored, palms_as_right_hands, right_hands
-from deep_nrsfm_ros.data.virtual_hands import virtual_hands
+from deep_nrsfm_ros.data.virtual_hands import FINGERS, virtual_hands
 from deep_nrsfm_ros.layouts.presets import preset
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model, save_model
-from deep_nrsfm_ros.nrsfm.geometry import centre
+from deep_nrsfm_ros.nrsfm.geometry import align, centre
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights
 
@@ -56,11 +56,12 @@ _LEGEND = COLUMNS | {
     "the tips and middle joints of four fingers, defined a little otherwise than MediaPipe's",
     "rigid": "the mean of the labelled shapes, turned to fit each frame: of the labels themselves",
 }
-HIDDEN = {
-    "hidden keypoint %": "each keypoint of 200 hands is hidden in turn: mean distance in the image "
-    "of where it is lifted to from where the detector has it, in % of the hand's RMS radius",
-}
 _HIDDEN_HANDS = 200
+_HIDDEN = "hidden keypoint %"
+_HIDDEN_LEGEND = {
+    _HIDDEN: f"each keypoint of {_HIDDEN_HANDS} hands is hidden in turn: mean distance in the "
+    "image between its lifted and its detected place, in % of the hand's RMS radius",
+}
 _MIN_CONFIDENCE = 0.3  # of each keypoint of a hand that is learned from
 _DETECTED = 1 / 3  # detected hands for each virtual one in the last step
 _SILA_ASPECT = 4 / 3  # width over height of a webcam's image, by which x is normalised
@@ -112,14 +113,14 @@ def _of_one_size(hands: Float32) -> Float32:
 
 
 def _signers(folder: Path) -> Float32:
-    """Return the complete hands of the signers, whose sides the detector has told."""
+    """Return the complete hands of the signers; the detector says which are left and right."""
     found = []
     for path in sorted(folder.glob("*.npz")):
         recording = np.load(path)
         for side in ("left", "right"):
             points = recording[f"hand_{side}"]
-            sure = recording[f"hand_{side}_confidence"] > _MIN_CONFIDENCE
-            points = points[sure.all(1) & np.isfinite(points).all((1, 2))]
+            confident = recording[f"hand_{side}_confidence"] > _MIN_CONFIDENCE
+            points = points[confident.all(1) & np.isfinite(points).all((1, 2))]
             found.append(mirrored(points) if side == "left" else points)
     return np.concatenate(found)
 
@@ -128,11 +129,10 @@ def labelled(folder: Path) -> Labelled:
     """Return the labelled recording, its 14 joints named as in hand21; the palm has no name."""
     recording = np.load(folder / "hand_nyu" / "hand_nyu_dev.npz")
     names = recording["joint_names"].tolist()
-    fingers = ("index", "middle", "ring", "pinky")
     sources = {"wrist": ("palm_1", "palm_2"), "thumb_tip": ("thumb_tip",)}
     sources |= {"thumb_ip": ("thumb_mid",), "thumb_mcp": ("thumb_root",)}
-    sources |= {f"{finger}_tip": (f"{finger}_tip",) for finger in fingers}
-    sources |= {f"{finger}_pip": (f"{finger}_mid",) for finger in fingers}
+    sources |= {f"{finger}_tip": (f"{finger}_tip",) for finger in FINGERS}
+    sources |= {f"{finger}_pip": (f"{finger}_mid",) for finger in FINGERS}
     layout, n = preset("hand21"), len(recording["points"])
     points, confidence = np.zeros((n, 21, 2), np.float32), np.zeros((n, 21), np.float32)
     truth = np.full((n, 21, 3), np.nan)
@@ -155,10 +155,11 @@ def errors(model: Model, hand: Labelled, *, intrinsics: bool) -> dict[str, float
             return lift_perspective(lifter, hand.intrinsics, points, confidence)
         return lifter.lift(points, confidence)
 
-    return _shown(lift_all(lift, hand.points, hand.confidence).shapes, hand)
+    return _figures(lift_all(lift, hand.points, hand.confidence).shapes, hand)
 
 
-def _shown(shapes: NDArray[Any], hand: Labelled) -> dict[str, float]:
+def _figures(shapes: NDArray[Any], hand: Labelled) -> dict[str, float]:
+    """Return the `COLUMNS` of shapes (f, 21, 3), over the keypoints that have labels."""
     joints = np.isfinite(hand.truth).all((0, 2))
     found = camera_errors(shapes[:, joints], hand.truth[:, joints])
     values = (found.aligned, found.in_camera, found.rotation, 100 * found.mirrored)
@@ -167,19 +168,25 @@ def _shown(shapes: NDArray[Any], hand: Labelled) -> dict[str, float]:
 
 def rigid_errors(hand: Labelled) -> dict[str, float]:
     """Return the errors of the mean labelled shape in the orientation that fits each frame best."""
-    from deep_nrsfm_ros.nrsfm.geometry import align
-
     known = np.asarray(np.isfinite(hand.truth).all(2), bool)
     truth = centre(np.where(known[..., None], hand.truth, 0.0)[:, known.all(0)])
     mean = align(truth, np.broadcast_to(truth[0], truth.shape)).aligned.mean(0)
     turned = align(np.broadcast_to(mean, truth.shape), truth).aligned
     shapes = np.full(hand.truth.shape, np.nan)
     shapes[:, known.all(0)] = turned
-    return _shown(shapes, hand)
+    return _figures(shapes, hand)
 
 
-def hidden_keypoint_errors(model: Model, hands: Float32) -> float:
-    """Return the figure of `HIDDEN` for hands (n, 21, 2), which needs no label."""
+def hidden_keypoint_error(model: Model, hands: Float32) -> float:
+    """Return the mean error in the image of keypoints that are hidden in turn; needs no label.
+
+    Args:
+        model: of hands.
+        hands: (n, 21, 2) complete detections, in any unit.
+
+    Returns:
+        Percent of the RMS radius of the hand; 5 to 10 typical.
+    """
     keypoints = len(model.layout)
     chosen = hands[np.linspace(0, len(hands) - 1, min(_HIDDEN_HANDS, len(hands))).astype(int)]
     points = np.repeat(chosen, keypoints, 0)
@@ -290,12 +297,12 @@ def without_labels(label: str, model: Model, others: dict[str, Float32]) -> Tabl
         "hidden_hand_keypoints",
         "Hands of other collections, no labels",
         ("model", "collection"),
-        tuple(HIDDEN),
-        HIDDEN,
-        bars(*HIDDEN),
+        (_HIDDEN,),
+        _HIDDEN_LEGEND,
+        bars(_HIDDEN),
     )
     for name, hands in others.items():
-        table.add((label, name), {next(iter(HIDDEN)): hidden_keypoint_errors(model, hands)})
+        table.add((label, name), {_HIDDEN: hidden_keypoint_error(model, hands)})
     return table
 
 

@@ -214,8 +214,12 @@ def clips(data: Path, scenes: Path) -> Iterator[tuple[str, str, list[Clip]]]:
 def benchmark(data: Path, scenes: Path) -> Table:
     """Return the switches of each camera, with both methods."""
     table = Table(
-        *("identities", "Identity switches", ("people", "camera", "lost")),
-        *(_FIGURES, LEGEND, bars("nearest", "similarity")),
+        "identities",
+        "Identity switches",
+        ("people", "camera", "lost"),
+        _FIGURES,
+        LEGEND,
+        bars("nearest", "similarity"),
     )
     total: dict[tuple[str, str, str], NDArray[np.int64]] = {}
     for people, camera, of_camera in clips(data, scenes):

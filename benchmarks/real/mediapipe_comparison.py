@@ -55,8 +55,12 @@ FIGURES = {
     "ms": "median time per frame from the input of the system, at the current load of the machine",
 }
 SYSTEMS = (
-    *(ON_CLIP, ON_CLIP + WITH_INTRINSICS, ON_MEDIAPIPE, ON_MEDIAPIPE + WITH_INTRINSICS),
-    *(WORLD, MEAN_SHAPE),
+    ON_CLIP,
+    ON_CLIP + WITH_INTRINSICS,
+    ON_MEDIAPIPE,
+    ON_MEDIAPIPE + WITH_INTRINSICS,
+    WORLD,
+    MEAN_SHAPE,
 )
 LEGEND = {
     ON_CLIP: "our model `human`, trained on 2D projections of motion capture; input: the "

@@ -178,8 +178,12 @@ def benchmark(
         choice: of the scenes and their keypoints.
     """
     table = Table(
-        *("people", "People before calibrated cameras", ("scene", "system", "intrinsics")),
-        *(tuple(FIGURES), LEGEND, bars("PA mm", "camera mm")),
+        "people",
+        "People before calibrated cameras",
+        ("scene", "system", "intrinsics"),
+        tuple(FIGURES),
+        LEGEND,
+        bars("PA mm", "camera mm"),
     )
     mean = mean_person(data / "cmu")
     for scene, complete in people_scenes(data, output, choice.stride, choice.scenes):
@@ -427,8 +431,12 @@ LOOKED_AT = {
 def look_at(lifters: Mapping[str, Lifter], data: Path, output: Path) -> Table:
     """Lift people without truth; write pictures and return the table of plausibility."""
     table = Table(
-        *("people_without_truth", "People without truth", ("scene", "model")),
-        *(tuple(LOOKED_AT), LOOKED_AT, bars("residual %", "knees %")),
+        "people_without_truth",
+        "People without truth",
+        ("scene", "model"),
+        tuple(LOOKED_AT),
+        LOOKED_AT,
+        bars("residual %", "knees %"),
     )
     for scene, people in people_without_truth(data):
         values = np.concatenate([people.points, people.confidence[..., None]], -1)

@@ -98,8 +98,11 @@ def detection_rates(dataset: Dataset, corrupted: Corrupted) -> dict[str, float]:
     jumps, swaps = corrupted.jumps > 0, corrupted.swaps > MIN_SWAP
     clean = ~((corrupted.jumps > 0) | (corrupted.swaps > 0)).any(1)
     rates = (
-        *(hidden[clean], hidden[clean].any(1)),
-        *(hidden[jumps], hidden[swaps.any(1)].any(1), hidden[swaps]),
+        hidden[clean],
+        hidden[clean].any(1),
+        hidden[jumps],
+        hidden[swaps.any(1)].any(1),
+        hidden[swaps],
     )
     return {name: 100 * float(rate.mean()) for name, rate in zip(FIGURES, rates, strict=True)}
 

@@ -221,8 +221,12 @@ def benchmark(show: bool = False) -> Table:
     """Make every input, run the programs on it and return the table."""
     figures = ("inputs", *(name for name in LEGEND if name != "inputs"))
     table = Table(
-        *("odd_inputs", "Odd inputs", ("kind", "program")),
-        *(figures, LEGEND, bars("worked", "said", "silent")),
+        "odd_inputs",
+        "Odd inputs",
+        ("kind", "program"),
+        figures,
+        LEGEND,
+        bars("worked", "said", "silent"),
     )
     model = load_model("human")
     counts: dict[tuple[str, str], dict[str, int]] = {}

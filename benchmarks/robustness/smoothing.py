@@ -64,7 +64,9 @@ def benchmark(session: Session) -> Table:
     """Lift each clip; return the table with the filter off and on."""
     lifter = Lifter(load_model(find_model("human", model_folders(default_models_dir()))))
     table = Table(
-        *("smoothing", "Temporal smoothing", ("clip", "filter")),
+        "smoothing",
+        "Temporal smoothing",
+        ("clip", "filter"),
         tuple(FIGURES),
         FIGURES,
         bars("rotation deg", "points %", "acceleration %"),

@@ -227,8 +227,7 @@ def benchmark(args: Namespace) -> Iterator[Table]:
     os.environ["ROS_DOMAIN_ID"] = str(random_domain())
     columns = ("us", "% of a core", "for joints %", "more %", "points us", "last us")
     table = Table(
-        *("joints", f"What the joints of {PEOPLE} people cost", ("row",)),
-        *(columns, LEGEND, bars("us")),
+        "joints", f"What the joints of {PEOPLE} people cost", ("row",), columns, LEGEND, bars("us")
     )
     results = measure(*((1, 3) if args.quick else (15, 60)))
     without = results[SWITCHED_OFF].work

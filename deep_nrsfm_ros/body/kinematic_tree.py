@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.layouts.joints import MAX_ANGLES, WORDS, Joint, direction_vector
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.nrsfm.geometry import quaternion
+from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_vector
 
 Floats = NDArray[Any]
 
@@ -309,7 +309,9 @@ class KinematicTree:
             parents, theta = rotations[:, group.parents], angles[:, group.angles]
             if (group.leads >= 0).any():
                 lead = np.where(group.leads >= 0, angles[:, group.leads], 0.0)
-                parents = parents @ rotation_about(self.angle_axes[group.leads], lead)
+                parents = parents @ rotation_from_vector(
+                    self.angle_axes[group.leads] * lead[..., None]
+                )
             rotations[:, group.joints] = parents @ _rotation(group, theta)
         rotations = rotations[:, self._frames]
         origins[:, 0] = origin
@@ -392,14 +394,7 @@ def _canonical_axes(kind: str, axes: Floats, first: Floats) -> tuple[Floats, Flo
 
 def rotation_about(axes: Floats, angles: Floats) -> Floats:
     """Return rotations (..., 3, 3) by angles (...) in radians about unit vectors (..., 3)."""
-    x, y, z = np.moveaxis(axes, -1, 0)
-    c, s = np.cos(angles), np.sin(angles)
-    t = 1 - c
-    R = np.empty((*np.broadcast_shapes(x.shape, c.shape), 3, 3))
-    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = t * x * x + c, t * x * y - s * z, t * x * z + s * y
-    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = t * x * y + s * z, t * y * y + c, t * y * z - s * x
-    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = t * x * z - s * y, t * y * z + s * x, t * z * z + c
-    return R
+    return rotation_from_vector(axes * angles[..., None])
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
@@ -485,8 +480,8 @@ def _rotation(group: _Group, theta: Floats) -> Floats:
         R[..., 2, 0], R[..., 2, 2] = -s2, c2
     else:  # about x, y and x or z
         x, y, z = np.eye(3)
-        R = rotation_about(x, t[..., 0]) @ rotation_about(y, t[..., 1])
-        R = R @ rotation_about(x if group.proper else z, t[..., 2])
+        R = rotation_from_vector(t[..., 0, None] * x) @ rotation_from_vector(t[..., 1, None] * y)
+        R = R @ rotation_from_vector(t[..., 2, None] * (x if group.proper else z))
     rotations: Floats = group.to_axes @ R @ group.to_axes.swapaxes(-1, -2)
     return rotations
 

@@ -16,7 +16,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.body.kinematic_tree import KinematicTree, rotation_about
+from deep_nrsfm_ros.body.kinematic_tree import KinematicTree
+from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector
 
 Floats = NDArray[Any]
 
@@ -194,8 +195,7 @@ class UrdfDrawing:
             frame = frames[joint.parent] @ joint.origin
             if joint.axis is not None:
                 turn = np.eye(4)
-                angle = np.array(angles.get(joint.name, 0.0))
-                turn[:3, :3] = rotation_about(joint.axis, angle)
+                turn[:3, :3] = rotation_from_vector(angles.get(joint.name, 0.0) * joint.axis)
                 frame = frame @ turn
             frames[joint.child] = frame
         return frames
@@ -252,7 +252,11 @@ def _origin(element: ElementTree.Element) -> Floats:
     roll, pitch, yaw = _vector(origin, "rpy", "0 0 0")
     x, y, z = np.eye(3)
     T = np.eye(4)
-    T[:3, :3] = rotation_about(z, yaw) @ rotation_about(y, pitch) @ rotation_about(x, roll)
+    T[:3, :3] = (
+        rotation_from_vector(yaw * z)
+        @ rotation_from_vector(pitch * y)
+        @ rotation_from_vector(roll * x)
+    )
     T[:3, 3] = _vector(origin, "xyz", "0 0 0")
     return T
 

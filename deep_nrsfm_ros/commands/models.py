@@ -141,7 +141,8 @@ def show(listed: Sequence[Listed]) -> str:
         lines.append("  ".join(cells).rstrip())
         for note in notes:
             lines += textwrap.wrap(
-                *(note, 100),
+                note,
+                100,
                 initial_indent="    ",
                 subsequent_indent="      ",
                 break_long_words=False,

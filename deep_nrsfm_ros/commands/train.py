@@ -205,7 +205,11 @@ def write_page(result: TrainingResult, reporter: Reporter) -> str:
     """
     prepared = result.prepared
     training = Training(
-        *(result.model, result.path, prepared.dataset, prepared.curated, prepared.sufficiency),
+        result.model,
+        result.path,
+        prepared.dataset,
+        prepared.curated,
+        prepared.sufficiency,
         progress=reporter.curves,
         warnings=reporter.warnings,
         detector_layout=result.detector_layout,

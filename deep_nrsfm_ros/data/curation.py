@@ -189,7 +189,9 @@ def curate(
     candidates = dataset if enough.all() else dataset[frames]
     if options.min_change:
         changed = changed_frames(
-            *(candidates.points, candidates.visible, options.min_change),
+            candidates.points,
+            candidates.visible,
+            options.min_change,
             lambda done, total: on_progress(done, 2 * total),
         )
         if not changed.all():
@@ -201,7 +203,9 @@ def curate(
     worst: NDArray[np.float64] = np.zeros(len(frames))
     if options.outlier_threshold:
         outliers, worst = find_outliers(
-            *(candidates.points, visible, options.outlier_threshold),
+            candidates.points,
+            visible,
+            options.outlier_threshold,
             lambda done, total: on_progress(total + done, 2 * total),
         )
     number = outliers.sum(1)

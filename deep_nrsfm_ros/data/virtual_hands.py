@@ -34,22 +34,53 @@ THUMB = (46.2, 31.6, 27.4)
 """Lengths in mm of the metacarpal and the phalanges of the thumb, its soft tip included."""
 CARPUS = 30.0  # mm from the wrist to the metacarpal bones
 
+LIMIT = 2.5  # of every normal deviate, in spreads
 PART_SPREAD = 0.05  # of the length of palm, fingers and thumb, each relative to its mean
 BONE_SPREAD = 0.07  # of the length of a phalanx relative to its part
-LIMIT = 2.5  # of every normal deviate, in spreads
 KEYPOINT_SPREAD, WRIST_SPREAD, THUMB_BASE_SPREAD = 2.5, 6.0, 4.0  # mm per axis, of definitions
-MCP, PIP, DIP_SHARE = (-20.0, 85.0), (-3.0, 105.0), 2 / 3
-"""Degrees from straight to bent, negative to the back; bend of a DIP joint relative to the PIP."""
+
+MCP, PIP = (-20.0, 85.0), (-3.0, 105.0)
+"""Degrees from straight to bent, negative to the back."""
+DIP_SHARE = 2 / 3  # bend of a DIP joint relative to the PIP joint
 THUMB_MCP, THUMB_IP = (-8.0, 47.0), (-12.0, 63.0)
+"""Degrees from straight to bent, negative to the back."""
 THUMB_FORWARD, THUMB_ASIDE = (-5.0, 55.0), (-5.0, 55.0)
 """Degrees of the thumb's metacarpal out of the palm's plane, and from the fingers within it."""
 
+# Spreads are standard deviations. A common one changes all four fingers of a hand alike.
+_REACH_SPREAD = 5.0  # mm, common: from the wrist to the knuckles
+_METACARPAL_SPREAD = 0.03  # of that of one finger, relative
 _FAN = (-15.0, 0.0, 12.0, 24.0)  # degrees of the metacarpals from the middle one, to the left
+_FAN_SPREAD = 0.12  # relative, common
+_METACARPAL_TURN = 1.5  # degrees: spread of one metacarpal
 _ARCH = (5.0, 2.0, 5.0, 11.0)  # mm of the knuckles before the wrist
-_ROLL = (8.0, 0.0, -8.0, -15.0)  # degrees by which bent fingers converge
-_ABDUCTION = (-14.0, 0.0, 11.0, 20.0)  # degrees of fingers that are spread
+_ARCH_SPREAD = 0.5  # relative, common
+_KNUCKLE_SPREAD = 3.0  # mm, of one knuckle
+
+# The curl of a finger is 0 where it is straight and 1 where it is bent.
+_TOGETHER = 0.55  # share of the hands whose fingers bend together
+_TOGETHER_SPREAD = 0.12  # of the curl of one of these fingers
+_OPEN_OR_SHUT = 0.6  # share of the other fingers that are open or shut, not in between
+_SHUT = 0.5  # share of these that are shut
+_OPEN_CURL, _SHUT_CURL = 0.05, 0.9
+_MCP_SPREAD, _PIP_SPREAD = 0.25, 0.2  # of the curl of a joint
+_DIP_SPREAD = 0.25  # of the bend of a DIP joint, relative
+_DIP_TURN = 5.0  # degrees: spread of its bend, beside the relative one
 _PARALLEL = 0.6  # share of the fan that fingers keep which are not spread
+_ABDUCTION = (-14.0, 0.0, 11.0, 20.0)  # degrees of fingers that are spread
+_ABDUCTED = (-0.5, 1.0)  # range of the share of this, common; negative: towards each other
+_ABDUCTION_SPREAD = 4.0  # degrees, of one finger
+_ROLL = (8.0, 0.0, -8.0, -15.0)  # degrees by which bent fingers converge
+_ROLL_SPREAD = 0.3  # relative, common
+_ROLL_TURN = 5.0  # degrees: spread of one finger
+
 _THUMB_BASE = (16.0, -24.0, -31.0)  # mm from the wrist: front, left, up
+_BASE_SPREAD = 4.0  # mm per axis, of the joint; `THUMB_BASE_SPREAD` is of its definition
+_OPPOSITION = 0.35  # degrees less aside for each degree forward, at most
+_THUMB_ROLL = 45.0  # degrees from left to front of the direction to which the thumb bends
+_ROLL_FORWARD = 1.1  # degrees less for each degree forward
+_THUMB_ROLL_SPREAD = 15.0  # degrees
+_THUMB_SPREAD = 0.25  # of the curl of a joint
 
 
 def virtual_hands(count: int, seed: int = 0) -> Dataset:
@@ -106,49 +137,64 @@ class _Draw:
 def _fingers(draw: _Draw) -> Floats:
     """Return the joints (n, 4, 4, 3) of the four fingers, each from its knuckle to its tip."""
     palm = 1 + PART_SPREAD * draw.normal(1)
-    reach = (np.array(METACARPALS) + CARPUS + 5 * draw.normal(1)) * palm
-    reach = reach * (1 + 0.03 * draw.normal(4))
-    fan = np.radians(np.array(_FAN) * (1 + 0.12 * draw.normal(1)) + 1.5 * draw.normal(4))
-    front = np.array(_ARCH) * (1 + 0.5 * draw.normal(1)) + 3 * draw.normal(4)
+    reach = (np.array(METACARPALS) + CARPUS + _REACH_SPREAD * draw.normal(1)) * palm
+    reach = reach * (1 + _METACARPAL_SPREAD * draw.normal(4))
+    fan = np.radians(_varied(draw, _FAN, _FAN_SPREAD, _METACARPAL_TURN))
+    front = _varied(draw, _ARCH, _ARCH_SPREAD, _KNUCKLE_SPREAD)
     knuckles = np.stack((front, reach * np.sin(fan), -reach * np.cos(fan)), -1)
 
     curl = _curl(draw)
-    mcp = _within(MCP, curl + 0.25 * draw.normal(4))
-    pip = _within(PIP, curl + 0.2 * draw.normal(4))
-    dip = DIP_SHARE * pip * (1 + 0.25 * draw.normal(4)) + np.radians(5) * draw.normal(4)
-    abduction = np.array(_ABDUCTION) * draw.uniform(-0.5, 1, 1) + 4 * draw.normal(4)
+    mcp = _within(MCP, curl + _MCP_SPREAD * draw.normal(4))
+    pip = _within(PIP, curl + _PIP_SPREAD * draw.normal(4))
+    dip = DIP_SHARE * pip * (1 + _DIP_SPREAD * draw.normal(4))
+    dip = dip + np.radians(_DIP_TURN) * draw.normal(4)
+    abduction = np.array(_ABDUCTION) * draw.uniform(*_ABDUCTED, 1)
+    abduction = abduction + _ABDUCTION_SPREAD * draw.normal(4)
     # Bent fingers cannot be spread.
     aside = _PARALLEL * fan + np.radians(abduction) * np.cos(np.clip(mcp, 0, None))
     ahead = np.stack((np.zeros_like(aside), np.sin(aside), -np.cos(aside)), -1)
-    roll = np.radians(np.array(_ROLL) * (1 + 0.3 * draw.normal(1)) + 5 * draw.normal(4))
+    roll = np.radians(_varied(draw, _ROLL, _ROLL_SPREAD, _ROLL_TURN))
     palmar = np.stack((np.cos(roll), np.sin(roll), np.zeros_like(roll)), -1)
     lengths = np.array(PHALANGES) * (1 + PART_SPREAD * draw.normal(1, 1))
     lengths = lengths * (1 + BONE_SPREAD * draw.normal(4, 3))
     return _chain(knuckles, _Bend(ahead, palmar), np.stack((mcp, pip, dip), -1), lengths)
 
 
+def _varied(draw: _Draw, means: tuple[float, ...], common_spread: float, spread: float) -> Floats:
+    """Return numbers (n, 4) of the four fingers.
+
+    Args:
+        draw: the random numbers.
+        means: of the fingers.
+        common_spread: of the size of all four, relative.
+        spread: of each of them, in the unit of the means.
+    """
+    common = 1 + common_spread * draw.normal(1)
+    return np.asarray(np.array(means) * common + spread * draw.normal(len(means)))
+
+
 def _curl(draw: _Draw) -> Floats:
     """Return how far (n, 4) the fingers are bent, from 0 to 1: together, or each for itself."""
-    together = draw.uniform(0, 1, 1) + 0.12 * draw.normal(4)
-    shut = 0.05 + 0.85 * (draw.uniform(0, 1, 4) < 0.5)
-    alone = np.where(draw.uniform(0, 1, 4) < 0.6, shut, draw.uniform(0, 1, 4))
-    return np.clip(np.where(draw.uniform(0, 1, 1) < 0.55, together, alone), 0, 1)
+    together = draw.uniform(0, 1, 1) + _TOGETHER_SPREAD * draw.normal(4)
+    open_or_shut = np.where(draw.uniform(0, 1, 4) < _SHUT, _SHUT_CURL, _OPEN_CURL)
+    alone = np.where(draw.uniform(0, 1, 4) < _OPEN_OR_SHUT, open_or_shut, draw.uniform(0, 1, 4))
+    return np.clip(np.where(draw.uniform(0, 1, 1) < _TOGETHER, together, alone), 0, 1)
 
 
 def _thumb(draw: _Draw) -> Floats:
     """Return the joints (n, 4, 3) of the thumb."""
     base = np.array(_THUMB_BASE) * (1 + PART_SPREAD * draw.normal(1))
-    base = base + 4 * draw.normal(3)
+    base = base + _BASE_SPREAD * draw.normal(3)
     forward = draw.uniform(*THUMB_FORWARD)
     # A thumb that opposes the fingers lies before the palm, not beside it.
-    aside = draw.uniform(*THUMB_ASIDE) - 0.35 * forward.clip(0) * draw.uniform(0, 1)
+    aside = draw.uniform(*THUMB_ASIDE) - _OPPOSITION * forward.clip(0) * draw.uniform(0, 1)
     a, b = np.radians(forward), np.radians(aside)
     ahead = np.stack((np.sin(a), -np.cos(a) * np.sin(b), -np.cos(a) * np.cos(b)), -1)
-    turn = np.radians(45 - 1.1 * forward + 15 * draw.normal())
-    across = np.stack((np.sin(turn), np.cos(turn), np.zeros_like(turn)), -1)
+    roll = np.radians(_THUMB_ROLL - _ROLL_FORWARD * forward + _THUMB_ROLL_SPREAD * draw.normal())
+    across = np.stack((np.sin(roll), np.cos(roll), np.zeros_like(roll)), -1)
     lengths = np.array(THUMB) * (1 + PART_SPREAD * draw.normal(1))
     lengths = lengths * (1 + BONE_SPREAD * draw.normal(3))
-    curl = draw.uniform(0, 1, 1) + 0.25 * draw.normal(2)
+    curl = draw.uniform(0, 1, 1) + _THUMB_SPREAD * draw.normal(2)
     mcp, ip = _within(THUMB_MCP, curl[:, 0]), _within(THUMB_IP, curl[:, 1])
     bends = np.stack((np.zeros_like(mcp), mcp, ip), -1)
     return _chain(base, _Bend(ahead, across), bends, lengths)

@@ -20,7 +20,13 @@ from deep_nrsfm_ros.lifting.history import Context, Memory, StateLayout
 from deep_nrsfm_ros.lifting.numpy_backend import Float32, LifterConstants, NumpyBackend
 from deep_nrsfm_ros.lifting.observation import from_arrays
 from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
-from deep_nrsfm_ros.lifting.own_bones import Learned, own_bones, partner_bones
+from deep_nrsfm_ros.lifting.own_bones import (
+    Learned,
+    in_reference_units,
+    named_lengths,
+    own_bones,
+    partner_bones,
+)
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.find_layout import find_layout
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -28,10 +34,9 @@ from deep_nrsfm_ros.model_files.model_file import Model
 _BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
 _RELEASED = 128  # blocks after which results that are in files are taken out of memory
 
-
-_IMAGE = np.array([-1, 1], np.float32)
-_CAMERA = np.array([-1, 1, 1], np.float32)  # x axis of the camera: to the right
-_OBJECT = np.array([1, -1, 1], np.float32)  # y axis of the object: to its left
+_MIRROR_IN_IMAGE = np.array([-1, 1], np.float32)
+_MIRROR_IN_CAMERA = np.array([-1, 1, 1], np.float32)  # x axis of the camera: to the right
+_MIRROR_IN_OBJECT = np.array([1, -1, 1], np.float32)  # y axis of the object: to its left
 
 
 class Lifted(NamedTuple):
@@ -156,24 +161,20 @@ class Lifter:
             length of the left one. And the seconds of sight behind the best known length; 0:
             nothing is learned.
         """
-        bones, row = self.constants.bones, memory.row(identity)
+        constants, row = self.constants, memory.row(identity)
+        bones = constants.bones
         if bones is None or row is None or np.isnan(row[0]):
             return {}, 0.0
         state = StateLayout(len(self.model.layout), len(bones.lengths)).split(row[None])
         learned = Learned(state.growth, state.evidence, state.misfit)
-        lengths = own_bones(bones, learned, self.constants.history.bones_time).lengths[0]
-        pairs = bones.ends.T.tolist()
-        reference = self.constants.reference
-        for pair, length in zip(pairs, lengths, strict=True):
-            if reference and set(pair) == set(reference):
-                lengths = lengths * (self.constants.reference_length / length)
-        names = self.model.layout.keypoints
-        shown = {
-            f"{names[a]}-{names[b]}": float(length)
-            for i, ((a, b), length) in enumerate(zip(pairs, lengths, strict=True))
-            if self.constants.bone_partners[i] >= i and state.evidence[0, i] > 0
-        }
-        return shown, float(state.evidence.max(initial=0))
+        lengths = own_bones(bones, learned, constants.history.bones_time).lengths[0]
+        if constants.reference:
+            reference, length = constants.reference, constants.reference_length
+            lengths = in_reference_units(lengths, bones.ends, reference, length)
+        first_of_pair = constants.bone_partners >= np.arange(len(lengths))
+        shown = first_of_pair & (state.evidence[0] > 0)
+        named = named_lengths(lengths, bones.ends, self.model.layout.keypoints, shown)
+        return named, float(state.evidence.max(initial=0))
 
     def lift(
         self,
@@ -206,7 +207,7 @@ class Lifter:
                 f"model {self.model.name!r} needs (n, {p}, 2) and (n, {p})"
             )
         if self.options.mirrored:
-            points, context = points * _IMAGE, context and _mirrored_context(context)
+            points, context = points * _MIRROR_IN_IMAGE, context and _mirrored_context(context)
         arrays, not_lifted = self.backend(points, confidence, perspective, context)
         lifted = Lifted(*arrays)
         if self.options.mirrored:
@@ -218,17 +219,19 @@ def _mirrored_context(context: Context) -> Context:
     """Return the context in the axes of the mirrored camera, whose x axis points to the left."""
     up, to_view = context.up, context.to_view
     return context._replace(
-        up=None if up is None else np.asarray(up) * _CAMERA,
-        to_view=None if to_view is None else _CAMERA[:, None] * to_view * _CAMERA,
+        up=None if up is None else np.asarray(up) * _MIRROR_IN_CAMERA,
+        to_view=None
+        if to_view is None
+        else _MIRROR_IN_CAMERA[:, None] * to_view * _MIRROR_IN_CAMERA,
     )
 
 
 def _mirrored(lifted: Lifted) -> Lifted:
     """Return the mirror images of lifted objects: left and right exchanged in image and object."""
     return lifted._replace(
-        shapes=lifted.shapes * _CAMERA,
-        rotations=_CAMERA[:, None] * lifted.rotations * _OBJECT,
-        translation=lifted.translation * _IMAGE,
+        shapes=lifted.shapes * _MIRROR_IN_CAMERA,
+        rotations=_MIRROR_IN_CAMERA[:, None] * lifted.rotations * _MIRROR_IN_OBJECT,
+        translation=lifted.translation * _MIRROR_IN_IMAGE,
     )
 
 

@@ -109,6 +109,41 @@ def own_bones(bones: Bones, learned: Learned, bones_time: float) -> Bones:
     return bones._replace(lengths=lengths, spread=spread)
 
 
+def in_reference_units(
+    lengths: Floats, ends: NDArray[np.int32], reference: tuple[int, int], reference_length: float
+) -> Floats:
+    """Return lengths (b,) scaled so that the bone of the reference pair has the reference length.
+
+    Where no bone joins the pair they stay.
+
+    Args:
+        lengths: (b,) of the bones, in any unit.
+        ends: (2, b) keypoints of the bones.
+        reference: pair of keypoints.
+        reference_length: distance of the pair in the new unit.
+    """
+    a, b = reference
+    joins = ((ends[0] == a) & (ends[1] == b)) | ((ends[0] == b) & (ends[1] == a))
+    return lengths * (reference_length / lengths[joins.argmax()]) if joins.any() else lengths
+
+
+def named_lengths(
+    lengths: Floats, ends: NDArray[np.int32], names: Sequence[str], chosen: NDArray[np.bool_]
+) -> dict[str, float]:
+    """Return the lengths of the chosen bones by the names of their ends: "elbow-wrist".
+
+    Args:
+        lengths: (b,) of the bones.
+        ends: (2, b) keypoints of the bones.
+        names: of all keypoints.
+        chosen: (b,) which bones.
+    """
+    return {
+        f"{names[ends[0, i]]}-{names[ends[1, i]]}": float(lengths[i])
+        for i in np.flatnonzero(chosen)
+    }
+
+
 def measure(bones: Bones, X: Floats, R: Floats, weight: Floats) -> Sight:
     """Return the bones as the first stage shows them.
 

@@ -76,8 +76,7 @@ def steady_depths(lifted: Lifted, memory: Memory, context: Context) -> Lifted:
     shapes, rotations = lifted.shapes.copy(), lifted.rotations.copy()
     if kernel.AVAILABLE and shapes.dtype == rotations.dtype == np.float32:
         kernel._kernel.steady_depths(
-            *(context.time, _constants(cutoff)),
-            *(memory.depth_states, context.rows, shapes, rotations),
+            context.time, _constants(cutoff), memory.depth_states, context.rows, shapes, rotations
         )
     else:
         for i, row in enumerate(context.rows.tolist()):

@@ -54,6 +54,7 @@ from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
@@ -246,7 +247,7 @@ class LifterNode(Node):
         self._bodies = BodyPublishers(self, self._body_options, camera.tf_prefix)
         self._bodies.describe(self._pipeline.model.layout)
         self._training = TrainingService(
-            *(self, self._training_request, self._switch_model, self._sandbox.models_dir)
+            self, self._training_request, self._switch_model, self._sandbox.models_dir
         )
 
     def activate(self) -> None:
@@ -328,51 +329,93 @@ class LifterNode(Node):
         if self._stream.searching:
             self._search_layout()
         try:
-            intrinsics = self._camera.require_intrinsics()
-            header, observation = self._pipeline.read(raw, source.reader, self._camera.size)
-            moment = self._moment(source, header.stamp if header else 0)
-            has_subscriber = self._objects.get_subscription_count()
-            needed = has_subscriber or self._tf or self._depth or self._bodies.wanted
-            if needed or self._pipeline.needs_identities:
-                identities = source.tracker(
-                    observation, moment.seconds, moment.period, self._pipeline.tolerances
-                )
-            else:
-                identities = ("",) * len(observation.confidence)
-            header = header or self._now()
-            if not header.frame_id or (self._frame_id and header.frame_id != self._frame_id):
-                header = header._replace(frame_id=self._frame(source, header.frame_id))
-            self._last_frame = header.frame_id
-            up = self._gravity(self._up, header.frame_id, header.stamp)
-            if up is None and self._target.name:
-                up = self._target.up(header)
-            detected = len(identities)
-            lifted, identities = self._pipeline.lift(
-                observation, intrinsics, identities, source.topic, moment, up
-            )
-            placed = None
-            if self._depth is not None and identities:
-                names = _names_of(source.topic, identities)
-                lifted, placed = self._depth(header, lifted, names, moment.seconds, self._pipeline)
-            if self._floor and identities and up is not None:
-                names = _names_of(source.topic, identities)
-                lifted = self._on_floor(names, lifted, up, moment, placed)
-            if self._target.name and identities:
-                header, lifted = self._target(header, lifted)
+            # Asked once: objects have identities only if there was a subscriber before the lift.
+            with_objects = self._objects.get_subscription_count() > 0
+            scene, places = self._lifted_scene(source, raw, with_objects=with_objects)
         except Exception as problem:  # one bad message must not end the node
             if self.context.ok():  # else a signal came meanwhile, and the message is not at fault
                 self._reject(source, problem)
             return
-        if not identities:
+        if not scene.identities:
             self._lifter_diagnostics.empty()
-            self._publish_bodies(source, Scene(header, lifted, (), 0, moment))
+            self._publish_bodies(source, scene)
             return
-        self._stream.lifted(lifted)
+        self._stream.lifted(scene.lifted)
+        self._publish_points(scene, with_objects=with_objects)
+        if self._camera.enabled and source.reader.input_type == YOLO.type:
+            self._publish_detections(scene.header, scene.lifted, raw, places)
+        self._publish_bodies(source, scene)
+        self._lifter_diagnostics.lifted(
+            time.perf_counter() - started, scene.lifted.residual, scene.lifted.confidence
+        )
+
+    def _lifted_scene(
+        self, source: KeypointTopic, raw: bytes, *, with_objects: bool
+    ) -> tuple[Scene, tuple[int, ...]]:
+        """Return the lifted objects of a message, and their `Observation.places`.
+
+        Args:
+            source: topic of the message.
+            raw: the message, serialised.
+            with_objects: whether ~/objects has a subscriber, which needs identities.
+
+        Raises:
+            MessageError: the message cannot be lifted.
+        """
+        intrinsics = self._camera.require_intrinsics()
+        header, observation = self._pipeline.read(raw, source.reader, self._camera.size)
+        moment = self._moment(source, header.stamp if header else 0)
+        identities = self._identities(source, observation, moment, with_objects=with_objects)
+        header = self._in_frame(source, header or self._now())
+        up = self._gravity(self._up, header.frame_id, header.stamp)
+        if up is None and self._target.name:
+            up = self._target.up(header)
+        detected = len(identities)
+        lifted, identities = self._pipeline.lift(
+            observation, intrinsics, identities, source.topic, moment, up
+        )
+        scene = Scene(header, lifted, identities, detected, moment)
+        return self._placed(source, scene, up) if identities else scene, observation.places
+
+    def _identities(
+        self, source: KeypointTopic, observation: Observation, moment: Moment, *, with_objects: bool
+    ) -> tuple[str, ...]:
+        """Return the identity of each object of a message, or "" where nothing needs them."""
+        needed = with_objects or self._tf or self._depth or self._bodies.wanted
+        if needed or self._pipeline.needs_identities:
+            return source.tracker(
+                observation, moment.seconds, moment.period, self._pipeline.tolerances
+            )
+        return ("",) * len(observation.confidence)
+
+    def _in_frame(self, source: KeypointTopic, header: Header) -> Header:
+        """Return the header with the frame of the points."""
+        if not header.frame_id or (self._frame_id and header.frame_id != self._frame_id):
+            header = header._replace(frame_id=self._frame(source, header.frame_id))
+        self._last_frame = header.frame_id
+        return header
+
+    def _placed(self, source: KeypointTopic, scene: Scene, up: NDArray[np.float64] | None) -> Scene:
+        """Return objects at the place and size that depth or the floor gives, in `target_frame`."""
+        header, lifted, identities, _, moment = scene
+        names = _names_of(source.topic, identities) if self._depth or self._floor else []
+        placed = None
+        if self._depth is not None:
+            lifted, placed = self._depth(header, lifted, names, moment.seconds, self._pipeline)
+        if self._floor and up is not None:
+            lifted = self._on_floor(names, lifted, up, moment, placed)
+        if self._target.name:
+            header, lifted = self._target(header, lifted)
+        return scene._replace(header=header, lifted=lifted)
+
+    def _publish_points(self, scene: Scene, *, with_objects: bool) -> None:
+        """Publish points, rotation, objects, transforms and markers of at least one object."""
+        header, lifted, identities, _, moment = scene
         positioned = self._camera.enabled
         self._points.publish(publishing.point_cloud(header, lifted))
         if not math.isnan(lifted.residual[0]):
             self._rotation.publish(publishing.camera_rotation(header, lifted.rotations[0]))
-        if has_subscriber:
+        if with_objects:
             self._objects.publish(
                 publishing.objects(header, lifted, identities, positioned=positioned)
             )
@@ -381,16 +424,9 @@ class LifterNode(Node):
         if self._markers.get_subscription_count():
             self._markers.publish(
                 publishing.markers(
-                    *(header, lifted, self._pipeline.edges, moment),
-                    positioned=positioned,
+                    header, lifted, self._pipeline.edges, moment, positioned=positioned
                 )
             )
-        if positioned and source.reader.input_type == YOLO.type:
-            self._publish_detections(header, lifted, raw, observation.places)
-        self._publish_bodies(source, Scene(header, lifted, identities, detected, moment))
-        self._lifter_diagnostics.lifted(
-            time.perf_counter() - started, lifted.residual, lifted.confidence
-        )
 
     def _on_floor(
         self,

@@ -258,13 +258,19 @@ def rotation_vector(R: Floats) -> Floats:
 
 
 def rotation_from_vector(v: Floats) -> Floats:
-    """Return the rotation (3, 3) of axis times angle v (3,) in radians, by Rodrigues' formula."""
-    angle = float(np.sqrt(v @ v))
-    x, y, z = v
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    # sin(angle) / angle and (1 - cos(angle)) / angle^2; sinc is also exact at 0.
-    a, b = np.sinc(angle / np.pi), np.sinc(angle / (2 * np.pi)) ** 2 / 2
-    R: Floats = np.eye(3) + a * K + b * (K @ K)
+    """Return rotations (..., 3, 3) of axis times angle v (..., 3) in radians.
+
+    Source: Rodrigues' formula.
+    """
+    x, y, z = np.moveaxis(v, -1, 0)
+    half = np.maximum(np.sqrt(x * x + y * y + z * z), _TINY) / 2  # floored: a, b, c are exact at 0
+    sine = np.sin(half)
+    # sin(angle) / angle, (1 - cos(angle)) / angle^2 and cos(angle).
+    a, b, c = sine * np.cos(half) / half, (sine / half) ** 2 / 2, 1 - 2 * sine * sine
+    R = np.empty((*v.shape[:-1], 3, 3))
+    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = b * x * x + c, b * x * y - a * z, b * x * z + a * y
+    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = b * x * y + a * z, b * y * y + c, b * y * z - a * x
+    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = b * x * z - a * y, b * y * z + a * x, b * z * z + c
     return R
 
 

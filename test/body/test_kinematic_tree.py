@@ -11,11 +11,11 @@ from deep_nrsfm_ros.body.kinematic_tree import (
     KinematicTree,
     _quaternions,
     quaternions,
-    rotation_about,
 )
 from deep_nrsfm_ros.layouts.joints import Joint
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31, COCO17, HUMAN17
+from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector
 from test.fixtures.standing_person import (
     HEIGHT,
     keypoints_of,
@@ -190,7 +190,7 @@ def test_a_layout_without_joints_has_no_tree() -> None:
 def test_any_object_may_have_a_tree() -> None:
     tree = KinematicTree(EXCAVATOR)
     points = np.array([[0, 0, 0], [0, 0, 2], [1, 0, 1], [3, 0, 3], [3, 0, 1]], float)
-    R = rotation_about(np.array([0.6, 0, 0.8]), np.array(1.0))
+    R = rotation_from_vector(np.array([0.6, 0, 0.8]))
     pose = tree(points[None] @ R.T)
     assert np.degrees(pose.angles[0]).tolist() == pytest.approx([45, 45])
     np.testing.assert_allclose(pose.rotations[0, 0], R, atol=1e-9)

@@ -72,7 +72,10 @@ def test_capsules_lie_on_the_bones() -> None:
 def test_names_are_those_of_rep_155() -> None:
     rename = rep155_name("x7")
     assert [rename(n) for n in ("left_elbow", "body", "r_y_hip", "right_hip")] == [
-        *("l_elbow_x7", "body_x7", "r_y_hip_x7", "r_hip_x7")
+        "l_elbow_x7",
+        "body_x7",
+        "r_y_hip_x7",
+        "r_hip_x7",
     ]
 
 

@@ -145,7 +145,10 @@ def test_a_type_of_a_known_detector_needs_no_definition_in_the_bag(
     given = people(5, 17)
     messages = [recorded.detections([{"id": "1", "points": p, "seen": range(17)}]) for p in given]
     bag = write_undefined(
-        *(tmp_path / "bag", recorded, "yolo_msgs/DetectionArray", messages),
+        tmp_path / "bag",
+        recorded,
+        "yolo_msgs/DetectionArray",
+        messages,
         storage_plugin=storage,
         text=text,
     )
@@ -194,7 +197,10 @@ def test_no_error_advises_what_was_done_already(tmp_path: Path, recorded: Any) -
     message = recorded.animals([])
     for storage in StoragePlugin:
         bag = write_undefined(
-            *(tmp_path / storage.name, recorded, "my_msgs/Animals", [message]),
+            tmp_path / storage.name,
+            recorded,
+            "my_msgs/Animals",
+            [message],
             storage_plugin=storage,
         )
         with pytest.raises(BagError, match="does not carry the definition") as error:

@@ -58,7 +58,11 @@ def model(
     together = np.c_[np.eye(b), rng.standard_normal((b, 3))]
     together /= np.linalg.norm(together, axis=1, keepdims=True)
     return Model(
-        *("random", network, layout, Normaliser(scale), frame),
+        "random",
+        network,
+        layout,
+        Normaliser(scale),
+        frame,
         error_covariance=covariance,
         bone_lengths=np.stack((lengths, spread), 1).astype(np.float32),
         bone_correlation=(together @ together.T).astype(np.float32),

@@ -253,8 +253,12 @@ def test_the_reference_length_is_that_of_the_object_unless_another_is_asked_for(
     pair = [HUMAN17.index(name) for name in HUMAN17.reference or ()]
     unknown = dataclasses.replace(HUMAN17, reference_length=None)
     for layout, length, height, expected in (
-        *((described, 0.0, 0.0, 0.52), (described, 2.0, 0.0, 2.0), (unknown, 0.0, 0.0, 1.0)),
-        *((HUMAN17, 0.0, 0.0, 0.5), (HUMAN17, 0.0, 1.4, 0.4), (HUMAN17, 0.6, 1.4, 0.6)),
+        (described, 0.0, 0.0, 0.52),
+        (described, 2.0, 0.0, 2.0),
+        (unknown, 0.0, 0.0, 1.0),
+        (HUMAN17, 0.0, 0.0, 0.5),
+        (HUMAN17, 0.0, 1.4, 0.4),
+        (HUMAN17, 0.6, 1.4, 0.6),
     ):
         options = LiftingOptions(reference_length=length, person_height=height)
         neck, hip = (

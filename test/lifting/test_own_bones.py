@@ -12,8 +12,10 @@ from deep_nrsfm_ros.lifting.own_bones import (
     MEMORY,
     Learned,
     Sight,
+    in_reference_units,
     learn,
     measure,
+    named_lengths,
     own_bones,
     own_growth,
     partner_bones,
@@ -145,3 +147,16 @@ def test_bones_are_measured_best_across_the_line_of_sight() -> None:
         assert sight.weight[n, b] == pytest.approx(across**8 * min(weight[n, i], weight[n, j]))
         length = np.exp(sight.growth[n, b]) * BONES.lengths[b]
         assert length == pytest.approx(np.linalg.norm(edge))
+
+
+def test_lengths_in_units_of_the_reference() -> None:
+    ends, lengths = np.array([[0, 1, 2], [1, 2, 3]], np.int32), np.array([2.0, 4.0, 8.0])
+    for pair in ((1, 2), (2, 1)):
+        assert in_reference_units(lengths, ends, pair, 0.5).tolist() == [0.25, 0.5, 1]
+    assert in_reference_units(lengths, ends, (0, 3), 0.5).tolist() == [2, 4, 8]  # no bone joins it
+
+
+def test_only_chosen_bones_are_named() -> None:
+    ends, chosen = np.array([[0, 1, 2], [1, 2, 3]], np.int32), np.array([True, False, True])
+    found = named_lengths(np.array([1.0, 2.0, 3.0]), ends, ("hip", "knee", "heel", "toe"), chosen)
+    assert found == {"hip-knee": 1, "heel-toe": 3}

@@ -26,8 +26,11 @@ def people() -> np.ndarray:
 def lifted(place: tuple[float, float, float] = (0, 0, 4), residual: float = 0.05) -> Lifted:
     shapes = np.full((N, Q, 3), place, np.float32)
     return Lifted(
-        *(shapes, np.tile(np.eye(3, dtype=np.float32), (N, 1, 1)), np.ones(N, np.float32)),
-        *(np.ones((N, 2), np.float32), np.full(N, residual, np.float32)),
+        shapes,
+        np.tile(np.eye(3, dtype=np.float32), (N, 1, 1)),
+        np.ones(N, np.float32),
+        np.ones((N, 2), np.float32),
+        np.full(N, residual, np.float32),
         np.full((N, Q), 0.8, np.float32),
     )
 

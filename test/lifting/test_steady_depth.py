@@ -27,7 +27,10 @@ def objects(shapes: np.ndarray, rotations: np.ndarray | None = None) -> Lifted:
     return Lifted(
         np.asarray(shapes, np.float32),
         np.array(rotations, np.float32),
-        *(ones, np.zeros((n, 2), np.float32), ones, np.ones(shapes.shape[:2], np.float32)),
+        ones,
+        np.zeros((n, 2), np.float32),
+        ones,
+        np.ones(shapes.shape[:2], np.float32),
     )
 
 

@@ -61,7 +61,7 @@ def shapes(n: int, p: int) -> Lifted:
 def test_each_object_is_put_into_the_detection_that_it_was_lifted_from(recorded: Detectors) -> None:
     model = load_model("human17")
     pipeline = Pipeline(
-        *(model, COCO17, InputOptions(min_score=0.5), LiftingOptions(), SmoothingOptions())
+        model, COCO17, InputOptions(min_score=0.5), LiftingOptions(), SmoothingOptions()
     )
     raw = bytes(recorded.store.serialize_cdr(recorded.detections(people()), KIND))
     decode: Any = partial(recorded.store.deserialize_cdr, typename=KIND)

@@ -183,7 +183,7 @@ def test_nothing_is_read_beyond_the_data(
 
     points, confidence = np.empty((4, 2, 2), np.float32), np.empty((4, 2), np.float32)
     _kernel.decode_keypoints(
-        *(bytes(96), (2, 48), (2, 2), (24, 12), (0, 4, 8), 1e9, 0.1, points, confidence)
+        bytes(96), (2, 48), (2, 2), (24, 12), (0, 4, 8), 1e9, 0.1, points, confidence
     )
     assert not points.any() and not confidence.any()
     confidence = np.empty((room, 2), np.float32)

@@ -162,9 +162,16 @@ def test_parameter_changes_at_full_rate_cost_no_message(
     heard = client.heard["/lifter/points"]
     heard.clear()
     wishes: list[tuple[str, Any]] = [
-        *(("model", "joints"), ("noise", 0.5), ("model", "broken"), ("test_time_rotations", 1)),
-        *(("model", "person"), ("keypoint_layout", "coco17"), ("min_confidence", 7.0)),
-        *(("test_time_rotations", 3), ("noise", 0.02), ("keypoint_layout", "model")),
+        ("model", "joints"),
+        ("noise", 0.5),
+        ("model", "broken"),
+        ("test_time_rotations", 1),
+        ("model", "person"),
+        ("keypoint_layout", "coco17"),
+        ("min_confidence", 7.0),
+        ("test_time_rotations", 3),
+        ("noise", 0.02),
+        ("keypoint_layout", "model"),
     ]
     refused = 0
     for second in range(10 * MANY):

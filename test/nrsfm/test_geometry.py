@@ -267,3 +267,12 @@ def test_on_one_line_sees_lines_and_spots_among_the_visible_points_only() -> Non
     assert on_one_line(W, visible).tolist() == [True, True, False, False]
     visible[3, 0] = False
     assert on_one_line(W, visible)[3]
+
+
+def test_rotations_from_vectors_are_scipys() -> None:
+    rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+    vectors = np.random.default_rng(0).standard_normal((5, 4, 3))
+    vectors *= np.array([0, 1e-13, 1e-6, 1, 10])[:, None, None]  # each row has one size
+    expected = rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(5, 4, 3, 3)
+    np.testing.assert_allclose(rotation_from_vector(vectors), expected, atol=1e-13)
+    np.testing.assert_allclose(rotation_from_vector(vectors[3, 0]), expected[3, 0], atol=1e-13)

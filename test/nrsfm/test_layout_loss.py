@@ -26,8 +26,11 @@ ANIMAL = KeypointLayout(
     "animal",
     ("left_hip", "right_hip", "neck", "nose", "left_foot", "right_foot"),
     edges=(
-        *(("left_hip", "left_foot"), ("right_foot", "right_hip")),
-        *(("neck", "nose"), ("left_hip", "right_hip"), ("neck", "left_hip")),
+        ("left_hip", "left_foot"),
+        ("right_foot", "right_hip"),
+        ("neck", "nose"),
+        ("left_hip", "right_hip"),
+        ("neck", "left_hip"),
     ),
     handedness=(("left_hip", "right_hip", "neck", "nose"),),
 )

@@ -100,7 +100,8 @@ def test_a_browser_follows_until_it_is_held_back(
     broadcast.put(frame(60))
     tab.wait("frames.length === 3")
     assert tab.evaluate("[index, document.getElementById('state').textContent]") == [
-        *(0, "live, paused"),
+        0,
+        "live, paused",
     ]
     tab.press("End")
     broadcast.put(frame(70))

@@ -64,8 +64,15 @@ def table(
         error = camera_errors(shapes, view.truth[frames])
         rows.append(
             [
-                *(len(run.stamps), len(frames), run.rate, run.latency(50), run.latency(99)),
-                *(run.error, error.aligned, error.in_camera, error.rotation),
+                len(run.stamps),
+                len(frames),
+                run.rate,
+                run.latency(50),
+                run.latency(99),
+                run.error,
+                error.aligned,
+                error.in_camera,
+                error.rotation,
                 100 * error.mirrored,
             ]
         )

@@ -122,78 +122,35 @@ def _detections(
     warnings: list[str],
     rate_acts: bool = False,
 ) -> Detections:
-    """Return the objects in arrays as detections."""
+    """Return the objects in arrays as detections, in the order of their frames.
+
+    Args:
+        arrays: by their names in an .npz; `points` (m, q, 2 or 3), the others optional.
+        options: how they are read.
+        warnings: from reading the arrays.
+        rate_acts: whether `options.rate` has been used for `stamps`.
+
+    Raises:
+        KeypointFileError: an array is not usable, or an option contradicts it.
+    """
     points = _numbers(arrays, "points", np.float64)
-    layout: KeypointLayout | None
-    if "names" in arrays and arrays["names"].dtype.kind == "U" and arrays["names"].ndim == 1:
-        named = layout_of_names(arrays["names"].tolist())
-        reason = contradiction(options.layout, named) if options.layout else ""
-        if options.layout and reason:
-            raise KeypointFileError(
-                f"its `names` are not those of the keypoint layout {options.layout.name}: "
-                f"{reason}; leave out --keypoint-layout to use the names of the file"
-            )
-        layout = options.layout or named
-    else:
-        layout = options.layout or options.fallback
-    if points.ndim != 3 or points.shape[2] not in (2, 3):
-        q = len(layout) if layout else "q"
-        raise KeypointFileError(
-            f"`points` is {points.shape}; (objects, {q}, 2), or 3 with the confidence, is "
-            f"needed: x, y in the order of the keypoint layout{_remedy(points.shape)}"
-        )
+    layout = _layout(arrays, options)
+    _check_shape(points, layout)
     m, q = points.shape[:2]
-    if layout and q != len(layout):
-        raise KeypointFileError(f"`points` is {points.shape}: {wrong_count(q, layout)}")
     if "confidence" in arrays:
         confidence = _numbers(arrays, "confidence", np.float64, (m, q))
         points = np.concatenate([points[..., :2], confidence[..., None]], -1)
-    frame = _numbers(arrays, "frame", np.int64, (m,)) if "frame" in arrays else np.arange(m)
-    count = int(frame.max(initial=-1)) + 1
-    if m and int(frame.min()) < 0:
-        raise KeypointFileError(f"`frame` has {frame.min()}; frames are counted from 0")
-    if count > m + _MAX_EMPTY:
-        raise KeypointFileError(
-            f"`frame` goes to {count - 1} with {m} objects; at most {_MAX_EMPTY} frames may show "
-            "nobody"
-        )
-    numbers = None
-    for name in ("stamps", "frame_numbers", "frame_names"):
-        if name in arrays and arrays[name].ndim == 1:
-            count = max(count, len(arrays[name]))
-    if "frame_numbers" in arrays:
-        numbers = _numbers(arrays, "frame_numbers", np.int64, (count,))
-    if "stamps" in arrays:
-        if options.rate and not rate_acts:
-            raise KeypointFileError("it has `stamps` of its own: leave out --rate")
-        stamps = _numbers(arrays, "stamps", np.int64, (count,))
-    else:
-        stamps = stamps_of(numbers, count, options.rate or DEFAULT_RATE)
-    names = arrays.get("frame_names", np.full(count, "")).astype(str)
-    if names.shape != (count,):
-        raise KeypointFileError(f"`frame_names` is {names.shape}; ({count},) is needed")
-    frames = Frames(np.arange(count) if numbers is None else numbers, names)
-    scores: NDArray[np.float32] = np.ones(m, np.float32)
-    if "scores" in arrays:
-        scores = _numbers(arrays, "scores", np.float32, (m,))
-    elif options.min_score:
-        raise KeypointFileError("it has no array `scores` (objects,): leave out --min-score")
-    if "identities" in arrays:
-        given = arrays["identities"]
-        if given.shape != (m,):
-            raise KeypointFileError(f"`identities` is {given.shape}; ({m},) is needed")
-        texts = [None if t in ("-1", "") else t for t in given.astype(str).tolist()]
-        identities, warning = identities_of(texts, frame)
-        warnings += [warning] if warning else []
-    else:
-        identities = index_in_frame(frame).astype(str)
+    frame = _frame_of_each(arrays, m)
+    frames, stamps = _frames_and_stamps(arrays, frame, options, rate_acts=rate_acts)
+    scores = _scores(arrays, m, options)
+    identities, warning = _identities(arrays, frame)
+    warnings = [*warnings, warning] if warning else warnings
     observation = to_observation(points, options.min_confidence)
     order = np.argsort(frame, kind="stable")
     kept = order[scores[order] >= options.min_score] if options.min_score else order
     if len(kept) < m:
-        warnings.append(
-            f"left out: {m - len(kept)} that have a score below --min-score {options.min_score:g}"
-        )
+        low = f"{m - len(kept)} that have a score below --min-score {options.min_score:g}"
+        warnings = [*warnings, f"left out: {low}"]
     return Detections(
         observation.points[kept],
         observation.confidence[kept],
@@ -205,6 +162,122 @@ def _detections(
         layout=layout,
         warnings=tuple(warnings),
     )
+
+
+def _layout(arrays: Mapping[str, NDArray[Any]], options: ReadOptions) -> KeypointLayout | None:
+    """Return the layout of the keypoints: of the options, of `names`, or the fallback.
+
+    Raises:
+        KeypointFileError: `names` contradicts the layout of the options.
+    """
+    names = arrays.get("names")
+    if names is None or names.dtype.kind != "U" or names.ndim != 1:
+        return options.layout or options.fallback
+    named = layout_of_names(names.tolist())
+    reason = contradiction(options.layout, named) if options.layout else ""
+    if options.layout and reason:
+        raise KeypointFileError(
+            f"its `names` are not those of the keypoint layout {options.layout.name}: "
+            f"{reason}; leave out --keypoint-layout to use the names of the file"
+        )
+    return options.layout or named
+
+
+def _check_shape(points: NDArray[Any], layout: KeypointLayout | None) -> None:
+    """Raise KeypointFileError unless points are (m, q, 2 or 3), with the layout's q keypoints."""
+    if points.ndim != 3 or points.shape[2] not in (2, 3):
+        q = len(layout) if layout else "q"
+        raise KeypointFileError(
+            f"`points` is {points.shape}; (objects, {q}, 2), or 3 with the confidence, is "
+            f"needed: x, y in the order of the keypoint layout{_remedy(points.shape)}"
+        )
+    q = points.shape[1]
+    if layout and q != len(layout):
+        raise KeypointFileError(f"`points` is {points.shape}: {wrong_count(q, layout)}")
+
+
+def _frame_of_each(arrays: Mapping[str, NDArray[Any]], m: int) -> NDArray[np.int64]:
+    """Return the frame (m,) of each object: `frame`, else one frame for each object.
+
+    Raises:
+        KeypointFileError: a frame is negative, or there are far more frames than objects.
+    """
+    if "frame" not in arrays:
+        return np.arange(m)
+    frame = _numbers(arrays, "frame", np.int64, (m,))
+    if m and int(frame.min()) < 0:
+        raise KeypointFileError(f"`frame` has {frame.min()}; frames are counted from 0")
+    last = int(frame.max(initial=-1))
+    if last + 1 > m + _MAX_EMPTY:
+        raise KeypointFileError(
+            f"`frame` goes to {last} with {m} objects; at most {_MAX_EMPTY} frames may show nobody"
+        )
+    return frame
+
+
+def _frames_and_stamps(
+    arrays: Mapping[str, NDArray[Any]],
+    frame: NDArray[np.int64],
+    options: ReadOptions,
+    *,
+    rate_acts: bool,
+) -> tuple[Frames, NDArray[np.int64]]:
+    """Return numbers and names of all frames, and their stamps, also of those without objects.
+
+    Raises:
+        KeypointFileError: arrays of frames differ in length, or a rate contradicts `stamps`.
+    """
+    count = int(frame.max(initial=-1)) + 1
+    for name in ("stamps", "frame_numbers", "frame_names"):
+        if name in arrays and arrays[name].ndim == 1:
+            count = max(count, len(arrays[name]))
+    numbers = None
+    if "frame_numbers" in arrays:
+        numbers = _numbers(arrays, "frame_numbers", np.int64, (count,))
+    if "stamps" in arrays:
+        if options.rate and not rate_acts:
+            raise KeypointFileError("it has `stamps` of its own: leave out --rate")
+        stamps = _numbers(arrays, "stamps", np.int64, (count,))
+    else:
+        stamps = stamps_of(numbers, count, options.rate or DEFAULT_RATE)
+    names = arrays.get("frame_names", np.full(count, "")).astype(str)
+    if names.shape != (count,):
+        raise KeypointFileError(f"`frame_names` is {names.shape}; ({count},) is needed")
+    return Frames(np.arange(count) if numbers is None else numbers, names), stamps
+
+
+def _scores(
+    arrays: Mapping[str, NDArray[Any]], m: int, options: ReadOptions
+) -> NDArray[np.float32]:
+    """Return the score (m,) of each object; 1 without `scores`.
+
+    Raises:
+        KeypointFileError: there are none, and the options have a least score.
+    """
+    if "scores" in arrays:
+        return _numbers(arrays, "scores", np.float32, (m,))
+    if options.min_score:
+        raise KeypointFileError("it has no array `scores` (objects,): leave out --min-score")
+    return np.ones(m, np.float32)
+
+
+def _identities(
+    arrays: Mapping[str, NDArray[Any]], frame: NDArray[np.int64]
+) -> tuple[NDArray[np.str_], str]:
+    """Return the identity (m,) of each object and a warning, or ""; see `identities_of`.
+
+    Without `identities` an object has its index in its frame.
+
+    Raises:
+        KeypointFileError: `identities` has another shape.
+    """
+    if "identities" not in arrays:
+        return index_in_frame(frame).astype(str), ""
+    given = arrays["identities"]
+    if given.shape != frame.shape:
+        raise KeypointFileError(f"`identities` is {given.shape}; ({len(frame)},) is needed")
+    texts = [None if t in ("-1", "") else t for t in given.astype(str).tolist()]
+    return identities_of(texts, frame)
 
 
 def _remedy(shape: tuple[int, ...]) -> str:

@@ -12,11 +12,11 @@
    from the median are left out. EM-PPCA starts again from the weighted mean of the others. For its
    cameras there are shapes of lowest weighted nuclear norm, too. The result is the weighted mean of
    all these solutions.
-4. Where half or more of the solutions of EM-PPCA are far from the median, its cameras are kept,
-   also those from rigid factorisation, and its shapes are not: the shapes of lowest nuclear norm
-   take their place. In each of three rounds EM-PPCA starts from the mean of these solutions. In the
-   last round the nuclear norm is weighted, which shrinks large singular values less. Where a model
-   of this round leaves no noise, the one with the fewest modes is the result.
+4. Where half or more of the solutions of EM-PPCA are far from the median, only its cameras are
+   kept, with those of EM-PPCA from rigid factorisation. The shapes of lowest nuclear norm take the
+   place of its shapes. In each of three rounds EM-PPCA starts from the mean of these solutions. In
+   the last round the nuclear norm is weighted, which shrinks large singular values less. Where a
+   model of this round leaves no noise, the one with the fewest modes is the result.
 
 The errors of depth of the solutions are partly independent, so that the mean is better than each:
 on pickup, yoga and face_mocap by 15 to 50 %.
@@ -38,7 +38,12 @@ from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import (
     block_rotations,
     least_nuclear_norm,
 )
-from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import LinearModel, fit, from_shapes, shapes_of
+from deep_nrsfm_ros.nrsfm.factorisation.em_ppca import (
+    LinearModel,
+    fit_from_rigid,
+    fit_from_shapes,
+    shapes_of,
+)
 from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations
 from deep_nrsfm_ros.nrsfm.geometry import align, back_project, centre, rotation_from_camera
 
@@ -147,14 +152,14 @@ def _once_more(W: Floats, agreeing: list[_Solution], before_each: Callable[[], N
 def _in_rounds(W: Floats, models: list[LinearModel], before_each: Callable[[], None]) -> _Mean:
     """Return the mean of solutions for cameras of EM-PPCA, which starts from the mean each time.
 
-    As many modes as points explain half of an image, whatever the cameras: such models are left
-    out, and those of the fewest modes, which explain too little.
+    Left out: models with as many modes as points or more, which fit any cameras, and models with
+    the fewest modes, which fit too little.
     """
     modes = [K for K in MODES[1:] if K < W.shape[1]] or list(MODES[:1])
     several = [model for model in models if len(model.basis) - 1 in modes]
     for K in modes:
         before_each()
-        several.append(fit(W, K, iterations=_EM_ITERATIONS))
+        several.append(fit_from_rigid(W, K, iterations=_EM_ITERATIONS))
     found = _mean(W, [_of_least_norm(W, model.Q) for model in several])
     spread = found.spread
     for iterations in _ROUNDS:
@@ -257,11 +262,11 @@ def _exact(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     for K in _FEW_MODES:
         for annealed in (False, True):
             before_each()
-            models[K, annealed] = fit(W, K, annealed=annealed, iterations=_EM_ITERATIONS)
+            models[K, annealed] = fit_from_rigid(W, K, annealed=annealed, iterations=_EM_ITERATIONS)
     K, annealed = min(models, key=lambda settings: models[settings].variance)
     if models[K, annealed].variance > _NO_NOISE * float((W**2).mean()):
         return []
-    return [_solution(W, fit(W, K, annealed=annealed, iterations=_MORE_ITERATIONS))]
+    return [_solution(W, fit_from_rigid(W, K, annealed=annealed, iterations=_MORE_ITERATIONS))]
 
 
 def _models(
@@ -274,7 +279,7 @@ def _models(
     """Yield the models of EM-PPCA with different numbers of modes."""
     for K in modes:
         before_each()
-        yield from_shapes(W, start.Q, start.S, K, iterations=iterations)
+        yield fit_from_shapes(W, start.Q, start.S, K, iterations=iterations)
 
 
 def _solution(W: Floats, model: LinearModel) -> _Solution:

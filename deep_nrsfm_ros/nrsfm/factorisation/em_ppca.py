@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.factorisation.rigid import rigid_rotations, rigid_shape
-from deep_nrsfm_ros.nrsfm.geometry import align, rotation_from_camera
+from deep_nrsfm_ros.nrsfm.geometry import align, rotation_from_camera, rotation_from_vector
 
 Floats = NDArray[Any]
 
@@ -72,9 +72,8 @@ def em_ppca(
         mirror_test: see `_mirror_test`; not in the authors' program.
         iterations: of EM.
     """
-    Y = W.astype(np.float64).swapaxes(1, 2)
-    model = _fit(Y, K, annealed=annealed, mirror_test=mirror_test, iterations=iterations)
-    return _shapes(model, _posterior(Y, model))
+    model = fit_from_rigid(W, K, annealed=annealed, mirror_test=mirror_test, iterations=iterations)
+    return shapes_of(W, model)
 
 
 def em_ppca_by_likelihood(
@@ -103,12 +102,6 @@ def em_ppca_by_likelihood(
     return best[1]
 
 
-def _fit(Y: Floats, K: int, *, annealed: bool, mirror_test: bool, iterations: int) -> LinearModel:
-    """Return the model that EM finds from rigid factorisation."""
-    start = _start(Y, K)
-    return _iterate(Y, start, annealed=annealed, mirror_test=mirror_test, iterations=iterations)
-
-
 def _iterate(
     Y: Floats, model: LinearModel, *, annealed: bool, mirror_test: bool, iterations: int
 ) -> LinearModel:
@@ -133,23 +126,43 @@ def _start(Y: Floats, K: int, rng: np.random.Generator | None = None) -> LinearM
     W = Y.swapaxes(1, 2)
     Q = rotation_from_camera(rigid_rotations(W).swapaxes(1, 2))
     if rng is not None:
-        Q = _rotation(RESTART_ANGLE * rng.standard_normal((len(Y), 3))) @ Q
+        Q = rotation_from_vector(RESTART_ANGLE * rng.standard_normal((len(Y), 3))) @ Q
     mean = rigid_shape(W, Q[:, :2])
     residual = Y - Q[:, :2] @ mean.T
-    lifted = (Q[:, :2].swapaxes(1, 2) @ residual).reshape(len(Y), -1)
-    _, s, Vt = np.linalg.svd(lifted, full_matrices=False)
-    modes = (s[:K, None] / len(Y) ** 0.5 * Vt[:K]).reshape(-1, 3, Y.shape[2])
+    modes, _ = _modes_of(Q[:, :2].swapaxes(1, 2) @ residual, K)
     return LinearModel(Q, np.concatenate((mean.T[None], modes)), float((residual**2).mean()))
 
 
-def fit(W: Floats, K: int, *, annealed: bool = False, iterations: int = 300) -> LinearModel:
-    """Return the model that EM finds for images W (f, p, 2) from rigid factorisation."""
+def _modes_of(deviations: Floats, K: int) -> tuple[Floats, float]:
+    """Return the K principal modes (K, 3, p) of deviations (f, 3, p), and the sum of squares left.
+
+    The length of a mode is the standard deviation of its coefficient.
+    """
+    f, _, p = deviations.shape
+    _, s, Vt = np.linalg.svd(deviations.reshape(f, -1), full_matrices=False)
+    modes = s[:K, None] / f**0.5 * Vt[:K]
+    return modes.reshape(-1, 3, p), float((s[K:] ** 2).sum())
+
+
+def fit_from_rigid(
+    W: Floats, K: int, *, annealed: bool = False, mirror_test: bool = False, iterations: int = 300
+) -> LinearModel:
+    """Return mean shape, K modes and cameras that EM finds from rigid factorisation.
+
+    Args:
+        W: (f, p, 2) images.
+        K: number of modes.
+        annealed: see `em_ppca`.
+        mirror_test: see `em_ppca`.
+        iterations: of EM.
+    """
     Y = W.astype(np.float64).swapaxes(1, 2)
-    return _fit(Y, K, annealed=annealed, mirror_test=False, iterations=iterations)
+    start = _start(Y, K)
+    return _iterate(Y, start, annealed=annealed, mirror_test=mirror_test, iterations=iterations)
 
 
-def from_shapes(W: Floats, Q: Floats, S: Floats, K: int, *, iterations: int) -> LinearModel:
-    """Return mean shape, K modes and cameras of highest likelihood, starting from other shapes.
+def fit_from_shapes(W: Floats, Q: Floats, S: Floats, K: int, *, iterations: int) -> LinearModel:
+    """Return mean shape, K modes and cameras that EM finds from given shapes and cameras.
 
     Args:
         W: (f, p, 2) images.
@@ -160,16 +173,10 @@ def from_shapes(W: Floats, Q: Floats, S: Floats, K: int, *, iterations: int) -> 
     """
     Y = W.astype(np.float64).swapaxes(1, 2)
     mean = S.mean(0)
-    _, s, Vt = np.linalg.svd((S - mean).swapaxes(1, 2).reshape(len(S), -1), full_matrices=False)
-    modes = (s[:K, None] / len(S) ** 0.5 * Vt[:K]).reshape(-1, 3, W.shape[1])
-    size = float((Y**2).mean())
-    variance = float((s[K:] ** 2).sum()) / S.size + 1e-4 * size
-    model = LinearModel(Q, np.concatenate((mean.T[None], modes)), variance)
-    for _ in range(iterations):
-        z, zz, _ = _posterior(Y, model)
-        Q = _update_rotations(Y, model, z, zz)
-        model = LinearModel(Q, *_fit_basis(Y, Q[:, :2], z, zz))
-    return model
+    modes, left = _modes_of((S - mean).swapaxes(1, 2), K)
+    variance = left / S.size + 1e-4 * float((Y**2).mean())
+    start = LinearModel(Q, np.concatenate((mean.T[None], modes)), variance)
+    return _iterate(Y, start, annealed=False, mirror_test=False, iterations=iterations)
 
 
 def shapes_of(W: Floats, model: LinearModel) -> Floats:
@@ -240,16 +247,8 @@ def _update_rotations(Y: Floats, model: LinearModel, z: Floats, zz: Floats) -> F
     gradient = np.stack((-E[:, 1, 2], E[:, 0, 2], E[:, 1, 0] - E[:, 0, 1]), 1)
     w = np.linalg.solve(H, gradient[..., None])[..., 0]
     w *= np.minimum(1, 0.3 / np.maximum(np.linalg.norm(w, axis=1), 1e-12))[:, None]
-    updated: Floats = _rotation(w) @ Q
+    updated: Floats = rotation_from_vector(w) @ Q
     return updated
-
-
-def _rotation(w: Floats) -> Floats:
-    """Return exp([w]) (f, 3, 3) of rotation vectors w (f, 3), by Rodrigues' formula."""
-    angle = np.maximum(np.linalg.norm(w, axis=1), 1e-12)[:, None, None]
-    X = np.cross(np.eye(3), w[:, None, :] / angle)
-    rotation: Floats = np.eye(3) + np.sin(angle) * X + (1 - np.cos(angle)) * X @ X
-    return rotation
 
 
 def _fit_basis(Y: Floats, R: Floats, z: Floats, zz: Floats) -> tuple[Floats, float]:

@@ -132,7 +132,7 @@ def test_neighbours_solve_what_all_frames_together_cannot() -> None:
 
 def test_mirror_test_turns_frames_that_are_mirrored_and_no_others(deforming: Seen) -> None:
     Y = deforming.points.swapaxes(1, 2)
-    model = em_module._fit(Y, MODES, annealed=False, mirror_test=False, iterations=40)
+    model = em_module.fit_from_rigid(deforming.points, MODES, iterations=40)
     wrong = np.arange(len(Y)) % 5 == 0
     mean = model.basis[0].T
     depth_negated = mean @ model.Q.swapaxes(1, 2) * [1, 1, -1]

@@ -49,9 +49,9 @@ def test_the_last_step_learns_from_virtual_and_detected_hands(
 def test_a_hidden_keypoint_is_expected_where_the_model_lifts_it() -> None:
     model = load_model("hand21")
     virtual = virtual_hands(40, 5).points
-    exact = hands.hidden_keypoint_errors(model, virtual)
+    exact = hands.hidden_keypoint_error(model, virtual)
     assert 0 < exact < 30
     moved = virtual.copy()
     moved[:, ::4] += 50  # each fourth keypoint is elsewhere, so none is where the others tell
-    assert hands.hidden_keypoint_errors(model, moved) > 2 * exact
-    assert hands.hidden_keypoint_errors(model, 7 * virtual + 300) == pytest.approx(exact, rel=1e-3)
+    assert hands.hidden_keypoint_error(model, moved) > 2 * exact
+    assert hands.hidden_keypoint_error(model, 7 * virtual + 300) == pytest.approx(exact, rel=1e-3)
