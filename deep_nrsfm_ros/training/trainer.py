@@ -138,18 +138,24 @@ class Trainer:
         )
 
     def known_shapes(self) -> Tensor | None:
-        """Return the known shapes of the next step: those of the last batch, some recombined."""
+        """Return the known shapes of the next step: those of `shapes`, some recombined.
+
+        Shapes that `cameras` see stay as they are, since these are the cameras of their frames.
+        """
         shapes = self.shapes
         if shapes is None or self.parts is None:
             return shapes
         share = self.preset.recipe.parts * max(1 - self.progress, 0.0)
-        count = round(share * len(shapes))
+        kept = 0 if self.cameras is None else len(self.cameras)
+        count = min(round(share * len(shapes)), len(shapes) - kept)
         if not count:
             return shapes
         rng = np.random.default_rng((self.seed, self.group.rank, self.step))
-        recombined = self.parts.recombine(shapes.cpu().numpy(), count, rng)
-        first = torch.from_numpy(recombined.astype(np.float32)).to(shapes.device)
-        return torch.cat((first, shapes[count:]))
+        without_camera_first = shapes.roll(-kept, 0).cpu().numpy()
+        recombined = self.parts.recombine(without_camera_first, count, rng)
+        result = shapes.clone()
+        result[kept : kept + count] = torch.from_numpy(recombined.astype(np.float32))
+        return result
 
     def advance(self) -> None:
         """Take one gradient step."""

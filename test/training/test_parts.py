@@ -12,10 +12,19 @@ import pytest
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31
-from deep_nrsfm_ros.nrsfm.geometry import align, centre, rotation_from_vector
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
+from deep_nrsfm_ros.nrsfm.geometry import (
+    align,
+    centre,
+    rotation_from_camera,
+    rotation_from_vector,
+)
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
+from deep_nrsfm_ros.training.few_frames import Lesson
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.loop import Setup, train
+from deep_nrsfm_ros.training.mirror import MirrorCheck, Teacher
 from deep_nrsfm_ros.training.parts import PartOptions, Parts
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -150,6 +159,27 @@ def test_only_the_first_shapes_are_recombined_and_fewer_with_progress(
         assert known is not None
         changed = (known != trainer.shapes).any(-1).any(-1).numpy()
         np.testing.assert_array_equal(changed, np.arange(64) < recombined)
+
+
+def test_a_frame_keeps_its_shape_where_its_own_camera_sees_it(
+    figure: Any, trained: Trainer, limbs: Parts
+) -> None:
+    f = 40
+    rotations = rotation_from_camera(figure.cameras[:f])
+    known = Consensus(centre(figure.shapes[:f]), rotations, np.ones(f), 0.01, 5)
+    recipe = dataclasses.replace(trained.preset.recipe, parts=1.0, steps=8)
+    frames = FrameStore.of(figure.points[:f], np.ones(figure.points[:f].shape[:2], bool))
+    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
+    trainer.parts = limbs
+    Teacher(MirrorCheck(frames, Normaliser()), recipe, Lesson(known)).prepare(trainer)
+    shapes, cameras = trainer.known_shapes(), trainer.cameras
+    assert shapes is not None and cameras is not None
+    images = (cameras @ shapes[: len(cameras)].mT).mT.numpy()
+    apart = images[:, None] - centre(figure.points[:f])
+    assert np.linalg.norm(apart, axis=(2, 3)).min(1) == pytest.approx(0, abs=1e-4)
+    assert trainer.shapes is not None
+    changed = (shapes != trainer.shapes).any(-1).any(-1).numpy()
+    np.testing.assert_array_equal(changed, np.arange(64) >= len(cameras))
 
 
 @pytest.mark.parametrize(
