@@ -13,15 +13,15 @@ from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Recipe
 
 FROM_RANDOM = 30_000
 """Steps of a training from random weights, and the most of one that starts from a model."""
-_FRAMES_A_STEP = 3  # of a training that starts from a model: each frame is seen 21 times or more
-_FEWEST = 300
+_FRAMES_A_STEP = 3  # of a training that starts from a model: 64 a batch are 21 passes over them
+_MIN_STEPS = 300  # of a training that starts from a model
 _OTHER_KEYPOINTS = 10  # times as many steps, as new keypoints are learned from nothing
 
 
 def with_steps(recipe: Recipe, frames: int, start: Network | None) -> Recipe:
     """Return the recipe with the number of its steps in place of `AUTOMATIC`.
 
-    A trained network has learned what shapes there are, so that a few passes over the new frames
+    A trained network has learned what shapes there are, so that about 21 passes over the new frames
     suffice; with more it fits their noise. `benchmarks/real/fine_tuning.py` compares numbers.
 
     Args:
@@ -34,7 +34,7 @@ def with_steps(recipe: Recipe, frames: int, start: Network | None) -> Recipe:
         return recipe
     wanted = FROM_RANDOM
     if start is not None:
-        wanted = max(frames // _FRAMES_A_STEP, _FEWEST)
+        wanted = max(frames // _FRAMES_A_STEP, _MIN_STEPS)
         if has_other_keypoints(start):
             wanted *= _OTHER_KEYPOINTS
     return dataclasses.replace(recipe, steps=min(wanted, FROM_RANDOM))
