@@ -43,8 +43,8 @@ from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.judge import Figures, Judge, rank, worse_figures
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.loop import Setup, train
-from deep_nrsfm_ros.training.parts import Parts
 
 Floats = NDArray[Any]
 
@@ -226,7 +226,7 @@ def trained(scene: Scene, run: Run, file: Path) -> Model:
     setup = Setup(
         start_from(start, layout) if start else None,
         LayoutLoss(_HELP, layout) if run.helped else None,
-        parts=Parts.of(layout),
+        limb_exchange=LimbExchange.of(layout),
     )
     trainer = train(frames.points, frames.visible, preset._replace(recipe=recipe), setup)
     model = finish(trainer, str(run), layout, "benchmark")

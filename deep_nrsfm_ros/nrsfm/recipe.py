@@ -13,7 +13,7 @@ from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 AUTOMATIC = -1
-"""Number of steps, or share of parts, that stands for one that follows from start and frames."""
+"""Value of `steps` or `limb_exchange` for which the training chooses by its start and frames."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Recipe:
         low=0.01,
         high=100.0,
     )
-    parts: float = option(
+    limb_exchange: float = option(
         float(AUTOMATIC),
         "share of the known shapes of the cycle loss in which limbs are exchanged between shapes "
         "and turned at the joints, at the first step; it falls to 0 by the last step; lifts people "

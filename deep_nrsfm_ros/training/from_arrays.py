@@ -24,7 +24,7 @@ from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
 from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model, load_once
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
-from deep_nrsfm_ros.training.parts import Parts
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.progress import Progress
@@ -102,7 +102,7 @@ def train(
     rival = origin or _shipped(layout)
     frames = split(curated.dataset, Curation().held_out if rival else 0.0)
     preset = PRESETS["default"]._replace(recipe=recipe or Recipe())
-    setup = Setup(parts=Parts.of(layout))
+    setup = Setup(limb_exchange=LimbExchange.of(layout))
     if origin:
         preset = preset._replace(
             architecture=origin.network.architecture, normaliser=origin.normaliser

@@ -30,9 +30,9 @@ from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
 from deep_nrsfm_ros.training.few_frames import Lesson, factorise
 from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
-from deep_nrsfm_ros.training.parts import Parts
 from deep_nrsfm_ros.training.progress import Clock, Progress
 from deep_nrsfm_ros.training.schedule import has_other_keypoints, with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
@@ -50,7 +50,8 @@ class Setup:
         start: network to begin with, of the preset's architecture (see `fine_tuning`); None
             begins with random networks, of which the screening chooses one.
         layout_loss: loss of the keypoint layout that is added to the recipe's; None is none.
-        parts: the limbs of the keypoint layout, which `Recipe.parts` needs; None: it has none.
+        limb_exchange: the limbs of the keypoint layout, which `Recipe.limb_exchange` needs; None:
+            it has none.
         limits: when the training ends before its last step, and which state it keeps.
         group: the processes that share the training.
         own_frames: whether each process has frames of its own; else all have all frames.
@@ -58,7 +59,7 @@ class Setup:
 
     start: Network | None = None
     layout_loss: LayoutLoss | None = None
-    parts: Parts | None = None
+    limb_exchange: LimbExchange | None = None
     limits: Limits = WHOLE
     group: ProcessGroup = ALONE
     own_frames: bool = False
@@ -144,7 +145,7 @@ def train(
     if setup.own_frames:
         group.sum_in_place(count)
     recipe = with_steps(preset.recipe, int(count), setup.start)
-    preset = preset._replace(recipe=_with_parts(recipe, setup))
+    preset = preset._replace(recipe=_with_limb_exchange(recipe, setup))
     if group.size > min(len(frames) * (group.size if setup.own_frames else 1), preset.recipe.batch):
         raise ValueError(
             f"{group.size} processes are more than the {len(frames)} frames or the batch of "
@@ -166,7 +167,7 @@ def train(
     return loop.train()
 
 
-def _with_parts(recipe: Recipe, setup: Setup) -> Recipe:
+def _with_limb_exchange(recipe: Recipe, setup: Setup) -> Recipe:
     """Return the recipe with the share of exchanged limbs in place of `AUTOMATIC`.
 
     Frames of a training that starts from a model are often of one person or of few motions, from
@@ -175,15 +176,17 @@ def _with_parts(recipe: Recipe, setup: Setup) -> Recipe:
     Raises:
         ValueError: the recipe exchanges limbs, and the layout has none; or the share is no share.
     """
-    if AUTOMATIC < recipe.parts < 0:
-        raise ValueError(f"parts is {recipe.parts:g}; it must be {AUTOMATIC} or from 0 to 1")
-    if recipe.parts == AUTOMATIC:
-        automatic = setup.start is not None and setup.parts is not None
-        recipe = dataclasses.replace(recipe, parts=float(automatic))
-    if recipe.parts and setup.parts is None:
+    if AUTOMATIC < recipe.limb_exchange < 0:
         raise ValueError(
-            f"parts is {recipe.parts:g}, but there are no limbs to exchange: no edge of the layout "
-            "divides it"
+            f"limb_exchange is {recipe.limb_exchange:g}; it must be {AUTOMATIC} or from 0 to 1"
+        )
+    if recipe.limb_exchange == AUTOMATIC:
+        automatic = setup.start is not None and setup.limb_exchange is not None
+        recipe = dataclasses.replace(recipe, limb_exchange=float(automatic))
+    if recipe.limb_exchange and setup.limb_exchange is None:
+        raise ValueError(
+            f"limb_exchange is {recipe.limb_exchange:g}, but there are no limbs to exchange: no "
+            "edge of the layout divides it"
         )
     return recipe
 
@@ -278,7 +281,7 @@ class _Loop:
         trainer = Trainer(
             *(self.frames, self.preset, seed, setup.start, setup.group, setup.layout_loss)
         )
-        trainer.known, trainer.parts = self.known, setup.parts
+        trainer.known, trainer.limb_exchange = self.known, setup.limb_exchange
         return trainer
 
     def _advance(self, steps: int, time_budget: float, *, chosen: bool = False) -> None:

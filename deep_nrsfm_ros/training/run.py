@@ -23,7 +23,7 @@ from deep_nrsfm_ros.training.data_check import check_dataset
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
-from deep_nrsfm_ros.training.parts import Parts
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data, read_people
 from deep_nrsfm_ros.training.record import checkpoint_file, keep_record
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
@@ -197,7 +197,7 @@ def _train(
             loss,
             limits=config.limits,
             group=group,
-            parts=Parts.of(dataset.layout),
+            limb_exchange=LimbExchange.of(dataset.layout),
             own_frames=not config.data.cmu,
         ),
         Callbacks(on_progress=reporter.training, should_stop=should_stop, on_message=reporter.say),

@@ -23,7 +23,7 @@ _TINY = 1e-9
 
 
 @dataclass(frozen=True)
-class PartOptions:
+class ExchangeOptions:
     """How shapes are recombined.
 
     Attributes:
@@ -37,10 +37,10 @@ class PartOptions:
     lengths: float = 0.1
 
 
-DEFAULT_PARTS = PartOptions()
+DEFAULT_EXCHANGE = ExchangeOptions()
 
 
-class Parts:
+class LimbExchange:
     """The limbs of a layout, and shapes recombined of them.
 
     Attributes:
@@ -48,7 +48,7 @@ class Parts:
         joints: (e,) the end of each of these edges on its other side.
     """
 
-    def __init__(self, layout: KeypointLayout, options: PartOptions = DEFAULT_PARTS) -> None:
+    def __init__(self, layout: KeypointLayout, options: ExchangeOptions = DEFAULT_EXCHANGE) -> None:
         """Find the limbs.
 
         An edge divides the layout where no other way leads from one of its ends to the other: an
@@ -81,7 +81,7 @@ class Parts:
         self._ends = np.array(ends)
 
     @classmethod
-    def of(cls, layout: KeypointLayout) -> Parts | None:
+    def of(cls, layout: KeypointLayout) -> LimbExchange | None:
         """Return the limbs of a layout; None if it has none."""
         try:
             return cls(layout)
