@@ -23,7 +23,7 @@ from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Network
-from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Preset, Recipe
+from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
@@ -34,7 +34,7 @@ from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
 from deep_nrsfm_ros.training.progress import Clock, Progress
-from deep_nrsfm_ros.training.schedule import has_other_keypoints, with_steps
+from deep_nrsfm_ros.training.schedule import has_other_keypoints, with_limb_exchange, with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
@@ -145,7 +145,8 @@ def train(
     if setup.own_frames:
         group.sum_in_place(count)
     recipe = with_steps(preset.recipe, int(count), setup.start)
-    preset = preset._replace(recipe=_with_limb_exchange(recipe, setup))
+    recipe = with_limb_exchange(recipe, setup.start, setup.limb_exchange)
+    preset = preset._replace(recipe=recipe)
     if group.size > min(len(frames) * (group.size if setup.own_frames else 1), preset.recipe.batch):
         raise ValueError(
             f"{group.size} processes are more than the {len(frames)} frames or the batch of "
@@ -165,30 +166,6 @@ def train(
     if saved is not None:
         loop.restore(saved)
     return loop.train()
-
-
-def _with_limb_exchange(recipe: Recipe, setup: Setup) -> Recipe:
-    """Return the recipe with the share of exchanged limbs in place of `AUTOMATIC`.
-
-    Frames of a training that starts from a model are often of one person or of few motions, from
-    which the network would learn that limbs move together.
-
-    Raises:
-        ValueError: the recipe exchanges limbs, and the layout has none; or the share is no share.
-    """
-    if AUTOMATIC < recipe.limb_exchange < 0:
-        raise ValueError(
-            f"limb_exchange is {recipe.limb_exchange:g}; it must be {AUTOMATIC} or from 0 to 1"
-        )
-    if recipe.limb_exchange == AUTOMATIC:
-        automatic = setup.start is not None and setup.limb_exchange is not None
-        recipe = dataclasses.replace(recipe, limb_exchange=float(automatic))
-    if recipe.limb_exchange and setup.limb_exchange is None:
-        raise ValueError(
-            f"limb_exchange is {recipe.limb_exchange:g}, but there are no limbs to exchange: no "
-            "edge of the layout divides it"
-        )
-    return recipe
 
 
 class _Loop:

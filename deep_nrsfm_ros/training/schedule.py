@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The schedule of a training: its number of steps, and the learning rate of each."""
+"""The schedule of a training: number of steps, learning rate of each, share of exchanged limbs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from deep_nrsfm_ros.nrsfm.network import Network
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Recipe
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 
 FROM_RANDOM = 30_000
 """Steps of a training from random weights, and the most of one that starts from a model."""
@@ -38,6 +39,45 @@ def with_steps(recipe: Recipe, frames: int, start: Network | None) -> Recipe:
         if has_other_keypoints(start):
             wanted *= _OTHER_KEYPOINTS
     return dataclasses.replace(recipe, steps=min(wanted, FROM_RANDOM))
+
+
+def with_limb_exchange(
+    recipe: Recipe, start: Network | None, limb_exchange: LimbExchange | None
+) -> Recipe:
+    """Return the recipe with the share of shapes with exchanged limbs in place of `AUTOMATIC`.
+
+    Frames of a training that starts from a model are often of one person or of few motions, from
+    which the network would learn that limbs move together.
+
+    Args:
+        recipe: whose `limb_exchange` may be `AUTOMATIC`.
+        start: the network that the training starts from; None: random weights.
+        limb_exchange: the limbs of the layout; None: it has none.
+
+    Raises:
+        ValueError: the recipe exchanges limbs, and the layout has none; or the share is no share.
+    """
+    share = recipe.limb_exchange
+    check_limb_exchange(share)
+    if share == AUTOMATIC:
+        share = float(start is not None and limb_exchange is not None)
+    if share and limb_exchange is None:
+        raise ValueError(
+            f"limb_exchange is {share:g}, but there are no limbs to exchange: no edge of the "
+            "layout divides it"
+        )
+    return dataclasses.replace(recipe, limb_exchange=share)
+
+
+def check_limb_exchange(share: float, name: str = "limb_exchange") -> None:
+    """Raise ValueError unless a share is `AUTOMATIC` or from 0 to 1.
+
+    Args:
+        share: `Recipe.limb_exchange`.
+        name: of the option, for the message.
+    """
+    if share != AUTOMATIC and not 0 <= share <= 1:
+        raise ValueError(f"{name} is {share:g}; it must be {AUTOMATIC} or from 0 to 1")
 
 
 def has_other_keypoints(start: Network) -> bool:

@@ -20,18 +20,16 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     rotation_from_vector,
 )
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
-from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
+from deep_nrsfm_ros.training import limb_exchange
 from deep_nrsfm_ros.training.few_frames import Lesson
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.limb_exchange import ExchangeOptions, LimbExchange
-from deep_nrsfm_ros.training.loop import Setup, train
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
+from deep_nrsfm_ros.training.loop import train
 from deep_nrsfm_ros.training.mirror import MirrorCheck, Teacher
 from deep_nrsfm_ros.training.trainer import Trainer
 
 BODY = ("a", "b", "c", "d", "shoulder", "elbow", "hand")
 CHAIN = KeypointLayout("chain", BODY, edges=tuple(pairwise(BODY)))
-EXCHANGE = ExchangeOptions(limbs=1, angle=0.0, lengths=0.0)
-"""One limb is exchanged, and nothing else."""
 
 
 def edge_lengths(S: np.ndarray, layout: KeypointLayout) -> np.ndarray:
@@ -67,7 +65,10 @@ def test_a_limb_is_the_smaller_side_of_an_edge() -> None:
     assert (2 * exchange.limbs.sum(1) <= len(CMU31)).all()
 
 
-def test_shapes_exchange_a_limb() -> None:
+def test_shapes_exchange_a_limb(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limb_exchange, "_LIMBS", 1)
+    monkeypatch.setattr(limb_exchange, "_ANGLE", 0.0)
+    monkeypatch.setattr(limb_exchange, "_LENGTHS", 0.0)
     rng = np.random.default_rng(0)
     A = centre(rng.standard_normal((7, 3)))
     B = A.copy()
@@ -76,20 +77,22 @@ def test_shapes_exchange_a_limb() -> None:
     B = centre(B)
     elsewhere = 0.7 * B @ rotation_from_vector(np.array([0.2, 0.1, -0.4]))
     S = np.concatenate((np.tile(A, (600, 1, 1)), np.tile(elsewhere, (600, 1, 1))))
-    recombined = LimbExchange(CHAIN, EXCHANGE).recombine(S, 600, rng)
+    recombined = LimbExchange(CHAIN).recombine(S, 600, rng)
     # Half of the partners are A itself; a third of the edges join the arm.
     assert is_like(recombined, A).mean() == pytest.approx(1 / 2, abs=0.07)
     assert is_like(recombined, B).mean() == pytest.approx(1 / 6, abs=0.05)
 
 
-def test_edges_keep_their_lengths_up_to_the_drawn_ratio() -> None:
+def test_edges_keep_their_lengths_up_to_the_drawn_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     S = people_of_one_size(300, rng)
     before = edge_lengths(S, CMU31)
-    kept = LimbExchange(CMU31, ExchangeOptions(lengths=0.0)).recombine(S, 200, rng)
+    with monkeypatch.context() as patch:
+        patch.setattr(limb_exchange, "_LENGTHS", 0.0)
+        kept = LimbExchange(CMU31).recombine(S, 200, rng)
     assert np.abs(kept - S[:200]).max() > 1
     np.testing.assert_allclose(edge_lengths(kept, CMU31), before[:200], rtol=1e-6)
-    changed = LimbExchange(CMU31, ExchangeOptions(lengths=0.1)).recombine(S, 200, rng)
+    changed = LimbExchange(CMU31).recombine(S, 200, rng)
     np.testing.assert_allclose(changed.mean(1), 0, atol=1e-9)
     ratio = np.log(edge_lengths(changed, CMU31) / before[:200])
     assert ratio.std() == pytest.approx(0.1, rel=0.05)
@@ -184,43 +187,9 @@ def test_a_frame_keeps_its_shape_where_its_own_camera_sees_it(
     np.testing.assert_array_equal(changed, np.arange(64) >= len(cameras))
 
 
-@pytest.mark.parametrize(
-    ("asked", "from_model", "has_limbs", "taken"),
-    [
-        (AUTOMATIC, True, True, 1),
-        (AUTOMATIC, True, False, 0),
-        (AUTOMATIC, False, True, 0),
-        (0.5, False, True, 0.5),
-        (0, True, True, 0),
-    ],
-)
-def test_limbs_are_exchanged_by_themselves_only_where_a_model_is_the_start(
-    figure: Any,
-    trained: Trainer,
-    limbs: LimbExchange,
-    asked: float,
-    from_model: bool,
-    has_limbs: bool,
-    taken: float,
-) -> None:
-    recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=asked, steps=1, seeds=1)
-    start = trained.net.map(lambda w: w.numpy()) if from_model else None
-    setup = Setup(start, limb_exchange=limbs if has_limbs else None)
-    visible = np.ones(figure.points.shape[:2], bool)
-    trainer = train(figure.points, visible, trained.preset._replace(recipe=recipe), setup)
-    assert trainer.preset.recipe.limb_exchange == taken
-
-
-def test_limbs_that_a_layout_lacks_cannot_be_exchanged(figure: Any, trained: Trainer) -> None:
+def test_a_training_that_exchanges_limbs_needs_some(figure: Any, trained: Trainer) -> None:
     recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=1, steps=1)
     visible = np.ones(figure.points.shape[:2], bool)
     with pytest.raises(ValueError, match="limb_exchange is 1, but there are no limbs to exchange"):
         train(figure.points, visible, trained.preset._replace(recipe=recipe))
     assert LimbExchange.of(figure.layout) is None
-
-
-def test_a_share_below_zero_is_refused(figure: Any, trained: Trainer) -> None:
-    recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=-0.5, steps=1)
-    visible = np.ones(figure.points.shape[:2], bool)
-    with pytest.raises(ValueError, match="limb_exchange is -0.5; it must be -1 or from 0 to 1"):
-        train(figure.points, visible, trained.preset._replace(recipe=recipe))
