@@ -89,8 +89,8 @@ class Recipe:
         "variance of the network's errors that the model is given, relative to that on the "
         "training frames; 4 lifts motions that the training lacks a tenth better from clean and "
         "complete keypoints, those with gaps worse, and makes the confidence too low; 1 = as on "
-        "the training frames; without effect where the training starts from a model or learns its "
-        "last step from virtual people",
+        "the training frames; without effect where the training starts from a model, or where its "
+        "last step learns the errors from other data, such as virtual people",
         low=0.01,
         high=100.0,
     )
