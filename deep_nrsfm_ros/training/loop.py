@@ -34,7 +34,7 @@ from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
 from deep_nrsfm_ros.training.progress import Clock, Progress
-from deep_nrsfm_ros.training.schedule import has_other_keypoints, with_limb_exchange, with_steps
+from deep_nrsfm_ros.training.schedule import lacks_whitening, with_limb_exchange, with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
@@ -220,7 +220,7 @@ class _Loop:
                 no_improvement=self.best.patience_exceeded,
             )
         self.best.restore_best(trainer)
-        if (start := self.setup.start) is not None and not has_other_keypoints(start):
+        if (start := self.setup.start) is not None and not lacks_whitening(start):
             trainer.average_with_start(self.preset.recipe.start_share)
         if trainer.end_reason:
             trainer.mirrored_share = self.mirror.share(trainer.net)

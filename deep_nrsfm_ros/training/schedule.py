@@ -16,7 +16,7 @@ FROM_RANDOM = 30_000
 """Steps of a training from random weights, and the most of one that starts from a model."""
 _FRAMES_A_STEP = 3  # of a training that starts from a model: 64 a batch are 21 passes over them
 _MIN_STEPS = 300  # of a training that starts from a model
-_OTHER_KEYPOINTS = 10  # times as many steps, as new keypoints are learned from nothing
+_WITHOUT_WHITENING = 10  # times as many steps, as new keypoints are learned from nothing
 
 
 def with_steps(recipe: Recipe, frames: int, start: Network | None) -> Recipe:
@@ -28,16 +28,16 @@ def with_steps(recipe: Recipe, frames: int, start: Network | None) -> Recipe:
     Args:
         recipe: whose steps may be `AUTOMATIC`.
         frames: of all processes.
-        start: the network that the training starts from; not whitened where it has other keypoints
-            than its model. None: random weights.
+        start: the network that the training starts from, as `fine_tuning.start_from` returns it.
+            None: random weights.
     """
     if recipe.steps != AUTOMATIC:
         return recipe
     wanted = FROM_RANDOM
     if start is not None:
         wanted = max(frames // _FRAMES_A_STEP, _MIN_STEPS)
-        if has_other_keypoints(start):
-            wanted *= _OTHER_KEYPOINTS
+        if lacks_whitening(start):
+            wanted *= _WITHOUT_WHITENING
     return dataclasses.replace(recipe, steps=min(wanted, FROM_RANDOM))
 
 
@@ -80,10 +80,10 @@ def check_limb_exchange(share: float, name: str = "limb_exchange") -> None:
         raise ValueError(f"{name} is {share:g}; it must be {AUTOMATIC} or from 0 to 1")
 
 
-def has_other_keypoints(start: Network) -> bool:
-    """Return whether a start, as `fine_tuning.start_from` returns it, lacks its whitening.
+def lacks_whitening(start: Network) -> bool:
+    """Return whether a start, as `fine_tuning.start_from` returns it, is not whitened.
 
-    It does where its keypoints are not those of its model, or where the model has none.
+    It is not where its keypoints are not those of its model, or where the model has no whitening.
     """
     return np.array_equal(start.L, np.eye(start.p))
 
