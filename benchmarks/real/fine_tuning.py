@@ -196,7 +196,7 @@ def tuned(start: Model, part: Part, recipe: Recipe, layout: KeypointLayout) -> t
     setup = Setup(start_from(start, layout), limb_exchange=LimbExchange.of(layout))
     trainer = train(frames.training.points, frames.training.visible, preset, setup)
     model = inherit(finish(trainer, "tuned", layout, data.source), start)
-    return model, not judge(frames, model, start).doubt
+    return model, not judge(frames, model, start).doubtful
 
 
 def recipes(steps: Sequence[int], shares: Sequence[float]) -> list[Recipe]:

@@ -260,12 +260,12 @@ class Result(NamedTuple):
 def measure(name: str, data: Path, output: Path) -> Result:
     """Train the models of a scene that are not there, and judge each beside each other one."""
     scene = SCENES[name](data)
-    court = Judge(split(scene.data, HELD_OUT))
+    comparison = Judge(split(scene.data, HELD_OUT))
     models = {HUMAN: load_model(HUMAN)} if any(run.start for run in RUNS[name]) else {}
     for run in RUNS[name]:
         models[str(run)] = trained(scene, run, output / f"{name}_{run}{MODEL_SUFFIX}")
     errors = np.array([truth(model, scene) for model in models.values()])
-    figures = [[court.figures(new, old) for old in models.values()] for new in models.values()]
+    figures = [[comparison.figures(new, old) for old in models.values()] for new in models.values()]
     return Result(list(models), errors[:, 0], errors[:, 1], figures)
 
 

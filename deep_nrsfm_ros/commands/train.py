@@ -188,9 +188,9 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
         values["warning"] = "; ".join(warnings)
     message = result.message
     if judgement := result.judgement:
-        values["judgement"] = "doubtful" if judgement.doubt else "better"
+        values["judgement"] = "doubtful" if judgement.doubtful else "better"
         message += f"; {judgement}"
-        if judgement.doubt:
+        if judgement.doubtful:
             reporter.warn(str(judgement))
     page = write_page(result, reporter)
     message += f"; report {page}" if page else ""

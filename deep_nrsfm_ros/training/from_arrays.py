@@ -114,7 +114,7 @@ def train(
     if origin:
         model = inherit(model, origin)
     judgement = judge(frames, model, rival)
-    if judgement.doubt:
+    if judgement.doubtful:
         warnings.warn(str(judgement), stacklevel=2)
     date = time.strftime("%Y-%m-%d", time.gmtime())
     model.provenance.update(date=date, judgement=judgement.record())

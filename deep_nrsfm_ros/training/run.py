@@ -131,7 +131,7 @@ def _train_and_save(
     if judgement:
         model.provenance["judgement"] = judgement.record()
     path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"
-    if judgement and judgement.doubt and path.resolve() == Path(config.rival).resolve():
+    if judgement and judgement.doubtful and path.resolve() == Path(config.rival).resolve():
         model = dataclasses.replace(model, name=f"{model.name}_doubtful")
         path = path.with_name(f"{model.name}{MODEL_SUFFIX}")
     save_model(path, model)
