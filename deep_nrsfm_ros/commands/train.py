@@ -22,9 +22,9 @@ from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
 from deep_nrsfm_ros.reporting.page import Training, write_report
-from deep_nrsfm_ros.reporting.shapes import handedness_warning
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.distributed import rank
+from deep_nrsfm_ros.training.handedness_check import handedness_warning
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments
