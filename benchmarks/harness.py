@@ -28,8 +28,8 @@ from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_mode
 from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, Setup, train
-from deep_nrsfm_ros.training.parts import Parts
 from deep_nrsfm_ros.training.progress import Progress
 from deep_nrsfm_ros.training.schedule import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
@@ -65,7 +65,7 @@ class Session:
     baselines: tuple[str, ...] | None = None  # words, of which a baseline's name has one; None: all
     error_scale: float | None = None  # instead of that of the presets
     few_frames: int | None = None  # instead of that of the presets; 0: without factorisations
-    parts: float = 0.0  # share of the known shapes in which limbs are exchanged
+    limb_exchange: float = 0.0  # share of the known shapes in which limbs are exchanged
 
     def mocap(self, subjects: Sequence[str], split: str) -> Dataset:
         """Return the dataset of the trials "train", "held-out" or "all" of CMU subjects."""
@@ -81,7 +81,7 @@ class Session:
             recipe["error_scale"] = self.error_scale
         if self.few_frames is not None:
             recipe["few_frames"] = self.few_frames
-        recipe["parts"] = self.parts
+        recipe["limb_exchange"] = self.limb_exchange
         base = PRESETS[name]
         changed = dataclasses.replace(base.recipe, seed=seed, **recipe)
         return base._replace(recipe=with_steps(changed, 0, None))
@@ -143,7 +143,7 @@ class Session:
                 dataset.points,
                 dataset.visible,
                 preset,
-                Setup(parts=Parts.of(dataset.layout)),
+                Setup(limb_exchange=LimbExchange.of(dataset.layout)),
                 callbacks=Callbacks(on_step=keep, on_progress=show),
                 checkpointing=Checkpointing(checkpoint, CHECKPOINT_SECONDS),
             )
@@ -269,7 +269,7 @@ def run_program(
         help="frames up to which factorisations teach a training (default: the preset's; 0: none)",
     )
     parser.add_argument(
-        "--parts",
+        "--limb-exchange",
         type=float,
         default=0.0,
         help="share of the known shapes in which limbs are exchanged, of each training",
@@ -283,6 +283,6 @@ def run_program(
         baselines=None if args.baselines is None else tuple(args.baselines),
         error_scale=args.error_scale,
         few_frames=args.few_frames,
-        parts=args.parts,
+        limb_exchange=args.limb_exchange,
     )
     print_tables(lambda: [benchmark(session)], session.output)

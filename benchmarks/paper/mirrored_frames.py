@@ -87,15 +87,13 @@ def _of_the_paper(session: Session, subject: str, dataset: Dataset) -> dict[str,
     """Return the paper's network of seed 0, and its repair."""
     preset = session.preset("paper", 0)
     model = session.trained(f"{subject} paper seed 0", dataset, preset)
-    return {"paper": model, "paper, repaired": repaired(model, dataset, preset.recipe.steps)}
+    return {"paper": model, "paper, repaired": repaired(model, dataset, preset.recipe)}
 
 
-def repaired(model: Model, dataset: Dataset, steps: int) -> Model:
-    """Return the model after a tenth of `steps` with the cycle loss on reference shapes."""
-    base = model.provenance["recipe"]
-    recipe = dataclasses.replace(
-        Recipe(**base), steps=max(int(steps * _REPAIR_SHARE), 1), cycle=2.0, reference="always"
-    )
+def repaired(model: Model, dataset: Dataset, recipe: Recipe) -> Model:
+    """Return a model after a tenth of its steps with the cycle loss on reference shapes."""
+    steps = max(int(recipe.steps * _REPAIR_SHARE), 1)
+    recipe = dataclasses.replace(recipe, steps=steps, cycle=2.0, reference="always")
     preset = Preset(model.network.architecture, model.normaliser, recipe)
     trainer = train(dataset.points, dataset.visible, preset, Setup(model.network))
     return finish(trainer, model.name, dataset.layout, dataset.source)

@@ -46,8 +46,8 @@ from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Preset, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.judge import judge
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.loop import Setup, train
-from deep_nrsfm_ros.training.parts import Parts
 
 Floats = NDArray[Any]
 
@@ -193,10 +193,10 @@ def tuned(start: Model, part: Part, recipe: Recipe, layout: KeypointLayout) -> t
     data = curate(everything).dataset
     frames = split(data, Curation().held_out)
     preset = Preset(start.network.architecture, start.normaliser, recipe)
-    setup = Setup(start_from(start, layout), parts=Parts.of(layout))
+    setup = Setup(start_from(start, layout), limb_exchange=LimbExchange.of(layout))
     trainer = train(frames.training.points, frames.training.visible, preset, setup)
     model = inherit(finish(trainer, "tuned", layout, data.source), start)
-    return model, not judge(frames, model, start).doubt
+    return model, not judge(frames, model, start).doubtful
 
 
 def recipes(steps: Sequence[int], shares: Sequence[float]) -> list[Recipe]:

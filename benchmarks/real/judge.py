@@ -43,8 +43,8 @@ from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.judge import Figures, Judge, rank, worse_figures
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.loop import Setup, train
-from deep_nrsfm_ros.training.parts import Parts
 
 Floats = NDArray[Any]
 
@@ -226,7 +226,7 @@ def trained(scene: Scene, run: Run, file: Path) -> Model:
     setup = Setup(
         start_from(start, layout) if start else None,
         LayoutLoss(_HELP, layout) if run.helped else None,
-        parts=Parts.of(layout),
+        limb_exchange=LimbExchange.of(layout),
     )
     trainer = train(frames.points, frames.visible, preset._replace(recipe=recipe), setup)
     model = finish(trainer, str(run), layout, "benchmark")
@@ -260,12 +260,12 @@ class Result(NamedTuple):
 def measure(name: str, data: Path, output: Path) -> Result:
     """Train the models of a scene that are not there, and judge each beside each other one."""
     scene = SCENES[name](data)
-    court = Judge(split(scene.data, HELD_OUT))
+    comparison = Judge(split(scene.data, HELD_OUT))
     models = {HUMAN: load_model(HUMAN)} if any(run.start for run in RUNS[name]) else {}
     for run in RUNS[name]:
         models[str(run)] = trained(scene, run, output / f"{name}_{run}{MODEL_SUFFIX}")
     errors = np.array([truth(model, scene) for model in models.values()])
-    figures = [[court.figures(new, old) for old in models.values()] for new in models.values()]
+    figures = [[comparison.figures(new, old) for old in models.values()] for new in models.values()]
     return Result(list(models), errors[:, 0], errors[:, 1], figures)
 
 

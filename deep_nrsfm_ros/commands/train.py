@@ -22,9 +22,9 @@ from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
 from deep_nrsfm_ros.reporting.page import Training, write_report
-from deep_nrsfm_ros.reporting.shapes import handedness_warning
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.distributed import rank
+from deep_nrsfm_ros.training.handedness_check import handedness_warning
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments
@@ -188,9 +188,9 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
         values["warning"] = "; ".join(warnings)
     message = result.message
     if judgement := result.judgement:
-        values["judgement"] = "doubtful" if judgement.doubt else "better"
+        values["judgement"] = "doubtful" if judgement.doubtful else "better"
         message += f"; {judgement}"
-        if judgement.doubt:
+        if judgement.doubtful:
             reporter.warn(str(judgement))
     page = write_page(result, reporter)
     message += f"; report {page}" if page else ""

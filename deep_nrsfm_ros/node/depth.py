@@ -190,13 +190,13 @@ class DepthSubscription:
 
     def report(self) -> dict[str, str]:
         """Return the state of the period since the last report, for diagnostics."""
-        doubt = self._doubt()
-        self.problem = doubt if self._matched or not self._asked else self._reason
+        reason = self._reason_for_doubt()
+        self.problem = reason if self._matched or not self._asked else self._reason
         text = f"{self._matched} of {self._asked} messages with depth"
         if self._reason and self._matched < self._asked:
             text += f": {self._reason}"
         if self.problem:
-            self._warn(self.problem, "is in doubt" if doubt else _UNUSED)
+            self._warn(self.problem, "is in doubt" if reason else _UNUSED)
         self._matched = self._asked = self._agree = self._measured = 0
         values = {"depth": text}
         if self._result is not None:
@@ -204,7 +204,7 @@ class DepthSubscription:
                 values[f"depth of {identity or i}"] = _describe(self._result, i)
         return values
 
-    def _doubt(self) -> str:
+    def _reason_for_doubt(self) -> str:
         """Return why the depth of the period cannot be believed; "" if it can."""
         if self._measured < _ENOUGH or self._agree >= _LEAST_AGREEMENT * self._measured:
             return ""

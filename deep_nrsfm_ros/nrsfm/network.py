@@ -15,7 +15,7 @@ docstrings name the paper's equations by their labels in its LaTeX source, e.g. 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ PAPER_WIDTHS = (125, 114, 104, 93, 83, 72, 62, 51, 41, 30, 20, 10)
 """Widths k_1 ... k_12 of the paper's 12 dictionaries: linspace(125, 10, 12)."""
 WIDE_WIDTHS = (256, 128, 64, 48)
 """Default widths: four wide dictionaries, which do not collapse under the cycle loss."""
+_FULL_WHITENING_FLOOR = 1e-3  # variance of noise, relative to the largest, without a network
 
 
 @dataclass(frozen=True)
@@ -319,6 +320,17 @@ def whitening(
     root = np.maximum(variance, floor * variance[-1]) ** (-exponent / 2)
     root *= np.sqrt(variance.clip(0).sum() / (root * root * variance.clip(0)).sum())
     return ((U * root) @ U.T).astype(np.float32), ((U / root) @ U.T).astype(np.float32)
+
+
+def whitening_network(moment: NDArray[np.float64]) -> Network:
+    """Return a network of which only the full whitening is used, to complete and whiten keypoints.
+
+    Args:
+        moment: (p, p) second moment E[W W^T] of the normalised keypoints.
+    """
+    L, L_inverse = whitening(moment, 1.0, _FULL_WHITENING_FLOOR)
+    net = initialise(Architecture(widths=(1,)), len(moment), np.random.default_rng(0))
+    return replace(net, L=L, L_inverse=L_inverse)
 
 
 def whiten(net: Network, X: Array) -> Array:

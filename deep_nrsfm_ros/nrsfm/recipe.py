@@ -13,7 +13,7 @@ from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 
 AUTOMATIC = -1
-"""Number of steps, or share of parts, that stands for one that follows from start and frames."""
+"""Value of `steps` or `limb_exchange` for which the training chooses by its start and frames."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +89,12 @@ class Recipe:
         "variance of the network's errors that the model is given, relative to that on the "
         "training frames; 4 lifts motions that the training lacks a tenth better from clean and "
         "complete keypoints, those with gaps worse, and makes the confidence too low; 1 = as on "
-        "the training frames; without effect where the training starts from a model or learns its "
-        "last step from virtual people",
+        "the training frames; without effect where the training starts from a model, or where its "
+        "last step learns the errors from other data, such as virtual people",
         low=0.01,
         high=100.0,
     )
-    parts: float = option(
+    limb_exchange: float = option(
         float(AUTOMATIC),
         "share of the known shapes of the cycle loss in which limbs are exchanged between shapes "
         "and turned at the joints, at the first step; it falls to 0 by the last step; lifts people "

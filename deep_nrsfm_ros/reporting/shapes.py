@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model on its training frames: mean shape, modes of deformation, errors without labels."""
+"""The mean shape and the principal deformations of an object that a model has lifted."""
 
 from __future__ import annotations
 
@@ -8,18 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.model_files.model_file import Model
-from deep_nrsfm_ros.nrsfm.geometry import (
-    align,
-    centre,
-)
-from deep_nrsfm_ros.nrsfm.handedness import disagreement
+from deep_nrsfm_ros.nrsfm.geometry import align, centre
 
 Floats = NDArray[np.float64]
 
-_SAMPLE = 500  # frames that are lifted
 _ROUNDS = 3  # rounds of alignment to the mean shape
 
 
@@ -37,45 +31,6 @@ class ShapeSpace(NamedTuple):
     mean: Floats
     modes: Floats
     shares: Floats
-
-
-class LiftedFrames(NamedTuple):
-    """The n frames of a sample that a model lifts.
-
-    Attributes:
-        frames: (n,) indices into the dataset.
-        lifted: n objects.
-    """
-
-    frames: NDArray[np.int64]
-    lifted: Lifted
-
-
-def lift_sample(model: Model, dataset: Dataset, most: int = _SAMPLE) -> LiftedFrames:
-    """Return up to `most` evenly spread frames of a dataset, lifted.
-
-    Raises:
-        ValueError: the model lifts none of them.
-    """
-    frames = np.unique(np.linspace(0, len(dataset) - 1, min(most, len(dataset))).astype(int))
-    chosen = dataset[frames]
-    lifted = lift_all(Lifter(model).lift, chosen.points, chosen.visible.astype(np.float32))
-    sound = np.isfinite(lifted.shapes).all((1, 2)) & np.isfinite(lifted.residual)
-    if not sound.any():
-        raise ValueError(f"model {model.name!r} lifts none of the {len(frames)} frames looked at")
-    return LiftedFrames(frames[sound], Lifted(*(array[sound] for array in lifted)))
-
-
-def handedness_warning(model: Model, dataset: Dataset) -> str:
-    """Return a warning if keypoints of lifted frames disagree on the depth, "" if they agree.
-
-    See `nrsfm.handedness.disagreement`.
-    """
-    try:
-        frames, lifted = lift_sample(model, dataset)
-    except ValueError:
-        return ""  # no frame is lifted: without a lifted frame there is no depth
-    return disagreement(lifted.shapes, model.layout, dataset.visible[frames])
 
 
 def shape_space(model: Model, lifted: Lifted, modes: int = 4) -> ShapeSpace:

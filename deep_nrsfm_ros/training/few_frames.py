@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus
-from deep_nrsfm_ros.nrsfm.network import Architecture, complete, initialise, whitening
+from deep_nrsfm_ros.nrsfm.network import complete, whitening_network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.trainer import second_moment
@@ -29,8 +29,6 @@ MIN_VISIBLE = 0.8
 """Share of the keypoints that must be visible; the others are filled in."""
 MAX_SPREAD = 0.25
 """Spread of the solutions above which none is believed."""
-
-_FLOOR = 1e-3  # of the whitening that fills in missing keypoints
 
 
 class _StoppedError(Exception):
@@ -69,13 +67,9 @@ def factorise(
     if mask.mean() < MIN_VISIBLE:
         return None
     if not mask.all():
-        L, L_inverse = whitening(second_moment(frames, preset.normaliser), 1.0, _FLOOR)
-        net = initialise(Architecture(widths=(1,)), p, np.random.default_rng(0))
-        weights = dict(net.named_weights()) | {"L": L, "L_inverse": L_inverse}
+        net = whitening_network(second_moment(frames, preset.normaliser))
         centred = points - (points * mask).sum(1, keepdims=True) / mask.sum(1, keepdims=True)
-        points, _ = complete(
-            net.from_named_weights(net.architecture, weights), centred * mask, mask
-        )
+        points, _ = complete(net, centred * mask, mask)
     on_message(
         f"classic factorisations of all {len(points)} frames come first and may take minutes; "
         "few_frames 0 leaves them out"

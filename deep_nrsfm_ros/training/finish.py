@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.virtual_people import FACE_KEYPOINTS
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.correction import (
+    Lift,
     bone_lengths,
     error_covariance,
     hidden_covariance,
@@ -24,11 +26,21 @@ from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import Floats, centre
 from deep_nrsfm_ros.nrsfm.handedness import object_frame
-from deep_nrsfm_ros.nrsfm.network import coherence, complete, reconstruct
-from deep_nrsfm_ros.nrsfm.normalisation import normalise
+from deep_nrsfm_ros.nrsfm.network import Network, coherence, complete, reconstruct
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _MOST_FRAMES = 2048  # on which the object frame, the error covariance and the bones are measured
+
+
+class _ErrorStatistics(NamedTuple):
+    """What a model knows of the errors of its network; the fields are those of `Model`."""
+
+    error_covariance: NDArray[np.float32]
+    bone_lengths: NDArray[np.float32]
+    bone_correlation: NDArray[np.float32]
+    hidden_keypoints: tuple[str, ...]
+    hidden_covariance: NDArray[np.float32]
 
 
 def finish(
@@ -36,7 +48,7 @@ def finish(
     name: str,
     layout: KeypointLayout,
     source: str,
-    people: Dataset | None = None,
+    last_step_data: Dataset | None = None,
 ) -> Model:
     """Return the trained model with object frame, error covariance, bones and provenance.
 
@@ -45,9 +57,9 @@ def finish(
         name: name of the model.
         layout: layout of the p keypoints that the trainer was trained on.
         source: where the data come from, in words, for the provenance.
-        people: complete frames of many different objects in this layout, from which the error
-            covariance and the bones are learned (see `data.virtual_people`). None: from frames of
-            the training.
+        last_step_data: complete frames of many different objects in this layout, from which the
+            error covariance and the bones are learned (see `data.virtual_people` and
+            `data.virtual_hands`). None: from frames of the training.
 
     Returns:
         The model. Its `quality` is label-free: errors relative to the size of the object, 0 is
@@ -55,16 +67,87 @@ def finish(
         mirrored depth, 0 to 0.5, where the frames tell it and the training came to its end.
     """
     net = trainer.net.map(lambda w: w.cpu().numpy())
-    normaliser = trainer.preset.normaliser
+    # Frames are drawn with replacement: four times their number leaves out 2 % of them.
+    sample = trainer.sample(min(_MOST_FRAMES, 4 * len(trainer.frames)))
+    mask = sample.mask.cpu().numpy()
+    W, _ = complete(net, sample.points.cpu().numpy(), mask)
+    S, _, _ = _lift(net, trainer.preset.normaliser)(W)
+    statistics = _error_statistics(trainer, net, layout, W, last_step_data)
+    provenance = _provenance(trainer, source)
+    if last_step_data is not None:
+        provenance["last_step"] = {"data": last_step_data.source, "frames": len(last_step_data)}
+    return Model(
+        name,
+        net,
+        layout,
+        trainer.preset.normaliser,
+        object_frame(S, layout, mask[..., 0] > 0),
+        **statistics._asdict(),
+        provenance=provenance,
+        quality=_quality(trainer, coherence(net)),
+    )
+
+
+def _error_statistics(
+    trainer: Trainer,
+    net: Network,
+    layout: KeypointLayout,
+    W: Floats,
+    last_step_data: Dataset | None,
+) -> _ErrorStatistics:
+    """Return error covariances and bones of a network.
+
+    Args:
+        trainer: gives seed, normaliser and recipe.
+        net: the network, of arrays.
+        layout: of its p keypoints.
+        W: (n, p, 2) complete frames of the training.
+        last_step_data: frames to learn from in place of W; see `finish`.
+    """
+    rng, recipe = np.random.default_rng(trainer.seed), trainer.preset.recipe
+    lift = _lift(net, trainer.preset.normaliser)
+    if last_step_data is not None:
+        W = last_step_data.points
+    covariance, pairs = error_covariance(lift, W, rng), layout.bone_indices()
+    if last_step_data is not None and pairs:
+        lengths, correlation = varied_bones(lift, W, pairs, covariance, rng)
+    else:
+        lengths = bone_lengths(lift, W, pairs, covariance, rng)
+        correlation = np.zeros((0, 0), np.float32)
+    hidden: tuple[str, ...] = ()
+    without_face: NDArray[np.float32] = np.zeros(0, np.float32)
+    if set(FACE_KEYPOINTS) <= set(layout.keypoints):
+        hidden = FACE_KEYPOINTS
+        lift_without_face = _lift_without_face(net, trainer.preset.normaliser, layout)
+        without_face = hidden_covariance(lift, lift_without_face, W, covariance, rng)
+    if last_step_data is None and trainer.from_random:
+        covariance *= recipe.error_scale
+        without_face *= recipe.error_scale
+    return _ErrorStatistics(covariance, lengths, correlation, hidden, without_face)
+
+
+def _lift(net: Network, normaliser: Normaliser) -> Lift:
+    """Return a function that lifts complete points W (f, p, 2).
+
+    It returns shapes S, cameras M and the normalised points.
+    """
 
     def lift(W: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return shapes S, cameras M and the normalised input of complete points W (f, p, 2)."""
         encoded = normaliser.encode(W, np.ones_like(W[..., :1]))
         return *reconstruct(net, encoded.W), encoded.W
 
-    def lift_without_face(W: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return what `lift` does, centred, from the keypoints other than those of the face."""
-        visible = np.array([[name not in FACE_KEYPOINTS] for name in layout.keypoints])
+    return lift
+
+
+def _lift_without_face(net: Network, normaliser: Normaliser, layout: KeypointLayout) -> Lift:
+    """Return what `_lift` does, but from the keypoints other than those of the face; S is centred.
+
+    The face is filled in as the lifter fills in missing keypoints: by the network's prior, then by
+    what the network lifts.
+    """
+    visible = np.array([[name not in FACE_KEYPOINTS] for name in layout.keypoints])
+
+    def lift(W: Floats) -> tuple[Floats, Floats, Floats]:
         points, mask = W, np.broadcast_to(visible, (*W.shape[:2], 1)).astype(W.dtype)
         for _ in range(1 + LiftingOptions().refill):
             encoded = normalise(net, normaliser, points, mask)
@@ -73,45 +156,7 @@ def finish(
             mask = np.ones_like(mask)
         return centre(S), M, centre((W - encoded.origin) / encoded.unit)
 
-    sample = trainer.sample(min(_MOST_FRAMES, 4 * len(trainer.frames)))
-    mask = sample.mask.cpu().numpy()
-    W, _ = complete(net, sample.points.cpu().numpy(), mask)
-    S, _, _ = lift(W)
-    rng = np.random.default_rng(trainer.seed)
-    if people is not None:
-        W = people.points
-    covariance, pairs = error_covariance(lift, W, rng), layout.bone_indices()
-    if people is not None and pairs:
-        lengths, correlation = varied_bones(lift, W, pairs, covariance, rng)
-    else:
-        lengths = bone_lengths(lift, W, pairs, covariance, rng)
-        correlation = np.zeros((0, 0), np.float32)
-    hidden = FACE_KEYPOINTS if set(FACE_KEYPOINTS) <= set(layout.keypoints) else ()
-    without_face = (
-        hidden_covariance(lift, lift_without_face, W, covariance, rng)
-        if hidden
-        else np.zeros(0, np.float32)
-    )
-    if people is None and trainer.from_random:
-        covariance *= trainer.preset.recipe.error_scale
-        without_face *= trainer.preset.recipe.error_scale
-    provenance = _provenance(trainer, source)
-    if people is not None:
-        provenance["last_step"] = {"data": people.source, "frames": len(people)}
-    return Model(
-        name,
-        net,
-        layout,
-        normaliser,
-        object_frame(S, layout, mask[..., 0] > 0),
-        error_covariance=covariance,
-        bone_lengths=lengths,
-        bone_correlation=correlation,
-        hidden_keypoints=hidden,
-        hidden_covariance=without_face,
-        provenance=provenance,
-        quality=_quality(trainer, coherence(net)),
-    )
+    return lift
 
 
 def _provenance(trainer: Trainer, source: str) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
 from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model, load_once
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
-from deep_nrsfm_ros.training.parts import Parts
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.progress import Progress
@@ -62,8 +62,9 @@ def train(
         start: model to start from, its name or its file. "" is a model that comes with the package
             and has most keypoints of the layout, if there is one; "none" is random weights.
         recipe: steps, seed and all else of the training; None stands for the defaults: from a
-            model of the same keypoints a step for each three frames, from random weights 30000
-            steps, which take minutes. `Recipe(steps=3000, seed=1)` is a first look.
+            model of the same keypoints a step for each three frames, at least 300 steps; from
+            random weights 30000 steps, which take minutes. `Recipe(steps=3000, seed=1)` is a first
+            look.
         sequence_starts: first frames of the recordings, views or people in the points, the frames
             of each in the order of their time: (0, 500) where 500 frames of one camera come first.
             (0,): one recording. (): unknown, each quarter of the frames counts as a sequence.
@@ -101,7 +102,7 @@ def train(
     rival = origin or _shipped(layout)
     frames = split(curated.dataset, Curation().held_out if rival else 0.0)
     preset = PRESETS["default"]._replace(recipe=recipe or Recipe())
-    setup = Setup(parts=Parts.of(layout))
+    setup = Setup(limb_exchange=LimbExchange.of(layout))
     if origin:
         preset = preset._replace(
             architecture=origin.network.architecture, normaliser=origin.normaliser
@@ -113,7 +114,7 @@ def train(
     if origin:
         model = inherit(model, origin)
     judgement = judge(frames, model, rival)
-    if judgement.doubt:
+    if judgement.doubtful:
         warnings.warn(str(judgement), stacklevel=2)
     date = time.strftime("%Y-%m-%d", time.gmtime())
     model.provenance.update(date=date, judgement=judgement.record())

@@ -37,7 +37,7 @@ _Lifted = tuple[Floats, Floats, NDArray[np.bool_]]
 
 _MOST_FRAMES = 2000
 _NETWORK_ALONE = LiftingOptions(correction="none", test_time_rotations=1)
-_AS_SHIPPED = LiftingOptions()
+_WITH_CORRECTION = LiftingOptions()
 
 
 class Figures(NamedTuple):
@@ -45,8 +45,9 @@ class Figures(NamedTuple):
 
     Attributes:
         residual: relative reprojection error of the network, median over the held-out frames.
-        bone_variation: standard deviation of a bone's length over the held-out frames by its mean,
-            mean over the bones. Lengths are shares of the sum of all; 0.1 typical.
+        bone_variation: mean absolute deviation of a bone's length from its median over the held-out
+            frames, mean over the bones. A length is relative to the bone's median and to the
+            median of its frame's bones; 0.04 typical of people.
         mirrored_share: share of all frames with mirrored depth, by the test of their neighbours.
         front_disagreement: share of all frames whose votes on the front say that it is behind.
         opposed: share of all frames of which the model compared with has the mirror image.
@@ -140,7 +141,7 @@ class Judgement(NamedTuple):
     """What the judge says of a new model.
 
     Attributes:
-        doubt: one sentence on why it should not replace the one at hand, and what would help; ""
+        reason: one sentence on why it should not replace the one at hand, and what would help; ""
             if it should.
         summary: a sentence that calls the model better, with the figures of both.
         figures: of the new model.
@@ -148,19 +149,24 @@ class Judgement(NamedTuple):
         rival_figures: its figures.
     """
 
-    doubt: str
+    reason: str
     summary: str
     figures: Figures
     rival: str = ""
     rival_figures: Figures | None = None
 
+    @property
+    def doubtful(self) -> bool:
+        """Return whether the new model should not replace the one at hand."""
+        return bool(self.reason)
+
     def __str__(self) -> str:
         """Return the judgement as a sentence."""
-        return f"the new model is doubtful: {self.doubt}" if self.doubt else self.summary
+        return f"the new model is doubtful: {self.reason}" if self.doubtful else self.summary
 
     def record(self) -> dict[str, Any]:
         """Return the judgement for the provenance of the new model."""
-        result: dict[str, Any] = {"doubtful": bool(self.doubt), "reason": str(self)}
+        result: dict[str, Any] = {"doubtful": self.doubtful, "reason": str(self)}
         result["figures"] = _rounded(self.figures)
         if self.rival_figures:
             result |= {"rival": self.rival, "rival_figures": _rounded(self.rival_figures)}
@@ -176,13 +182,13 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
         rival: the one at hand; None, or one that lifts none of the frames: the new model is judged
             by its mirrored frames alone.
     """
-    court = Judge(frames)
+    comparison = Judge(frames)
     old = None
     if rival is not None:
         with suppress(ValueError):
-            old = court.figures(rival)
+            old = comparison.figures(rival)
     try:
-        new = court.figures(model, rival if old else None)
+        new = comparison.figures(model, rival if old else None)
     except ValueError as error:  # no training is lost because its model is poor
         unknown = Figures(*[math.nan] * len(Figures._fields))
         return Judgement(f"{error}; {_advice(model, '')} would help", "", unknown)
@@ -192,12 +198,12 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
     than = f"compared with model {name!r} {on}" if name else on
     shown = [each for each in IN_WORDS if each in _known(new) and (old or each not in _BESIDE)]
     summary = "; ".join(_in_words(each, new, old) for each in shown)
-    doubt = ""
+    reason = ""
     if worse := worse_figures(new, old):
         reasons = "; ".join(_in_words(each, new, old) for each in worse)
-        doubt = f"{than}, {reasons}; {_advice(model, name)} would help"
+        reason = f"{than}, {reasons}; {_advice(model, name)} would help"
     verdict = f"is better than model {name!r} {on}" if name else f"has no other beside it; {on}"
-    return Judgement(doubt, f"the new model {verdict}: {summary}", new, name, old)
+    return Judgement(reason, f"the new model {verdict}: {summary}", new, name, old)
 
 
 def worse_figures(new: Figures, old: Figures | None) -> list[str]:
@@ -302,15 +308,15 @@ def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> li
         models: the new one first.
         rival: the model at hand, with which each is compared; None: with itself.
     """
-    court = Judge(frames)
+    comparison = Judge(frames)
     at_hand, old = None, None
     if rival is not None:
         with suppress(ValueError):
-            old, at_hand = court.figures(rival), rival
+            old, at_hand = comparison.figures(rival), rival
     result = []
     for model in ([at_hand] if at_hand else []) + list(models):
         with suppress(ValueError):
-            new = old if model is at_hand and old else court.figures(model, at_hand)
+            new = old if model is at_hand and old else comparison.figures(model, at_hand)
             place = rank(new, old)
             verdict = "doubtful" if place.doubtful else "better" if old else ""
             result.append(Standing(model, new, "at hand" if model is at_hand else verdict, place))
@@ -357,7 +363,7 @@ class Judge:
         everything, _, shown = self._lift(model)
         test = self._mirror_check.test_shapes(everything, shown)
         X = _unit(S, visible)
-        variation, difference = _bones(S, visible, layout)
+        variation, side_difference = _bones(S, visible, layout)
         both = visible & also_visible[sound]
         Y, Z = _unit(S, both), _unit(T[sound], both)
         is_trained_on = other is not None and _origin(model) == other.name
@@ -367,25 +373,25 @@ class Judge:
             test.share if test.tested.mean() >= MIN_TESTED else math.nan,
             _front_disagreement(everything, shown, layout),
             self._opposed(model, other or model),
-            difference,
+            side_difference,
             float(np.linalg.norm(X[..., :2], axis=(1, 2)).mean()),
             float(np.linalg.norm(align(Y, Z).aligned - Z, axis=(1, 2)).mean()),
-            self._opposed(model, other, shipped=True) if other and is_trained_on else math.nan,
+            self._opposed(model, other, corrected=True) if other and is_trained_on else math.nan,
         )
 
-    def _lift(self, model: Model, *, held_out: bool = False, shipped: bool = False) -> _Lifted:
+    def _lift(self, model: Model, *, held_out: bool = False, corrected: bool = False) -> _Lifted:
         """Return a model's shapes of all or of the held-out frames, which are computed once."""
-        key = id(model), held_out, shipped
+        key = id(model), held_out, corrected
         if key not in self._lifted:  # the model is kept: its id is the key
             data = self._held_out if held_out else self._all
-            options = _AS_SHIPPED if shipped else _NETWORK_ALONE
+            options = _WITH_CORRECTION if corrected else _NETWORK_ALONE
             self._lifted[key] = model, _lift(model, data, options)
         return self._lifted[key][1]
 
-    def _opposed(self, model: Model, other: Model, *, shipped: bool = False) -> float:
+    def _opposed(self, model: Model, other: Model, *, corrected: bool = False) -> float:
         """Return the share of all frames of which `other` has the mirror image."""
-        S, _, visible = self._lift(model, shipped=shipped)
-        T, residual, also_visible = self._lift(other, shipped=shipped)
+        S, _, visible = self._lift(model, corrected=corrected)
+        T, residual, also_visible = self._lift(other, corrected=corrected)
         both, sound = visible & also_visible, np.isfinite(residual)
         aligned = align(_unit(S, both), _unit(T, both), allow_reflection=True)
         return float(aligned.mirrored[sound].mean())
@@ -433,7 +439,7 @@ def _unit(S: Floats, visible: NDArray[np.bool_]) -> Floats:
 def _bones(S: Floats, visible: NDArray[np.bool_], layout: KeypointLayout) -> tuple[float, float]:
     """Return `bone_variation` and `side_difference` of shapes; NaN where there are too few bones.
 
-    A length is relative to the median of the frame's bones, each by its own mean, so that hidden
+    A length is relative to the bone's median and to the median of its frame's bones, so that hidden
     bones do not matter.
     """
     pairs = layout.bone_indices()

@@ -23,18 +23,18 @@ from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Network
-from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Preset, Recipe
+from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
 from deep_nrsfm_ros.training.few_frames import Lesson, factorise
 from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
-from deep_nrsfm_ros.training.parts import Parts
 from deep_nrsfm_ros.training.progress import Clock, Progress
-from deep_nrsfm_ros.training.schedule import has_other_keypoints, with_steps
+from deep_nrsfm_ros.training.schedule import lacks_whitening, with_limb_exchange, with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
@@ -50,7 +50,8 @@ class Setup:
         start: network to begin with, of the preset's architecture (see `fine_tuning`); None
             begins with random networks, of which the screening chooses one.
         layout_loss: loss of the keypoint layout that is added to the recipe's; None is none.
-        parts: the limbs of the keypoint layout, which `Recipe.parts` needs; None: it has none.
+        limb_exchange: the limbs of the keypoint layout, which `Recipe.limb_exchange` needs; None:
+            it has none.
         limits: when the training ends before its last step, and which state it keeps.
         group: the processes that share the training.
         own_frames: whether each process has frames of its own; else all have all frames.
@@ -58,7 +59,7 @@ class Setup:
 
     start: Network | None = None
     layout_loss: LayoutLoss | None = None
-    parts: Parts | None = None
+    limb_exchange: LimbExchange | None = None
     limits: Limits = WHOLE
     group: ProcessGroup = ALONE
     own_frames: bool = False
@@ -144,7 +145,8 @@ def train(
     if setup.own_frames:
         group.sum_in_place(count)
     recipe = with_steps(preset.recipe, int(count), setup.start)
-    preset = preset._replace(recipe=_with_parts(recipe, setup))
+    recipe = with_limb_exchange(recipe, setup.start, setup.limb_exchange)
+    preset = preset._replace(recipe=recipe)
     if group.size > min(len(frames) * (group.size if setup.own_frames else 1), preset.recipe.batch):
         raise ValueError(
             f"{group.size} processes are more than the {len(frames)} frames or the batch of "
@@ -164,28 +166,6 @@ def train(
     if saved is not None:
         loop.restore(saved)
     return loop.train()
-
-
-def _with_parts(recipe: Recipe, setup: Setup) -> Recipe:
-    """Return the recipe with the share of exchanged limbs in place of `AUTOMATIC`.
-
-    Frames of a training that starts from a model are often of one person or of few motions, from
-    which the network would learn that limbs move together.
-
-    Raises:
-        ValueError: the recipe exchanges limbs, and the layout has none; or the share is no share.
-    """
-    if AUTOMATIC < recipe.parts < 0:
-        raise ValueError(f"parts is {recipe.parts:g}; it must be {AUTOMATIC} or from 0 to 1")
-    if recipe.parts == AUTOMATIC:
-        automatic = setup.start is not None and setup.parts is not None
-        recipe = dataclasses.replace(recipe, parts=float(automatic))
-    if recipe.parts and setup.parts is None:
-        raise ValueError(
-            f"parts is {recipe.parts:g}, but there are no limbs to exchange: no edge of the layout "
-            "divides it"
-        )
-    return recipe
 
 
 class _Loop:
@@ -240,7 +220,7 @@ class _Loop:
                 no_improvement=self.best.patience_exceeded,
             )
         self.best.restore_best(trainer)
-        if (start := self.setup.start) is not None and not has_other_keypoints(start):
+        if (start := self.setup.start) is not None and not lacks_whitening(start):
             trainer.average_with_start(self.preset.recipe.start_share)
         if trainer.end_reason:
             trainer.mirrored_share = self.mirror.share(trainer.net)
@@ -278,7 +258,7 @@ class _Loop:
         trainer = Trainer(
             *(self.frames, self.preset, seed, setup.start, setup.group, setup.layout_loss)
         )
-        trainer.known, trainer.parts = self.known, setup.parts
+        trainer.known, trainer.limb_exchange = self.known, setup.limb_exchange
         return trainer
 
     def _advance(self, steps: int, time_budget: float, *, chosen: bool = False) -> None:

@@ -8,7 +8,6 @@ handedness that most of its frames have already.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from functools import cached_property
@@ -29,14 +28,7 @@ from deep_nrsfm_ros.nrsfm.neighbours import (
     nearest,
     rigid_shapes,
 )
-from deep_nrsfm_ros.nrsfm.network import (
-    Architecture,
-    Network,
-    initialise,
-    reconstruct,
-    whiten,
-    whitening,
-)
+from deep_nrsfm_ros.nrsfm.network import Network, reconstruct, whiten, whitening_network
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
@@ -56,7 +48,6 @@ MIN_TESTED = 0.5
 """Share of the frames that the test must tell something about, for its share to count."""
 
 _NEIGHBOURS = 16
-_FLOOR = 1e-3  # of the whitening of the search
 _MIN_WEIGHT = 0.3  # of a reference shape that is taught
 
 
@@ -113,8 +104,7 @@ class MirrorCheck:
     @cached_property
     def _reference(self) -> tuple[Neighbours, Reference]:
         """Return the neighbours of the sample's frames, and a shape of each."""
-        L, L_inverse = whitening(self._moment, 1.0, _FLOOR)
-        net = _search_network(L, L_inverse)
+        net = whitening_network(self._moment)
         W = self._normalised(net)
         pairs = nearest(whiten(net, W), _NEIGHBOURS, self.on_progress)
         return pairs, join(rigid_shapes(W, pairs), pairs)
@@ -193,12 +183,6 @@ def _unmirrored(X: Floats, mirrored: NDArray[np.bool_], pairs: Neighbours) -> Fl
 def _arrays(net: Network) -> Network:
     """Return a network of arrays."""
     return net.map(lambda w: w if isinstance(w, np.ndarray) else w.detach().cpu().numpy())
-
-
-def _search_network(L: NDArray[np.float32], L_inverse: NDArray[np.float32]) -> Network:
-    """Return a network of which only the whitening is used, to complete and whiten keypoints."""
-    net = initialise(Architecture(widths=(1,)), len(L), np.random.default_rng(0))
-    return dataclasses.replace(net, L=L, L_inverse=L_inverse)
 
 
 class Teacher:

@@ -23,7 +23,7 @@ from deep_nrsfm_ros.training.data_check import check_dataset
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
-from deep_nrsfm_ros.training.parts import Parts
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data, read_people
 from deep_nrsfm_ros.training.record import checkpoint_file, keep_record
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
@@ -131,7 +131,7 @@ def _train_and_save(
     if judgement:
         model.provenance["judgement"] = judgement.record()
     path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"
-    if judgement and judgement.doubt and path.resolve() == Path(config.rival).resolve():
+    if judgement and judgement.doubtful and path.resolve() == Path(config.rival).resolve():
         model = dataclasses.replace(model, name=f"{model.name}_doubtful")
         path = path.with_name(f"{model.name}{MODEL_SUFFIX}")
     save_model(path, model)
@@ -197,7 +197,7 @@ def _train(
             loss,
             limits=config.limits,
             group=group,
-            parts=Parts.of(dataset.layout),
+            limb_exchange=LimbExchange.of(dataset.layout),
             own_frames=not config.data.cmu,
         ),
         Callbacks(on_progress=reporter.training, should_stop=should_stop, on_message=reporter.say),

@@ -26,7 +26,7 @@ from deep_nrsfm_ros.training.gradient_function import (
     weight_vector,
     with_weights,
 )
-from deep_nrsfm_ros.training.parts import Parts
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.schedule import learning_rate
 from deep_nrsfm_ros.training.soap import Soap
 
@@ -51,7 +51,7 @@ class Trainer:
         mirrored_share: share of frames with mirrored depth at the end, 0 to 0.5; NaN unknown.
         known: shapes of the frames by factorisation that the network is taught; None: none.
         from_random: whether the training began with random weights.
-        parts: recombines the share `Recipe.parts` of the known shapes; None: none.
+        limb_exchange: recombines the share `Recipe.limb_exchange` of the known shapes; None: none.
         total_frames: frames of all processes.
         cpu_seconds: processor time of this process in steps.
     """
@@ -89,7 +89,7 @@ class Trainer:
         self.mirrored_share = math.nan
         self.known: Consensus | None = None
         self.from_random = start is None
-        self.parts: Parts | None = None
+        self.limb_exchange: LimbExchange | None = None
         device = frames.device
         initial = start or initialise(
             architecture,
@@ -138,18 +138,24 @@ class Trainer:
         )
 
     def known_shapes(self) -> Tensor | None:
-        """Return the known shapes of the next step: those of the last batch, some recombined."""
+        """Return the known shapes of the next step: those of `shapes`, some recombined.
+
+        Shapes that `cameras` see stay as they are, since these are the cameras of their frames.
+        """
         shapes = self.shapes
-        if shapes is None or self.parts is None:
+        if shapes is None or self.limb_exchange is None:
             return shapes
-        share = self.preset.recipe.parts * max(1 - self.progress, 0.0)
-        count = round(share * len(shapes))
+        share = self.preset.recipe.limb_exchange * max(1 - self.progress, 0.0)
+        kept = 0 if self.cameras is None else len(self.cameras)
+        count = min(round(share * len(shapes)), len(shapes) - kept)
         if not count:
             return shapes
         rng = np.random.default_rng((self.seed, self.group.rank, self.step))
-        recombined = self.parts.recombine(shapes.cpu().numpy(), count, rng)
-        first = torch.from_numpy(recombined.astype(np.float32)).to(shapes.device)
-        return torch.cat((first, shapes[count:]))
+        without_camera_first = shapes.roll(-kept, 0).cpu().numpy()
+        recombined = self.limb_exchange.recombine(without_camera_first, count, rng)
+        result = shapes.clone()
+        result[kept : kept + count] = torch.from_numpy(recombined.astype(np.float32))
+        return result
 
     def advance(self) -> None:
         """Take one gradient step."""

@@ -19,11 +19,11 @@ from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
 from deep_nrsfm_ros.model_files.model_file import check_name, load_once
-from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.training.config import DataConfig, OptionNames, TrainingConfig
 from deep_nrsfm_ros.training.disk import check_room
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
-from deep_nrsfm_ros.training.parts import Parts
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
+from deep_nrsfm_ros.training.schedule import check_limb_exchange
 
 _NUMBERED_LAYOUT = KeypointLayout(NUMBERED, ())  # its points are counted when the bags are read
 
@@ -55,17 +55,14 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
     if target != _NUMBERED_LAYOUT:
         KeypointMap(source, target)
     config.layout_loss.check(target, names)
-    if AUTOMATIC < config.recipe.parts < 0:
-        raise ValueError(
-            f"{names('parts')} is {config.recipe.parts:g}; it must be {AUTOMATIC} or from 0 to 1"
-        )
-    if config.recipe.parts > 0:
+    check_limb_exchange(config.recipe.limb_exchange, names("limb_exchange"))
+    if config.recipe.limb_exchange > 0:
         try:
-            Parts(target)
+            LimbExchange(target)
         except ValueError as error:
             raise ValueError(
-                f"{names('parts')} is {config.recipe.parts:g}, but {error}; give it edges in "
-                "a layout file, or set it to 0"
+                f"{names('limb_exchange')} is {config.recipe.limb_exchange:g}, but {error}; give "
+                "it edges in a layout file, or set it to 0"
             ) from None
     people = (HUMAN17.keypoints, HUMAN25.keypoints)
     if config.data.virtual_people and target.keypoints not in people:

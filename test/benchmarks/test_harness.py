@@ -80,7 +80,7 @@ def test_reads_the_protocols_split(session: Session) -> None:
 
 def test_preset_has_seed_steps_and_options(session: Session) -> None:
     assert session.preset("paper", 7, noise=0.1).recipe == dataclasses.replace(
-        PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1, start_share=0.0, parts=0.0
+        PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1, start_share=0.0, limb_exchange=0.0
     )
     whole = dataclasses.replace(session, steps=None)
     assert whole.preset("default", 0).recipe.steps == FROM_RANDOM
@@ -88,8 +88,8 @@ def test_preset_has_seed_steps_and_options(session: Session) -> None:
     assert scaled.preset("default", 0).recipe.error_scale == 2
     untaught = dataclasses.replace(whole, few_frames=0)
     assert untaught.preset("default", 0).recipe.few_frames == 0
-    exchanged = dataclasses.replace(whole, parts=1.0)
-    assert exchanged.preset("default", 0).recipe.parts == 1
+    exchanged = dataclasses.replace(whole, limb_exchange=1.0)
+    assert exchanged.preset("default", 0).recipe.limb_exchange == 1
 
 
 def test_snapshots_are_those_of_one_uninterrupted_training(

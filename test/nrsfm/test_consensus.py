@@ -77,10 +77,11 @@ def test_few_modes_without_noise_are_found_exactly() -> None:
     shapes, W = images(2)
     found = consensus(W)
     assert found.solutions == 1
+    assert found.spread == pytest.approx(0)  # one solution alone agrees with itself
     assert shape_errors(found.shapes, shapes).proper < 0.01
 
 
-def test_one_solution_alone_is_no_agreement() -> None:
+def test_images_without_a_common_shape_have_no_agreement() -> None:
     W = np.random.default_rng(0).standard_normal((30, 10, 2))
     assert consensus(W).spread > MAX_SPREAD
 

@@ -24,8 +24,11 @@ from deep_nrsfm_ros.nrsfm.network import (
     initialise,
     reconstruct,
     recover,
+    unwhiten,
     weight_shapes,
+    whiten,
     whitening,
+    whitening_network,
 )
 
 I3 = np.eye(3)
@@ -362,6 +365,19 @@ def test_whitening_of_centred_points_is_finite() -> None:
     L, L_inverse = whitening(np.einsum("fic,fjc->ij", W, W) / 100, 1.0, 1e-4)
     assert np.isfinite(L).all() and np.isfinite(L_inverse).all()
     np.testing.assert_allclose(L @ L_inverse, np.eye(6), atol=1e-3)
+
+
+def test_a_network_of_the_whitening_alone_whitens_and_fills_in() -> None:
+    p = 6
+    moment = moment_of(0, p)
+    net = whitening_network(moment)
+    np.testing.assert_array_equal(net.L, whitening(moment, 1.0, 1e-3)[0])
+    points = np.random.default_rng(0).standard_normal((2, p, 2)).astype(np.float32)
+    np.testing.assert_allclose(unwhiten(net, whiten(net, points)), points, atol=1e-4)
+    mask = np.ones((2, p, 1), np.float32)
+    mask[0, 1] = 0
+    filled, complete_mask = complete(net, points * mask, mask)
+    assert complete_mask.all() and filled[0, 1].any()
 
 
 def test_training_learns_everything_but_the_whitening() -> None:

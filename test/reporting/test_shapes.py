@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes and label-free errors of a model, from the frames it lifts."""
+"""The mean shape and the deformations of an object that a model has lifted."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
@@ -14,11 +12,7 @@ from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre, random_cameras, rotation_from_camera
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
-from deep_nrsfm_ros.reporting.shapes import (
-    handedness_warning,
-    lift_sample,
-    shape_space,
-)
+from deep_nrsfm_ros.reporting.shapes import shape_space
 
 P = 10
 
@@ -35,12 +29,6 @@ def lifted(S: np.ndarray, seed: int = 0) -> Lifted:
     return Lifted(
         S @ R.swapaxes(1, 2), R, ones, np.zeros((len(S), 2), np.float32), 0 * ones, ones[:, None]
     )
-
-
-def frames(f: int, p: int) -> Dataset:
-    rng = np.random.default_rng(1)
-    points = rng.uniform(0, 500, (f, p, 2)).astype(np.float32)
-    return Dataset(points, rng.random((f, p)) < 0.9, KeypointLayout.numbered(p), "made up")
 
 
 def test_the_modes_are_those_of_the_object() -> None:
@@ -78,42 +66,3 @@ def test_one_frame_has_no_modes_but_a_mean() -> None:
         model(KeypointLayout.numbered(P)), lifted(np.random.default_rng(5).random((1, P, 3)))
     )
     assert np.isfinite(space.mean).all() and (np.abs(space.modes) < 1e-6).all()
-
-
-def test_frames_that_cannot_be_lifted_are_passed_over() -> None:
-    seen = frames(30, P)
-    seen.visible[::3] = False
-    found = lift_sample(model(seen.layout), seen)
-    assert found.frames.tolist() == [i for i in range(30) if i % 3]
-    assert all(np.isfinite(array).all() for array in found.lifted)
-    seen.visible[:] = False
-    with pytest.raises(ValueError, match="lifts none of the 30 frames"):
-        lift_sample(model(seen.layout), seen)
-
-
-def test_a_sample_is_spread_evenly() -> None:
-    found = lift_sample(model(KeypointLayout.numbered(P)), frames(100, P), most=5)
-    assert found.frames.tolist() == [0, 24, 49, 74, 99]
-
-
-def test_depth_is_doubted_where_keypoints_contradict_each_other() -> None:
-    seen = frames(40, P)
-    names = seen.layout.keypoints
-    four, inside_out = (
-        (names[0], names[1], names[2], names[3]),
-        (names[1], names[0], names[2], names[3]),
-    )
-    told = [
-        handedness_warning(model(KeypointLayout("thing", names, handedness=handedness)), seen)
-        for handedness in ((four,), (inside_out,), (four, inside_out), ())
-    ]
-    # One of two that are each other's mirror image is wrong, and both of both.
-    assert sorted(map(bool, told[:2])) == [False, True]
-    assert told[2].count(names[3]) == 2 and "disagree" in told[2]
-    assert told[3] == ""
-
-
-def test_what_no_model_lifts_is_not_doubted() -> None:
-    nothing = frames(5, P)
-    blind = Dataset(nothing.points, np.zeros((5, P), bool), nothing.layout, "made up")
-    assert handedness_warning(model(nothing.layout), blind) == ""

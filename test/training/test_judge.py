@@ -59,12 +59,12 @@ def test_a_bad_model_is_doubted_and_told_what_would_help(
     frames: Split, good: Model, bad: Model
 ) -> None:
     judgement = judge(frames, bad, good)
-    assert "compared with model 'good' on 60 held-out frames" in judgement.doubt
+    assert "compared with model 'good' on 60 held-out frames" in judgement.reason
     assert (
-        "are mirrored against their neighbours" in judgement.doubt
-        and "(the other's: " in judgement.doubt
+        "are mirrored against their neighbours" in judgement.reason
+        and "(the other's: " in judgement.reason
     )
-    assert "would help" in judgement.doubt and "--from" in judgement.doubt
+    assert "would help" in judgement.reason and "--from" in judgement.reason
     assert str(judgement).startswith("the new model is doubtful: ")
     record = judgement.record()
     assert record["doubtful"] and record["rival"] == "good"
@@ -76,7 +76,7 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
 ) -> None:
     for rival in (good, bad):
         judgement = judge(frames, good, rival)
-        assert judgement.doubt == "" and judgement.rival == rival.name
+        assert not judgement.doubtful and judgement.rival == rival.name
         better = f"the new model is better than model {rival.name!r} on 60 held-out frames: "
         assert str(judgement).startswith(f"{better}its keypoints and bones are off by ")
         assert not judgement.record()["doubtful"]
@@ -88,7 +88,9 @@ def test_mirrored_frames_are_seen_without_another_model(
     from deep_nrsfm_ros.training import judge as module
 
     alone = judge(frames, good, None)
-    assert not alone.doubt and str(alone).startswith("the new model has no other beside it; on 60")
+    assert not alone.doubtful and str(alone).startswith(
+        "the new model has no other beside it; on 60"
+    )
     lift = module._lift
 
     def half_mirrored(model: Model, data: Dataset, options: LiftingOptions) -> Any:
@@ -100,7 +102,7 @@ def test_mirrored_frames_are_seen_without_another_model(
     monkeypatch.setattr(module, "_lift", half_mirrored)
     mirrored = judge(frames, good, None)
     assert mirrored.figures.mirrored_share == pytest.approx(0.3, abs=0.05)
-    assert "of its frames are mirrored" in mirrored.doubt
+    assert "of its frames are mirrored" in mirrored.reason
 
 
 def test_figures_follow_names_not_places(frames: Split, good: Model) -> None:
@@ -123,9 +125,9 @@ def test_a_rival_of_another_object_is_none(frames: Split, good: Model) -> None:
     names = tuple(f"other_{i}" for i in range(len(good.layout)))
     stranger = dataclasses.replace(good, layout=KeypointLayout("other", names))
     judgement = judge(frames, good, stranger)
-    assert judgement.rival == "" and not judgement.doubt
+    assert judgement.rival == "" and not judgement.doubtful
     lost = judge(frames, stranger, None)  # the training that made it is not lost by it
-    assert "keypoints" in lost.doubt and lost.record()["figures"] == {}
+    assert "keypoints" in lost.reason and lost.record()["figures"] == {}
 
 
 @pytest.mark.parametrize(
@@ -176,12 +178,12 @@ def test_frames_that_a_training_has_turned_are_seen_beside_its_start_alone(
     frames: Split, good: Model
 ) -> None:
     tuned = dataclasses.replace(good, provenance=good.provenance | {"from": {"model": "good"}})
-    court, other = Judge(frames), dataclasses.replace(good, name="other")
-    assert court.figures(tuned, good).turned == 0
+    comparison, other = Judge(frames), dataclasses.replace(good, name="other")
+    assert comparison.figures(tuned, good).turned == 0
     mirrored = dataclasses.replace(good, object_frame=-good.object_frame, name="good")
-    assert court.figures(tuned, mirrored).turned == 1
-    assert math.isnan(court.figures(tuned, other).turned)
-    assert math.isnan(court.figures(good, good).turned)
+    assert comparison.figures(tuned, mirrored).turned == 1
+    assert math.isnan(comparison.figures(tuned, other).turned)
+    assert math.isnan(comparison.figures(good, good).turned)
 
 
 def test_standings_have_the_best_first_and_doubtful_ones_last(

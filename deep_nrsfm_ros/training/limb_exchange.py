@@ -9,7 +9,6 @@ frames may not show. They need no 3D label, since they are made of the network's
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,29 +17,14 @@ from deep_nrsfm_ros.body.kinematic_tree import rotation_about
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import Floats, align, centre
 
+_LIMBS = 3  # of each shape that are exchanged and turned, one after the other
+_ANGLE = 0.35  # standard deviation of a limb's rotation vector, per axis, in radians
+_LENGTHS = 0.1  # standard deviation of the logarithm of each edge's length
 _REACH = 1.5  # edges between the joint and a keypoint that has the weight 1 / e in the alignment
 _TINY = 1e-9
 
 
-@dataclass(frozen=True)
-class PartOptions:
-    """How shapes are recombined.
-
-    Attributes:
-        limbs: limbs of each shape that are exchanged and turned, one after the other.
-        angle: standard deviation of a limb's rotation vector, per axis, in radians.
-        lengths: standard deviation of the logarithm of each edge's length.
-    """
-
-    limbs: int = 3
-    angle: float = 0.35
-    lengths: float = 0.1
-
-
-DEFAULT_PARTS = PartOptions()
-
-
-class Parts:
+class LimbExchange:
     """The limbs of a layout, and shapes recombined of them.
 
     Attributes:
@@ -48,7 +32,7 @@ class Parts:
         joints: (e,) the end of each of these edges on its other side.
     """
 
-    def __init__(self, layout: KeypointLayout, options: PartOptions = DEFAULT_PARTS) -> None:
+    def __init__(self, layout: KeypointLayout) -> None:
         """Find the limbs.
 
         An edge divides the layout where no other way leads from one of its ends to the other: an
@@ -73,7 +57,6 @@ class Parts:
             raise ValueError(
                 f"layout {layout.name!r} has no limbs: none of its {len(edges)} edges divides it"
             )
-        self.options = options
         self.limbs: NDArray[np.bool_] = np.array(limbs)
         self.joints: NDArray[np.intp] = np.array(joints)
         distance = np.array([_distances(edges, joint, p) for joint in joints])
@@ -81,7 +64,7 @@ class Parts:
         self._ends = np.array(ends)
 
     @classmethod
-    def of(cls, layout: KeypointLayout) -> Parts | None:
+    def of(cls, layout: KeypointLayout) -> LimbExchange | None:
         """Return the limbs of a layout; None if it has none."""
         try:
             return cls(layout)
@@ -103,8 +86,8 @@ class Parts:
         Returns:
             (count, p, 3) centred.
         """
-        options, X, size = self.options, S[:count], self._size(S)
-        for _ in range(options.limbs):
+        X, size = S[:count], self._size(S)
+        for _ in range(_LIMBS):
             edge, other = (
                 rng.integers(len(self.limbs), size=count),
                 rng.integers(len(S), size=count),
@@ -114,13 +97,13 @@ class Parts:
             weights = weights / weights.sum(1, keepdims=True)
             near_X, near_Y = ((weights * Z).sum(1, keepdims=True) for Z in (X, Y))
             Q = align(weights * (Y - near_Y), X - near_X).rotation
-            vector = options.angle * rng.standard_normal((count, 3))
+            vector = _ANGLE * rng.standard_normal((count, 3))
             angle = np.linalg.norm(vector, axis=1)
             R = rotation_about(vector / np.maximum(angle, _TINY)[:, None], angle)
             joint = self.joints[edge][:, None, None]
             at_X, at_Y = (np.take_along_axis(Z, joint, 1) for Z in (X, Y))
             X = np.where(self.limbs[edge][..., None], at_X + (Y - at_Y) @ (Q @ R), X)
-        longer = np.exp(options.lengths * rng.standard_normal((count, len(self.limbs), 1))) - 1
+        longer = np.exp(_LENGTHS * rng.standard_normal((count, len(self.limbs), 1))) - 1
         return centre(X + self.limbs.T @ (longer * self._edges(X)))
 
     def _edges(self, S: Floats) -> Floats:

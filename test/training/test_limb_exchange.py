@@ -12,17 +12,24 @@ import pytest
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import CMU31
-from deep_nrsfm_ros.nrsfm.geometry import align, centre, rotation_from_vector
-from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
+from deep_nrsfm_ros.nrsfm.geometry import (
+    align,
+    centre,
+    rotation_from_camera,
+    rotation_from_vector,
+)
+from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.training import limb_exchange
+from deep_nrsfm_ros.training.few_frames import Lesson
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.loop import Setup, train
-from deep_nrsfm_ros.training.parts import PartOptions, Parts
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange
+from deep_nrsfm_ros.training.loop import train
+from deep_nrsfm_ros.training.mirror import MirrorCheck, Teacher
 from deep_nrsfm_ros.training.trainer import Trainer
 
 BODY = ("a", "b", "c", "d", "shoulder", "elbow", "hand")
 CHAIN = KeypointLayout("chain", BODY, edges=tuple(pairwise(BODY)))
-EXCHANGE = PartOptions(limbs=1, angle=0.0, lengths=0.0)
-"""One limb is exchanged, and nothing else."""
 
 
 def edge_lengths(S: np.ndarray, layout: KeypointLayout) -> np.ndarray:
@@ -50,15 +57,18 @@ def is_like(S: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def test_a_limb_is_the_smaller_side_of_an_edge() -> None:
-    parts = Parts(CMU31)
+    exchange = LimbExchange(CMU31)
     edge = CMU31.edges.index(("lfemur", "lhipjoint"))
-    limb = {CMU31.keypoints[i] for i in np.flatnonzero(parts.limbs[edge])}
+    limb = {CMU31.keypoints[i] for i in np.flatnonzero(exchange.limbs[edge])}
     assert limb == {"lfemur", "ltibia", "lfoot", "ltoes"}
-    assert CMU31.keypoints[parts.joints[edge]] == "lhipjoint"
-    assert (2 * parts.limbs.sum(1) <= len(CMU31)).all()
+    assert CMU31.keypoints[exchange.joints[edge]] == "lhipjoint"
+    assert (2 * exchange.limbs.sum(1) <= len(CMU31)).all()
 
 
-def test_shapes_exchange_a_limb() -> None:
+def test_shapes_exchange_a_limb(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limb_exchange, "_LIMBS", 1)
+    monkeypatch.setattr(limb_exchange, "_ANGLE", 0.0)
+    monkeypatch.setattr(limb_exchange, "_LENGTHS", 0.0)
     rng = np.random.default_rng(0)
     A = centre(rng.standard_normal((7, 3)))
     B = A.copy()
@@ -67,20 +77,22 @@ def test_shapes_exchange_a_limb() -> None:
     B = centre(B)
     elsewhere = 0.7 * B @ rotation_from_vector(np.array([0.2, 0.1, -0.4]))
     S = np.concatenate((np.tile(A, (600, 1, 1)), np.tile(elsewhere, (600, 1, 1))))
-    recombined = Parts(CHAIN, EXCHANGE).recombine(S, 600, rng)
+    recombined = LimbExchange(CHAIN).recombine(S, 600, rng)
     # Half of the partners are A itself; a third of the edges join the arm.
     assert is_like(recombined, A).mean() == pytest.approx(1 / 2, abs=0.07)
     assert is_like(recombined, B).mean() == pytest.approx(1 / 6, abs=0.05)
 
 
-def test_edges_keep_their_lengths_up_to_the_drawn_ratio() -> None:
+def test_edges_keep_their_lengths_up_to_the_drawn_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     S = people_of_one_size(300, rng)
     before = edge_lengths(S, CMU31)
-    kept = Parts(CMU31, PartOptions(lengths=0.0)).recombine(S, 200, rng)
+    with monkeypatch.context() as patch:
+        patch.setattr(limb_exchange, "_LENGTHS", 0.0)
+        kept = LimbExchange(CMU31).recombine(S, 200, rng)
     assert np.abs(kept - S[:200]).max() > 1
     np.testing.assert_allclose(edge_lengths(kept, CMU31), before[:200], rtol=1e-6)
-    changed = Parts(CMU31, PartOptions(lengths=0.1)).recombine(S, 200, rng)
+    changed = LimbExchange(CMU31).recombine(S, 200, rng)
     np.testing.assert_allclose(changed.mean(1), 0, atol=1e-9)
     ratio = np.log(edge_lengths(changed, CMU31) / before[:200])
     assert ratio.std() == pytest.approx(0.1, rel=0.05)
@@ -90,35 +102,37 @@ def test_edges_keep_their_lengths_up_to_the_drawn_ratio() -> None:
 @pytest.mark.parametrize("edges", [(*CHAIN.edges, ("a", "hand")), ()])
 def test_a_layout_that_no_edge_divides_is_refused(edges: tuple[tuple[str, str], ...]) -> None:
     with pytest.raises(ValueError, match=f"'ring' has no limbs: none of its {len(edges)} edges"):
-        Parts(KeypointLayout("ring", BODY, edges=edges))
+        LimbExchange(KeypointLayout("ring", BODY, edges=edges))
 
 
 def test_edges_of_a_ring_have_no_limbs_and_other_edges_have() -> None:
     ring = (("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"))
     arm = (("d", "shoulder"), ("elbow", "shoulder"))  # the hand is joined to nothing
-    parts = Parts(KeypointLayout("body", BODY, edges=(*ring, *arm)))
-    limbs = [{BODY[i] for i in np.flatnonzero(limb)} for limb in parts.limbs]
+    exchange = LimbExchange(KeypointLayout("body", BODY, edges=(*ring, *arm)))
+    limbs = [{BODY[i] for i in np.flatnonzero(limb)} for limb in exchange.limbs]
     assert limbs == [{"shoulder", "elbow"}, {"elbow"}]
-    assert [BODY[joint] for joint in parts.joints] == ["d", "shoulder"]
+    assert [BODY[joint] for joint in exchange.joints] == ["d", "shoulder"]
     S = np.random.default_rng(0).standard_normal((20, 7, 3))
-    apart = parts.recombine(S, 20, np.random.default_rng(1)) - centre(S)
+    apart = exchange.recombine(S, 20, np.random.default_rng(1)) - centre(S)
     moved = apart - apart[:, :1]
     np.testing.assert_allclose(moved[:, [1, 2, 3, 6]], 0, atol=1e-9)
     assert np.abs(moved[:, 5]).max() > 0.1
 
 
 @pytest.fixture(scope="module")
-def limbs(figure: Any) -> Parts:
+def limbs(figure: Any) -> LimbExchange:
     """The limbs of the figure, whose keypoints form a chain here."""
     names = figure.layout.keypoints
-    return Parts(KeypointLayout("chain", names, edges=tuple(pairwise(names))))
+    return LimbExchange(KeypointLayout("chain", names, edges=tuple(pairwise(names))))
 
 
-def weights_after(figure: Any, trained: Trainer, share: float, parts: Parts | None) -> np.ndarray:
-    recipe = dataclasses.replace(trained.preset.recipe, parts=share, steps=8)
+def weights_after(
+    figure: Any, trained: Trainer, share: float, exchange: LimbExchange | None
+) -> np.ndarray:
+    recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=share, steps=8)
     frames = FrameStore.of(figure.points, np.ones(figure.points.shape[:2], bool))
     trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
-    trainer.parts = parts
+    trainer.limb_exchange = exchange
     for _ in range(4):
         trainer.advance()
     result: np.ndarray = trainer.weights.numpy()
@@ -126,7 +140,7 @@ def weights_after(figure: Any, trained: Trainer, share: float, parts: Parts | No
 
 
 def test_a_share_of_the_known_shapes_is_recombined(
-    figure: Any, trained: Trainer, limbs: Parts
+    figure: Any, trained: Trainer, limbs: LimbExchange
 ) -> None:
     plain = weights_after(figure, trained, 0.0, None)
     np.testing.assert_array_equal(weights_after(figure, trained, 0.0, limbs), plain)
@@ -136,12 +150,12 @@ def test_a_share_of_the_known_shapes_is_recombined(
 
 
 def test_only_the_first_shapes_are_recombined_and_fewer_with_progress(
-    figure: Any, trained: Trainer, limbs: Parts
+    figure: Any, trained: Trainer, limbs: LimbExchange
 ) -> None:
-    recipe = dataclasses.replace(trained.preset.recipe, parts=0.5, steps=8)
+    recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=0.5, steps=8)
     frames = FrameStore.of(figure.points, np.ones(figure.points.shape[:2], bool))
     trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
-    trainer.parts = limbs
+    trainer.limb_exchange = limbs
     trainer.advance()
     assert trainer.shapes is not None
     for step, recombined in ((0, 32), (4, 16), (8, 0)):
@@ -152,43 +166,30 @@ def test_only_the_first_shapes_are_recombined_and_fewer_with_progress(
         np.testing.assert_array_equal(changed, np.arange(64) < recombined)
 
 
-@pytest.mark.parametrize(
-    ("asked", "from_model", "has_limbs", "taken"),
-    [
-        (AUTOMATIC, True, True, 1),
-        (AUTOMATIC, True, False, 0),
-        (AUTOMATIC, False, True, 0),
-        (0.5, False, True, 0.5),
-        (0, True, True, 0),
-    ],
-)
-def test_limbs_are_exchanged_by_themselves_only_where_a_model_is_the_start(
-    figure: Any,
-    trained: Trainer,
-    limbs: Parts,
-    asked: float,
-    from_model: bool,
-    has_limbs: bool,
-    taken: float,
+def test_a_frame_keeps_its_shape_where_its_own_camera_sees_it(
+    figure: Any, trained: Trainer, limbs: LimbExchange
 ) -> None:
-    recipe = dataclasses.replace(trained.preset.recipe, parts=asked, steps=1, seeds=1)
-    start = trained.net.map(lambda w: w.numpy()) if from_model else None
-    setup = Setup(start, parts=limbs if has_limbs else None)
-    visible = np.ones(figure.points.shape[:2], bool)
-    trainer = train(figure.points, visible, trained.preset._replace(recipe=recipe), setup)
-    assert trainer.preset.recipe.parts == taken
+    f = 40
+    rotations = rotation_from_camera(figure.cameras[:f])
+    known = Consensus(centre(figure.shapes[:f]), rotations, np.ones(f), 0.01, 5)
+    recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=1.0, steps=8)
+    frames = FrameStore.of(figure.points[:f], np.ones(figure.points[:f].shape[:2], bool))
+    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
+    trainer.limb_exchange = limbs
+    Teacher(MirrorCheck(frames, Normaliser()), recipe, Lesson(known)).prepare(trainer)
+    shapes, cameras = trainer.known_shapes(), trainer.cameras
+    assert shapes is not None and cameras is not None
+    images = (cameras @ shapes[: len(cameras)].mT).mT.numpy()
+    apart = images[:, None] - centre(figure.points[:f])
+    assert np.linalg.norm(apart, axis=(2, 3)).min(1) == pytest.approx(0, abs=1e-4)
+    assert trainer.shapes is not None
+    changed = (shapes != trainer.shapes).any(-1).any(-1).numpy()
+    np.testing.assert_array_equal(changed, np.arange(64) >= len(cameras))
 
 
-def test_limbs_that_a_layout_lacks_cannot_be_exchanged(figure: Any, trained: Trainer) -> None:
-    recipe = dataclasses.replace(trained.preset.recipe, parts=1, steps=1)
+def test_a_training_that_exchanges_limbs_needs_some(figure: Any, trained: Trainer) -> None:
+    recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=1, steps=1)
     visible = np.ones(figure.points.shape[:2], bool)
-    with pytest.raises(ValueError, match="parts is 1, but there are no limbs to exchange"):
+    with pytest.raises(ValueError, match="limb_exchange is 1, but there are no limbs to exchange"):
         train(figure.points, visible, trained.preset._replace(recipe=recipe))
-    assert Parts.of(figure.layout) is None
-
-
-def test_a_share_below_zero_is_refused(figure: Any, trained: Trainer) -> None:
-    recipe = dataclasses.replace(trained.preset.recipe, parts=-0.5, steps=1)
-    visible = np.ones(figure.points.shape[:2], bool)
-    with pytest.raises(ValueError, match="parts is -0.5; it must be -1 or from 0 to 1"):
-        train(figure.points, visible, trained.preset._replace(recipe=recipe))
+    assert LimbExchange.of(figure.layout) is None
