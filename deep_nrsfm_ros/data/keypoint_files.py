@@ -245,7 +245,7 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
     def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
         lines = (line for line in file if line.strip())
         for number, line in enumerate(lines):
-            yield DefaultFrame(f"line {number + 1}", number), line
+            yield DefaultFrame(f"line {number + 1}", number, is_document=True), line
             on_progress(min(file.tell(), size), size)
 
     with gzip.open(path) if is_compressed else path.open("rb") as file:
@@ -296,7 +296,7 @@ def _folder(path: Path, options: ReadOptions, on_progress: Progress) -> Detectio
 
     def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
         for done, file in enumerate(files, 1):
-            yield DefaultFrame(file.name), file.read_bytes()
+            yield DefaultFrame(file.name, is_document=True), file.read_bytes()
             on_progress(done, len(files))
 
     _read_frames(builder, documents())

@@ -505,3 +505,57 @@ def test_times_of_frames(tmp_path: Path) -> None:
         assert any(said in warning for warning in found.warnings) == bool(said)
     with pytest.raises(KeypointFileError, match="times of its own: leave out --rate"):
         read(tmp_path / "a.json", {"frames": frames}, layout=COCO17, rate=10)
+
+
+def test_a_list_of_results_of_mediapipe_is_frames(tmp_path: Path) -> None:
+    """MediaPipe gives a result for each image, however a script writes the list of them."""
+    persons = [
+        [{"x": x, "y": y, "z": 0.0, "visibility": 0.9} for x, y in np.array(pairs(i)) / 1000]
+        for i in range(3)
+    ]
+    size = (1000, 1000)
+    for content in (
+        [{"pose_landmarks": one} for one in persons],
+        [{"pose_landmarks": [one]} for one in persons],
+        [{"pose_landmarks": {"landmark": one}} for one in persons],
+        [{"landmarks": one} for one in persons],
+        persons,
+        [[one] for one in persons],
+        {"frames": persons},
+    ):
+        found = read(tmp_path / "a.json", content, layout=COCO17, image_size=size)
+        assert found.frame.tolist() == [0, 1, 2] and not found.warnings
+        assert found.frames.numbers.tolist() == [0, 1, 2]
+        np.testing.assert_allclose(found.points[2], pairs(2), rtol=1e-5)
+    nobody = [{"pose_landmarks": value} for value in (persons[0], [], None, persons[1])]
+    found = read(tmp_path / "a.json", nobody, layout=COCO17, image_size=size)
+    assert found.frame.tolist() == [0, 3] and len(found.stamps) == 4 and not found.warnings
+    found = read(tmp_path / "a.json", persons[0], layout=COCO17, image_size=size)
+    assert found.points.shape == (1, Q, 2)
+
+
+def test_results_of_mediapipe_in_a_document_of_a_frame_are_people(tmp_path: Path) -> None:
+    person_ = [{"x": x, "y": y, "visibility": 0.9} for x, y in pairs()]
+    other = [{"x": x, "y": y, "visibility": 0.9} for x, y in pairs(1)]
+    both = [{"landmarks": person_}, {"landmarks": other}]
+    lines = "\n".join([json.dumps(both)] * 2)
+    assert read(tmp_path / "a.jsonl", lines, layout=COCO17).frame.tolist() == [0, 0, 1, 1]
+    named = [{**one, "track_id": i} for i, one in enumerate(both)]
+    assert read(tmp_path / "a.json", named, layout=COCO17).frame.tolist() == [0, 0]
+    timed = [{**one, "timestamp_ms": 40 * i} for i, one in enumerate(both)]
+    assert read(tmp_path / "a.json", timed, layout=COCO17).stamps.tolist() == [0, 40_000_000]
+
+
+def test_one_object_many_times_in_a_frame_is_doubted(tmp_path: Path) -> None:
+    moved = [(np.reshape(person(), (Q, 3)) + [3 * i, 0, 0]).tolist() for i in range(6)]
+    found = read(tmp_path / "a.json", [{"keypoints": one} for one in moved], layout=COCO17)
+    assert "all 6 objects are of one frame" in found.findings[0].message
+    side = [(np.reshape(person(i), (Q, 3)) + [500 * i, 0, 0]).tolist() for i in range(6)]
+    found = read(tmp_path / "a.json", [{"keypoints": one} for one in side], layout=COCO17)
+    assert not found.findings and len(found.stamps) == 1
+
+
+def test_a_place_is_named_once(tmp_path: Path) -> None:
+    content = [{"image_id": 1, "keypoints": person()}, *[{"image_id": 1, "box": [1]}] * 5]
+    found = read(tmp_path / "a.json", content, layout=COCO17)
+    assert found.warnings == ("left out: 5 that have no keypoints, but image_id, box (a.json)",)

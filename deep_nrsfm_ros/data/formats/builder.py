@@ -32,6 +32,8 @@ _ROWS = 1024  # by which arrays grow at least
 _MEDIAPIPE = 33  # landmarks of MediaPipe Pose
 _FEW = 4  # keypoints, which are too few to be compared with a box
 _SMALLEST_BOX = 20.0  # pixels; a smaller one is a placeholder
+_CROWD = 5  # objects, of which as many in one frame may be one object in as many frames
+_SAME_PLACE = 0.5  # overlap of boxes, which two people in an image hardly have
 _MANY = 0.5  # fraction of objects that makes a suspicion a warning
 UNITS = {"seconds": 10**9, "milliseconds": 10**6, "microseconds": 1000, "nanoseconds": 1}
 """Units of time in ns."""
@@ -216,7 +218,7 @@ class DetectionsBuilder:
         """Count an entry of the input that is left out."""
         self._left_out_counts[reason] += 1
         places = self._left_out.setdefault(reason, [])
-        if len(places) < _NAMED:
+        if len(places) <= _NAMED and place not in places:
             places.append(place)
 
     def add(
@@ -341,6 +343,12 @@ class DetectionsBuilder:
                 f"the keypoints of {self._outside_box} of {self._with_box} objects are not in "
                 "their box: are they pixels of the box's crop? Pixels of the image are needed"
             )
+        if len(self._keys) == 1 and len(group.frame) >= _CROWD and _is_one_object(group):
+            self.findings["one-frame"] = (
+                f"all {len(group.frame)} objects are of one frame, and lie on each other: if each "
+                "is of a frame of its own, give each the number of its frame (`frame`), or write a "
+                "line for each frame (.jsonl)"
+            )
         return warnings
 
     def _stamp_frames(self) -> None:
@@ -369,8 +377,8 @@ class DetectionsBuilder:
         sentences = []
         for reason, count in self._left_out_counts.items():
             places = self._left_out.get(reason, [])
-            more = ", ..." if count > len(places) else ""
-            named = f" ({', '.join(places)}{more})" if places else ""
+            more = ", ..." if len(places) > _NAMED else ""
+            named = f" ({', '.join(places[:_NAMED])}{more})" if places else ""
             sentences.append(f"left out: {count} that {reason}{named}")
         return sentences
 
@@ -504,6 +512,22 @@ def _share(low: NDArray[Any], high: NDArray[Any], box: tuple[float, ...]) -> flo
     """Return the share of the area of keypoints from `low` to `high` that is in a box."""
     inside = np.minimum(high, box[2:]) - np.maximum(low, box[:2])
     return float(np.prod(inside) / max(np.prod(high - low), 1e-9))
+
+
+def _is_one_object(group: _Group) -> bool:
+    """Return whether most objects lie where the one before lies, as the same object later does."""
+    n = len(group.frame)
+    points = group.points[:n].astype(np.float64)
+    usable = (group.confidence[:n] > 0) & points.any(-1) & np.isfinite(points).all(-1)
+    points[~usable] = np.nan
+    points = points[usable.sum(1) >= _FEW]
+    if len(points) < _CROWD:
+        return False
+    low, high = np.nanmin(points, 1), np.nanmax(points, 1)
+    inside = np.clip(np.minimum(high[1:], high[:-1]) - np.maximum(low[1:], low[:-1]), 0, None)
+    area, common = np.prod(high - low, 1), np.prod(inside, 1)
+    union = area[1:] + area[:-1] - common
+    return bool(np.median(common / np.maximum(union, 1e-9)) > _SAME_PLACE)
 
 
 def wrong_count(q: int, layout: KeypointLayout | None) -> str:

@@ -5,6 +5,9 @@ They differ in what holds the frames, and in the names of the same few fields of
 reader takes them all, so that a mixture (COCO results with nested keypoints, identities of
 AlphaPose) is read as well; and arrays written as lists, and keypoints by name, as scripts write
 them.
+
+A list at the top is of frames if its elements are frames, as results of MediaPipe are; else it is
+of the objects of one frame.
 """
 
 from __future__ import annotations
@@ -47,10 +50,12 @@ class DefaultFrame(NamedTuple):
     Attributes:
         name: of the file or line.
         number: of the frame; None = the number in its name, where the names have one.
+        is_document: the document is this frame: a list in it is of objects, not of frames.
     """
 
     name: str
     number: int | None = None
+    is_document: bool = False
 
 
 class JsonReader:
@@ -77,10 +82,10 @@ class JsonReader:
         keys: dict[str | None, None] = {}
         for key, value, is_element in json_items(file):
             keys[key] = None
-            if key in _LANDMARKS and is_element and isinstance(value, dict):
+            if key in (None, *_LANDMARKS) and is_element and _is_point(value):
                 landmarks.append(value)
             else:
-                if is_element and _is_frame(key, value):
+                if is_element and _is_frame(key, value, frame):
                     # Frames without a name or number of their own follow one another.
                     inner = DefaultFrame(f"{frame.name} [{elements}]", elements)
                     known |= self._item(key, value, is_element, inner)
@@ -115,8 +120,9 @@ class JsonReader:
             self._frame_of({}, frame)
         if key in (None, "annotations", "instance_info", "results", "frames", *_OBJECTS):
             return self._element(value, frame, key)
-        if key in _LANDMARKS and is_element:
-            return self._landmark(value, frame)
+        if key in _LANDMARKS and isinstance(value, list if is_element else dict):
+            self._person({"landmarks": value}, self._frame_of({}, frame))
+            return True
         if isinstance(value, dict) and key is not None and any(k in value for k in _OBJECTS):
             return self._element(value, DefaultFrame(key), key)  # AlphaPose: image -> people
         if is_element and isinstance(value, dict) and "keypoints" in value and key:
@@ -125,8 +131,9 @@ class JsonReader:
 
     def _element(self, value: Any, frame: DefaultFrame, key: str | None) -> bool:
         """Read an object, a frame, or the list of the objects of a frame."""
-        if isinstance(value, list) and _are_numbers(value):
-            self._person({"keypoints": value}, self._frame_of({}, frame))
+        if isinstance(value, list) and (_are_numbers(value) or _are_landmarks(value)):
+            field = "keypoints" if _are_numbers(value) else "landmarks"
+            self._person({field: value}, self._frame_of({}, frame))
             return True
         if isinstance(value, list):  # a list of instances inside `predictions`
             self._frame_of({}, frame)
@@ -146,7 +153,11 @@ class JsonReader:
         if points := _named_points(value):
             self._person({"keypoints": points}, self._frame_of({}, frame))
             return True
-        if not any(name in value for name in _KEYPOINTS):
+        field = next((name for name in _KEYPOINTS if name in value), "")
+        if field in _LANDMARKS:
+            self._result(value, field, frame)
+            return True
+        if not field:
             # Annotations of COCO are boxes of cars, too.
             if key != "annotations":
                 self._builder.leave_out(
@@ -157,14 +168,29 @@ class JsonReader:
         self._person(value, self._frame_of(value, frame))
         return True
 
-    def _frame(self, value: Mapping[str, Any], frame: DefaultFrame) -> None:
-        """Read the objects of a frame."""
+    def _result(self, value: Mapping[str, Any], field: str, frame: DefaultFrame) -> None:
+        """Read a result of MediaPipe: the landmarks of a person, or those of each person."""
         index = self._frame_of(value, frame)
+        self._time(value, index)
+        people = value[field]
+        if isinstance(people, list) and all(map(_is_person, people)):
+            for person in people:
+                self._person({field: person}, index)
+        elif people is not None:  # null: nobody is seen
+            self._person(value, index)
+
+    def _time(self, value: Mapping[str, Any], index: int) -> None:
+        """Set the time of a frame, if it says one."""
         for name, unit in TIMES.items():
             time = value.get(name)
             if isinstance(time, (int, float)) and not isinstance(time, bool):
                 self._builder.time(index, time, unit)
                 break
+
+    def _frame(self, value: Mapping[str, Any], frame: DefaultFrame) -> None:
+        """Read the objects of a frame."""
+        index = self._frame_of(value, frame)
+        self._time(value, index)
         for name in _OBJECTS:
             objects = value.get(name)
             if isinstance(objects, list):
@@ -212,6 +238,8 @@ class JsonReader:
             if keypoints is None:
                 raise ValueError(NO_KEYPOINTS)
             scores = next((person[n] for n in _SCORES if isinstance(person.get(n), list)), None)
+            if isinstance(keypoints, dict) and isinstance(keypoints.get("landmark"), list):
+                keypoints = keypoints["landmark"]  # of a message of protobuf
             if isinstance(keypoints, dict):
                 keypoints = _named_points(keypoints) or _columns(keypoints)
                 scores = None
@@ -241,13 +269,6 @@ class JsonReader:
             confidence = next((point[n] for n in _CONFIDENCE if n in point), 1.0)
             rows.append([position.get("x"), position.get("y"), confidence])
         return rows
-
-    def _landmark(self, value: Any, frame: DefaultFrame) -> bool:
-        """Read all landmarks of one of the objects of a frame."""
-        if isinstance(value, list):
-            self._person({"landmarks": value}, self._frame_of({}, frame))
-            return True
-        return False
 
     def _place(self, frame: int) -> str:
         """Return the name of a frame, for a warning."""
@@ -292,13 +313,44 @@ class JsonReader:
             self._builder.name_keypoints(ordered)
 
 
-def _is_frame(key: str | None, value: Any) -> bool:
+def _is_frame(key: str | None, value: Any, document: DefaultFrame) -> bool:
     """Return whether an element of a list at the top is a frame, not an object."""
     if key in ("frames", "results"):
         return isinstance(value, (dict, list))
-    is_people = isinstance(value, dict) and any(isinstance(value.get(n), list) for n in _OBJECTS)
-    is_person = isinstance(value, dict) and bool(_named_points(value))
-    return key is None and (is_people or is_person or isinstance(value, list))
+    if key is not None:
+        return False
+    if isinstance(value, dict):
+        is_people = any(isinstance(value.get(n), list) for n in _OBJECTS)
+        is_result = _is_result(value) and not document.is_document
+        return is_people or is_result or bool(_named_points(value))
+    return value is None or isinstance(value, list)
+
+
+def _is_result(value: Mapping[str, Any]) -> bool:
+    """Return whether an entry is a result of MediaPipe, which gives one for each image.
+
+    An entry with an identity is a person.
+    """
+    has_identity = any(as_identity(value.get(name)) is not None for name in _IDENTITY)
+    return any(name in value for name in _LANDMARKS) and not has_identity
+
+
+def _is_point(value: Any) -> bool:
+    """Return whether a value is a keypoint with `x` and `y`, and not an object with its centre."""
+    others = (*_KEYPOINTS, *_FRAME)
+    is_dict = isinstance(value, dict) and "x" in value and "y" in value
+    return is_dict and not any(name in value for name in others)
+
+
+def _is_person(value: Any) -> bool:
+    """Return whether an element of the landmarks of an image is all landmarks of a person."""
+    is_array = isinstance(value, list) and all(isinstance(each, list) for each in value)
+    return is_array or _are_points(value)
+
+
+def _are_landmarks(value: list[Any]) -> bool:
+    """Return whether a list is an object, of keypoints with `x` and `y`."""
+    return len(value) >= _FEWEST and all(map(_is_point, value))
 
 
 def _are_numbers(value: list[Any]) -> bool:
