@@ -27,7 +27,7 @@ from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
 from deep_nrsfm_ros.data.over_time import CAUSAL, SMOOTH, OverTime
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, lift_recording
-from deep_nrsfm_ros.data.resolve_layout import resolve_layout
+from deep_nrsfm_ros.data.resolve_layout import check_names, resolve_layout
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
@@ -207,7 +207,8 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
         warn(warning)
     chosen = detections.largest() if args.objects == "largest" else detections
     if detections.layout:
-        return Objects(chosen, detections.layout, detections.findings)
+        found = (*detections.findings, *check_names(detections.layout, model))
+        return Objects(chosen, detections.layout, found)
     layout, reason, ambiguity = resolve_layout(chosen, model)
     note(f"keypoint layout {layout.name}: {reason}")
     found = (*detections.findings, *([ambiguity] if ambiguity else []))

@@ -3,9 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from deep_nrsfm_ros.data.detections import Detections
+from deep_nrsfm_ros.data.formats.names import (
+    NAMED_BY_INPUT,
+    are_mostly_known,
+    misspelt,
+)
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.layout_fit import (
     LayoutFit,
@@ -16,6 +23,9 @@ from deep_nrsfm_ros.lifting.layout_fit import (
 )
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.model_files.model_file import Model
+
+_SHOWN = 4  # names in a text
+_LIMBS = 3  # keypoints of a side, without which a person has only one
 
 
 class ResolvedLayout(NamedTuple):
@@ -59,6 +69,59 @@ def resolve_layout(detections: Detections, model: Model) -> ResolvedLayout:
         f"the objects have {q} keypoints; no layout of {q} keypoints is known that model "
         f"{model.name!r} ({len(model.layout)} keypoints) can lift: name one with --keypoint-layout"
     )
+
+
+def check_names(layout: KeypointLayout, model: Model) -> list[Finding]:
+    """Return what looks wrong in the names that an input gives its keypoints.
+
+    Args:
+        layout: of the input.
+        model: lifts its keypoints.
+
+    Raises:
+        ValueError: the model has too few keypoints of these names.
+    """
+    if layout.name != NAMED_BY_INPUT:
+        return []
+    names, wanted = layout.keypoints, model.layout.keypoints
+    close = misspelt(names, wanted)
+    guesses = ", ".join(f"{name} ({other}?)" for name, other in list(close.items())[:_SHOWN])
+    guesses += ", ..." * (len(close) > _SHOWN)
+    try:
+        filled = KeypointMap(layout, model.layout).filled
+    except ValueError:
+        raise ValueError(
+            f"its keypoints are named {_shown(names)}, and those of model {model.name!r} "
+            f"{_shown(wanted)}: rename them{f', such as {guesses}' if guesses else ''}, or name "
+            "the layout in whose order they are with --keypoint-layout"
+        ) from None
+    findings = []
+    if close and are_mostly_known(names, wanted):
+        count = f"{len(close)} of {len(names)} names are unknown"
+        findings.append(
+            Finding(
+                "misspelt",
+                f"{count} to model {model.name!r}, which lacks these keypoints then: {guesses}; "
+                "correct the names",
+            )
+        )
+    for side, other in (("left", "right"), ("right", "left")):
+        count = sum(name.startswith(f"{side}_") for name in wanted)
+        seen = sum(name.startswith(f"{other}_") for name in filled)
+        if count >= _LIMBS <= seen and not any(name.startswith(f"{side}_") for name in filled):
+            findings.append(
+                Finding(
+                    "one-side",
+                    f"the input names {seen} {other}_ keypoints of model {model.name!r} and no "
+                    f"{side}_ one: that side is guessed; check the names",
+                )
+            )
+    return findings
+
+
+def _shown(names: Sequence[str]) -> str:
+    """Return the first names of a list."""
+    return ", ".join(names[:_SHOWN]) + ", ..." * (len(names) > _SHOWN)
 
 
 def _ranking(chosen: LayoutFit, fits: list[LayoutFit]) -> str:

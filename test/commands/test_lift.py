@@ -204,6 +204,8 @@ def test_the_size_of_the_image_acts_on_every_input(
 
 
 POINTS, CONFIDENCE = in_layout(COCO17)
+NAMES = np.array(COCO17.keypoints)
+ONE_SIDE = np.array([name.replace("left", "loose") for name in COCO17.keypoints])
 SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
 
 
@@ -218,6 +220,10 @@ SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
         ({"points": POINTS / 1000 + 5}, (), 3, "these are no pixels"),
         ({"confidence": CONFIDENCE * (np.arange(17) < 3)}, (), 2, "60 have fewer than 4 detected"),
         ({"points": POINTS[:0], "confidence": CONFIDENCE[:0]}, (), 2, "has no object"),
+        ({"names": np.char.replace(NAMES, "knee", "knie")}, (), 3, "left_knie (left_knee?), right"),
+        ({"names": np.char.replace(NAMES, "ear", "hearing")}, (), 0, ""),
+        ({"names": ONE_SIDE}, (), 3, "8 right_ keypoints of model 'human' and no left_ one"),
+        ({"names": np.char.add("p", np.arange(17).astype(str))}, (), 2, "are named p0, p1, p2, p3"),
         ({}, ("--image-width", "640"), 2, "--image-height is 0: the size of the image needs both"),
         ({}, ("--rectified",), 2, "--rectified has no effect without --intrinsics"),
         ({}, ("--correction", "none", "--noise", "0.1"), 2, "--noise has no effect"),

@@ -165,6 +165,39 @@ def test_a_column_for_each_coordinate(tmp_path: Path, form: str) -> None:
         np.testing.assert_allclose(found.points, np.nan_to_num(VALUES[..., :2]), rtol=1e-5)
 
 
+def columns(*without: str) -> str:
+    """Return a table of a column for each coordinate, without some of them."""
+    head = [f"{part}_{c}" for part in PARTS for c in ("x", "y", "v")]
+    kept = [i for i, name in enumerate(head) if name not in without]
+    lines = VALUES.reshape(5, -1)[:, kept].tolist()
+    return rows([head[i] for i in kept], *lines)
+
+
+def test_a_coordinate_without_the_other_is_named(tmp_path: Path) -> None:
+    found = read(tmp_path / "a.csv", columns("nose_y", "left_ear_x"))
+    assert found.layout and found.layout.keypoints == PARTS[2:]
+    (finding,) = found.findings
+    assert "nose has x but no y, left_ear has y but no x" in finding.message
+    whole = ("nose_x", "nose_y", "nose_v", "left_ear_v")
+    assert not read(tmp_path / "a.csv", columns(*whole)).findings
+    lacking = [(column, i) for i, column in enumerate(COLUMNS) if column[1:] != ("nose", "y")]
+    values = VALUES.reshape(5, -1)[:, [i for _, i in lacking]]
+    levels = ("scorer", "bodyparts", "coords")
+    found = read(tmp_path / "a.csv", deeplabcut([c for c, _ in lacking], values, levels))
+    assert "nose has x but no y" in found.findings[0].message
+
+
+def test_landmarks_without_a_frame(tmp_path: Path) -> None:
+    """A landmark that comes again begins the next frame, where no column says the frame."""
+    text = landmarks(VALUES, PARTS)
+    unnumbered = "".join(line.split(",", 1)[1] + "\n" for line in text.splitlines())
+    assert_mouse(read(tmp_path / "a.csv", unnumbered))
+    lines = text.splitlines()
+    found = read(tmp_path / "a.csv", "\n".join([*lines, *lines[1:4]]))
+    assert len(found) == 5
+    assert found.warnings[0].startswith("left out: 3 that are rows before another one of the same")
+
+
 def test_other_tables(tmp_path: Path) -> None:
     with pytest.raises(KeypointFileError, match="its columns are date, price"):
         read(tmp_path / "a.csv", "date,price\n1,2\n")

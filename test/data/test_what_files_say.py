@@ -13,7 +13,7 @@ import pytest
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.formats.frame_numbers import numbers_in
 from deep_nrsfm_ros.data.formats.json_items import JsonItem, json_items
-from deep_nrsfm_ros.data.formats.names import layout_of_names, preset_spelling
+from deep_nrsfm_ros.data.formats.names import layout_of_names, misspelt, preset_spelling
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN17
@@ -559,3 +559,25 @@ def test_a_place_is_named_once(tmp_path: Path) -> None:
     content = [{"image_id": 1, "keypoints": person()}, *[{"image_id": 1, "box": [1]}] * 5]
     found = read(tmp_path / "a.json", content, layout=COCO17)
     assert found.warnings == ("left out: 5 that have no keypoints, but image_id, box (a.json)",)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["left_knie", "RIGHT_ANCLE"], {"left_knie": "left_knee", "RIGHT_ANCLE": "right_ankle"}),
+        (["left_knie", "left_knee"], {}),  # none is missing
+        (["left_knie", "left_heel", "left_hand", "chin"], {"left_knie": "left_knee"}),
+        (["Left Hand", "tail_base", "knie_right"], {"knie_right": "right_knee"}),
+    ],
+)
+def test_names_that_are_nearly_those_of_a_model(names: list[str], expected: Any) -> None:
+    wanted = [*COCO17.keypoints[:13], "left_knee", "right_knee", "right_ankle"]
+    assert misspelt(names, wanted) == expected
+
+
+def test_too_few_names_are_the_fault(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", points=np.ones((2, Q, 2)), names=np.array(COCO17.keypoints[:16]))
+    with pytest.raises(KeypointFileError, match="its `names` are 16, and `points` has 17 keypo"):
+        read_keypoints(tmp_path / "a.npz")
+    with pytest.raises(KeypointFileError, match="have 17 keypoints, and it names 16: correct"):
+        read(tmp_path / "a.json", coco(list(COCO17.keypoints[:16])))

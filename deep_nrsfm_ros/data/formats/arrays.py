@@ -168,11 +168,18 @@ def _layout(arrays: Mapping[str, NDArray[Any]], options: ReadOptions) -> Keypoin
     """Return the layout of the keypoints: of the options, of `names`, or the fallback.
 
     Raises:
-        KeypointFileError: `names` contradicts the layout of the options.
+        KeypointFileError: `names` contradicts the layout of the options, or are not as many as
+            the keypoints.
     """
     names = arrays.get("names")
     if names is None or names.dtype.kind != "U" or names.ndim != 1:
         return options.layout or options.fallback
+    q = arrays["points"].shape[1] if arrays["points"].ndim == 3 else len(names)
+    if len(names) != q:
+        raise KeypointFileError(
+            f"its `names` are {len(names)}, and `points` has {q} keypoints: save a name for each, "
+            "or leave `names` out"
+        )
     named = layout_of_names(names.tolist())
     reason = contradiction(options.layout, named) if options.layout else ""
     if options.layout and reason:

@@ -20,7 +20,7 @@ from deep_nrsfm_ros.data.formats.frame_numbers import (
     series_of,
     stamps_of,
 )
-from deep_nrsfm_ros.data.formats.names import contradiction, layout_of_names
+from deep_nrsfm_ros.data.formats.names import NAMED_BY_INPUT, contradiction, layout_of_names
 from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
@@ -536,6 +536,11 @@ def wrong_count(q: int, layout: KeypointLayout | None) -> str:
     fitting = [preset for preset in LAYOUTS if len(LAYOUTS[preset]) == q]
     others = f" ({', '.join(fitting)} has {q})" if len(fitting) == 1 else ""
     others = f" ({', '.join(fitting)} have {q})" if len(fitting) > 1 else others
+    if name == NAMED_BY_INPUT:
+        return (
+            f"its objects have {q} keypoints, and it names {size}: correct the names, or leave "
+            f"them out and name the layout with --keypoint-layout{others}"
+        )
     return (
         f"its objects have {q} keypoints; the keypoint layout {name} has {size}: name the layout "
         f"in which they were written with --keypoint-layout{others}"

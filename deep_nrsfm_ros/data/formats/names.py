@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from difflib import SequenceMatcher
 from functools import cache
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 
+NAMED_BY_INPUT = "names_of_the_input"
+"""Name of a layout of the names in an input, which are not those of a preset."""
 _DATASETS = {
     "coco": "coco17",
     "halpe": "halpe136",
@@ -24,6 +27,7 @@ _DATASETS = {
     "coco_wholebody_hand": "hand21",
 }
 """Datasets of MMPose -> presets."""
+_ALIKE = 0.7  # of the letters of two names: knie and knee have 0.75, hip and hand 0.3
 _SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _ALIASES = {
     "sho": "shoulder",
@@ -57,7 +61,7 @@ def layout_of_names(names: Sequence[str]) -> KeypointLayout:
             if LAYOUTS[name].keypoints == keypoints:
                 return LAYOUTS[name]
     unique = keypoints if len(set(keypoints)) == len(keypoints) else tuple(names)
-    return KeypointLayout("names_of_the_input", unique)
+    return KeypointLayout(NAMED_BY_INPUT, unique)
 
 
 def preset_spelling(name: str) -> str:
@@ -65,10 +69,7 @@ def preset_spelling(name: str) -> str:
     known = _known()
     if name in known:
         return name
-    words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])([A-Z][a-z])", r"\1\3_\2\4", name).lower()
-    parts = [part for part in re.split(r"[^a-z0-9]+", words) if part]
-    sides = [_SIDES[part] for part in parts if part in _SIDES]
-    rest = "_".join(part for part in parts if part not in _SIDES)
+    sides, rest = _words(name)
     bare = [rest, _ALIASES.get(rest, rest)]
     if sides:
         candidates = [f"{sides[0]}_{name}" for name in bare]
@@ -78,6 +79,45 @@ def preset_spelling(name: str) -> str:
     else:
         candidates = bare
     return next((candidate for candidate in candidates if candidate in known), name)
+
+
+def _words(name: str) -> tuple[list[str], str]:
+    """Return the sides in a name, and the rest of it: ["left"], "small_toe" of LSmallToe."""
+    words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])([A-Z][a-z])", r"\1\3_\2\4", name).lower()
+    parts = [part for part in re.split(r"[^a-z0-9]+", words) if part]
+    sides = [_SIDES[part] for part in parts if part in _SIDES]
+    return sides, "_".join(part for part in parts if part not in _SIDES)
+
+
+def misspelt(names: Collection[str], wanted: Sequence[str]) -> dict[str, str]:
+    """Return the names that are unknown and nearly a wanted one that is missing -> that one.
+
+    A name of any preset is known: a detector may give keypoints that a model lacks.
+
+    Args:
+        names: of the keypoints of an input.
+        wanted: names of the keypoints of a model.
+    """
+    missing = {name: _words(name) for name in wanted if name not in names}
+    found: dict[str, str] = {}
+    for name in names:
+        if name in _known() or name in wanted:
+            continue
+        sides, rest = _words(name)
+        likeness = {
+            other: SequenceMatcher(None, rest, other_rest).ratio()
+            for other, (other_sides, other_rest) in missing.items()
+            if other_sides == sides
+        }
+        best = max(likeness, key=likeness.__getitem__, default="")
+        if best and likeness[best] >= _ALIKE:
+            found[name] = best
+    return found
+
+
+def are_mostly_known(names: Collection[str], wanted: Sequence[str]) -> bool:
+    """Return whether at least half of some names are wanted ones, or those of a preset."""
+    return 2 * sum(name in wanted or name in _known() for name in names) >= len(names)
 
 
 @cache

@@ -7,6 +7,7 @@ import csv
 import io
 import pickle
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -40,6 +41,7 @@ _EXPECTED = (
 )
 _UNIQUE = "single"  # individual of DeepLabCut that has the unique bodyparts
 _DECIMAL_COMMA = re.compile(r"^(\s*[-+]?\d+),(\d+)")
+_SHOWN = 4  # keypoints that a finding names
 _METRES = 50.0  # a larger coordinate of a TRC is in pixels: no one is filmed on 50 m
 
 Column = tuple[str, str, str]
@@ -192,6 +194,7 @@ def add_table(
                 f"are points of the scene, not of an individual (--category {_UNIQUE} reads them)",
                 part,
             )
+    _find_incomplete({part: at for parts in places.values() for part, at in parts.items()}, builder)
     kinds: dict[tuple[str, ...], int] = {}
     names: dict[int, list[str]] = {}
     plan = []
@@ -218,6 +221,26 @@ def add_table(
             identity = as_identity(individual)
             identity = None if identity == _UNIQUE else identity
             builder.add(frame, np.column_stack([points, confidence]), identity, None, kind)
+
+
+def _find_incomplete(places: Mapping[str, Mapping[str, int]], builder: DetectionsBuilder) -> None:
+    """Add a finding if a keypoint has a column of one coordinate only.
+
+    Args:
+        places: columns of each keypoint, by coordinate.
+        builder: gets the finding.
+    """
+    halves = [
+        f"{part} has {'x but no y' if 'x' in at else 'y but no x'}"
+        for part, at in places.items()
+        if ("x" in at) != ("y" in at)
+    ]
+    if halves:
+        more = ", ..." * (len(halves) > _SHOWN)
+        builder.findings["incomplete"] = (
+            f"{', '.join(halves[:_SHOWN])}{more}: these keypoints are missing in all objects; add "
+            "the columns, or correct their names"
+        )
 
 
 def _confidence_columns(places: Mapping[str, Mapping[str, int]]) -> NDArray[np.int64]:
@@ -265,6 +288,7 @@ def _landmark_rows(names: list[str], rows: Iterator[list[str]], builder: Detecti
     person = next((names.index(c) for c in _OBJECT if c in names), None)
     objects: dict[tuple[Any, str], dict[str, tuple[float, float, float]]] = {}
     order: dict[str, None] = {}
+    counts: Counter[str] = Counter()
     for line, row in enumerate(rows, 2):
         if not any(cell.strip() for cell in row):
             continue
@@ -273,7 +297,18 @@ def _landmark_rows(names: list[str], rows: Iterator[list[str]], builder: Detecti
             continue
         mark = row[keypoint].strip()
         order[mark] = None
-        key = ("" if frame is None else _key([row[frame]]), "" if person is None else row[person])
+        who = "" if person is None else row[person]
+        key = (counts[who] if frame is None else _key([row[frame]]), who)
+        if mark in objects.get(key, {}):
+            if frame is None:  # the next frame of this object
+                counts[who] += 1
+                key = (counts[who], who)
+            else:
+                builder.leave_out(
+                    "are rows before another one of the same landmark and frame (people need a "
+                    "column such as person_id)",
+                    f"before line {line}",
+                )
         c = 1.0 if confidence is None else _number(row[confidence])
         objects.setdefault(key, {})[mark] = (_number(row[x]), _number(row[y]), c)
     if not order:
@@ -324,6 +359,7 @@ def _coordinate_columns(
     if not complete:
         shown = ", ".join(head[:6]) or "nothing"
         raise KeypointFileError(f"it is {_EXPECTED}; its columns are {shown}")
+    _find_incomplete(places, builder)
     if not all(part.isdecimal() for part in complete):
         builder.name_keypoints(list(complete))
     builder.is_mediapipe = True
