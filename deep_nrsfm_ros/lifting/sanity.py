@@ -33,6 +33,9 @@ _MAX_OBJECTS = 5000  # objects of a sample; more cost time and change no finding
 _NORMALISED = 2.0  # largest normalised coordinate; a detector puts some points beyond the border
 _SIGNED = 0.05  # fraction of points with a negative coordinate, above which the range is -1 to 1
 _TINY = 3.0  # pixels; no detector finds keypoints of smaller objects
+_HIGH = 2.0  # COCO's mark of a visible keypoint; OpenPose and MMPose go a little above 1
+_MANY_HIGH = 0.05  # fraction of confidences above it that is another scale
+_SCALES = (10, 100, 255, 1000)  # largest values of usual scales
 _UPRIGHT = 0.7  # cosine between the up axis of a person and an axis of the image
 _NEARLY_ALL = 0.9  # fraction of people that makes an orientation suspicious
 _FACE = ("nose", "left_eye", "right_eye")
@@ -80,7 +83,7 @@ def check(
 
     Args:
         points: (n, q, 2) keypoints, which should be pixels.
-        confidence: (n, q) of the keypoints; 0 where missing.
+        confidence: (n, q) of the keypoints, as the detector gives it; 0 where missing.
         intrinsics: of the camera, in pixels; None: not used.
         image_size: width and height of the image in pixels; None: unknown.
         stamps: (f,) in ns, one for each frame, in the order of the frames; None: unknown.
@@ -90,6 +93,7 @@ def check(
     findings: list[Finding] = []
     visible = confidence[::step] > 0
     objects = points[::step]
+    findings += confidence_scale(confidence[::step])
     if visible.any():
         if sentinel := find_sentinel(objects, visible):
             spot, times = sentinel
@@ -161,6 +165,28 @@ def find_sentinel(points: Floats, visible: NDArray[np.bool_]) -> tuple[Floats, i
     spots, counts = np.unique(points[suspect], axis=0, return_counts=True)
     most = int(counts.argmax())
     return (spots[most], int(counts[most])) if counts[most] >= _MIN_REPEATS else None
+
+
+def confidence_scale(confidence: Floats) -> list[Finding]:
+    """Return whether confidences are on another scale than 0 to 1.
+
+    What is above 1 counts as 1, so that on a scale of 0 to 100 weak keypoints count fully.
+
+    Args:
+        confidence: of any shape, as the detector gives it; 0, negative or NaN where missing.
+    """
+    given = confidence[(confidence > 0) & (confidence < np.inf)]
+    if not given.size or (given > _HIGH).mean() <= _MANY_HIGH:
+        return []
+    largest = float(given.max())
+    scale = next((scale for scale in _SCALES if largest <= scale), None)
+    remedy = f"divide it by {scale}" if scale else "convert it"
+    return [
+        Finding(
+            "confidence-scale",
+            f"confidence up to {largest:.4g}: it must be 0 to 1, and more counts as 1; {remedy}",
+        )
+    ]
 
 
 def quality(residual: Floats, confidence: Floats) -> list[Finding]:

@@ -581,3 +581,17 @@ def test_too_few_names_are_the_fault(tmp_path: Path) -> None:
         read_keypoints(tmp_path / "a.npz")
     with pytest.raises(KeypointFileError, match="have 17 keypoints, and it names 16: correct"):
         read(tmp_path / "a.json", coco(list(COCO17.keypoints[:16])))
+
+
+def test_confidence_of_0_to_100_is_doubted(tmp_path: Path) -> None:
+    """It is read as ever: what is above 1 counts as 1."""
+    values = np.reshape(person(), (Q, 3)) * [1, 1, 100]
+    np.save(tmp_path / "a.npy", np.tile(values, (3, 1, 1)))
+    people = [{"image_id": 0, "keypoints": values.ravel().tolist()}]
+    for found in (
+        read(tmp_path / "a.json", people, layout=COCO17),
+        read_keypoints(tmp_path / "a.npy"),
+    ):
+        assert [f.code for f in found.findings] == ["confidence-scale"]
+        assert "up to 90: it must be 0 to 1" in found.findings[0].message
+        assert (found.confidence == 1).all()

@@ -146,3 +146,22 @@ def test_people_upside_down_and_on_their_side() -> None:
     some[::4, 1] *= -1
     assert not orientation(some)
     assert is_person(HUMAN17) and not is_person(KeypointLayout.numbered(17))
+
+
+@pytest.mark.parametrize(
+    ("confidence", "expected"),
+    [
+        (np.linspace(0, 97, N * Q), "confidence up to 97: it must be 0 to 1, and more counts as 1; "
+         "divide it by 100"),
+        (np.linspace(0, 250, N * Q), "divide it by 255"),
+        (np.linspace(0, 1e6, N * Q), "convert it"),
+        (np.linspace(0, 1.3, N * Q), ""),  # OpenPose, MMPose
+        (np.arange(N * Q) % 3, ""),  # visibility of COCO
+        (np.r_[97, np.full(N * Q - 1, 0.9)], ""),  # an odd one
+        (np.full(N * Q, np.nan), ""),
+    ],
+)  # fmt: skip
+def test_the_scale_of_confidence(confidence: np.ndarray, expected: str) -> None:
+    found = check(people(), confidence.reshape(N, Q))
+    assert [f.code for f in found] == ["confidence-scale"] * bool(expected)
+    assert expected in "".join(map(str, found))
