@@ -209,8 +209,16 @@ def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections
         reasons = builder.reasons()
         raise KeypointFileError("; ".join([problem, *reasons]))
     if problem:
-        builder.warnings.append(f"it is read up to a damaged place only: {problem}")
+        _find_damage(builder, problem)
     return builder.detections("it has no frame")
+
+
+def _find_damage(builder: DetectionsBuilder, problem: str) -> None:
+    """Add the finding that a file is read up to a damaged place."""
+    builder.findings["damaged"] = (
+        f"it is read up to a damaged place only, and whatever follows is lost: {problem}; write or "
+        "copy the file anew"
+    )
 
 
 def _read_document(reader: JsonReader, file: Readable, frame: DefaultFrame) -> str:
@@ -254,7 +262,7 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
         except (EOFError, OSError, zlib.error) as error:
             if not builder.frames:
                 raise
-            builder.warnings.append(f"it is read up to a damaged place only: {error}")
+            _find_damage(builder, f"{error}, after {builder.frames} frames")
     return builder.detections("it is empty")
 
 

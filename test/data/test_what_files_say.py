@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from pathlib import Path
 from typing import Any
@@ -424,7 +425,20 @@ def test_an_option_that_cannot_act_is_an_error(tmp_path: Path) -> None:
 def test_a_file_that_ends_early_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     text = json.dumps([{"image_id": i, "keypoints": person(i)} for i in range(5)])
     found = read(tmp_path / "a.json", text[:-300], layout=COCO17)
-    assert len(found) == 4 and "read up to a damaged place" in found.warnings[0]
+    (finding,) = found.findings
+    assert len(found) == 4 and finding.code == "damaged"
+    end = f"the file ends early at character {len(text) - 300}, after 4 whole elements"
+    assert "read up to a damaged place" in finding.message and end in finding.message
+    broken = text.replace('"image_id": 2', '"image_id" 2')
+    found = read(tmp_path / "a.json", broken, layout=COCO17)
+    place = broken.index('"image_id" 2') + len('"image_id" ')
+    assert f"at character {place}, after 2 whole elements" in found.findings[0].message
+    with pytest.raises(KeypointFileError, match="a.json: the file is empty"):
+        read(tmp_path / "a.json", " ")
+    lines = gzip.compress("\n".join(json.dumps(openpose(person())) for _ in range(200)).encode())
+    (tmp_path / "a.jsonl.gz").write_bytes(lines[:-200])
+    found = read_keypoints(tmp_path / "a.jsonl.gz", ReadOptions(layout=COCO17))
+    assert f"after {len(found)} frames" in found.findings[0].message
 
 
 class Slow:

@@ -57,12 +57,16 @@ class _Reader:
 
     def __init__(self, file: Readable) -> None:
         self._file, self._text, self._at, self._ended = file, "", 0, False
+        self._before = 0  # characters before `_text`
+        self._whole = 0  # elements read
         self._bytes: codecs.IncrementalDecoder | None = None
         self._decode = json.JSONDecoder().raw_decode
 
     def items(self) -> Iterator[JsonItem]:
         """See `json_items`."""
         first = self._peek()
+        if not first:
+            raise ValueError("the file is empty")
         if first == "[":
             yield from self._elements(None)
         elif first == "{":
@@ -70,7 +74,8 @@ class _Reader:
             while self._continues("}"):
                 key = self._value()
                 if not isinstance(key, str) or self._peek() != ":":
-                    raise ValueError(f"no JSON: a key and ':' are needed, not {key!r:.40}")
+                    where = self._place(self._at)
+                    raise ValueError(f"no JSON: a key and ':' are needed, not {key!r:.40}{where}")
                 self._at += 1
                 if self._peek() == "[":
                     yield from self._elements(key)
@@ -79,14 +84,17 @@ class _Reader:
         else:
             yield JsonItem(None, self._value(), False)
         if self._peek():
-            raise ValueError(f"no JSON: {self._text[self._at : self._at + 20]!r} after its end")
+            rest = self._text[self._at : self._at + 20]
+            raise ValueError(f"no JSON: {rest!r} after its end{self._place(self._at)}")
 
     def _elements(self, key: str | None) -> Iterator[JsonItem]:
         """Yield the elements of the list that begins here."""
         self._at += 1
         empty = True
         while self._continues("]"):
-            yield JsonItem(key, self._value(), True)
+            value = self._value()
+            self._whole += 1
+            yield JsonItem(key, value, True)
             empty = False
         if empty:
             yield JsonItem(key, [], False)
@@ -100,7 +108,7 @@ class _Reader:
         if here == ",":
             self._at += 1
         elif not here:
-            raise ValueError("the file ends early")
+            raise ValueError(f"the file ends early{self._place(self._at)}")
         return True
 
     def _peek(self) -> str:
@@ -120,16 +128,24 @@ class _Reader:
             try:
                 value, end = self._decode(self._text, self._at)
             except json.JSONDecodeError as error:
+                at = self._before + error.pos  # `_more` moves the text
                 # Unless it is far from the end, the error may be that the value is unfinished.
                 if len(self._text) - error.pos > _PUNCTUATION or not self._more():
-                    if self._ended and error.pos >= len(self._text.rstrip()):
-                        raise ValueError("the file ends early") from None
-                    raise ValueError(f"no JSON: {error.msg}") from None
+                    if self._ended and at >= self._before + len(self._text.rstrip()):
+                        place = self._place(len(self._text))
+                        raise ValueError(f"the file ends early{place}") from None
+                    place = self._place(at - self._before)
+                    raise ValueError(f"no JSON: {error.msg}{place}") from None
                 continue
             if end == len(self._text) and self._more():
                 continue  # a number may go on
             self._at = end
             return value
+
+    def _place(self, at: int) -> str:
+        """Return where in the file a character of the text is, for an error text."""
+        after = f", after {self._whole} whole elements" if self._whole else ""
+        return f" at character {self._before + at}{after}"
 
     def _more(self) -> bool:
         """Read on; return False at the end of the file."""
@@ -140,6 +156,7 @@ class _Reader:
         self._ended = not data
         if self._bytes is None:
             self._bytes = codecs.getincrementaldecoder(_encoding(data))()
+        self._before += self._at
         self._text = self._text[self._at :] + self._bytes.decode(data, final=self._ended)
         self._at = 0
         return not self._ended
