@@ -22,7 +22,7 @@ from deep_nrsfm_ros.commands.program import program, program_name
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.camera_file import read_camera_file, read_image_size
 from deep_nrsfm_ros.data.detections import Detections
-from deep_nrsfm_ros.data.keypoint_files import KINDS, read_keypoints
+from deep_nrsfm_ros.data.keypoint_files import KINDS, is_bag, read_keypoints
 from deep_nrsfm_ros.data.lifted_files import check_output, write_recording
 from deep_nrsfm_ros.data.over_time import CAUSAL, SMOOTH, OverTime
 from deep_nrsfm_ros.data.read_options import ReadOptions
@@ -190,7 +190,8 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
         layout: as the user names it; None = that of the input, or the one that fits best.
 
     Raises:
-        ValueError: the input cannot be read, or has other keypoints than the layout.
+        ValueError: the input cannot be read, has other keypoints than the layout, or is a file
+            without an object.
     """
     inputs = override(InputOptions(), args)
     options = dataclasses.replace(
@@ -205,6 +206,9 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
         detections = read_keypoints(args.input, options, on_progress)
     for warning in detections.warnings:
         warn(warning)
+    # A bag may be shown without its keypoints, and says how many there would be.
+    if not len(detections) and not is_bag(args.input):
+        raise ValueError(_no_object(args.input, len(detections.stamps)))
     chosen = detections.largest() if args.objects == "largest" else detections
     if detections.layout:
         found = (*detections.findings, *check_names(detections.layout, model))
@@ -241,13 +245,18 @@ def summary_of(
     summary = summarise(recording, model, *camera, min_visible)
     summary = dataclasses.replace(summary, findings=(*findings, *summary.findings))
     if not summary.total:
-        raise ValueError(f"{args.input} has no object in its {summary.frames} frames")
+        raise ValueError(_no_object(args.input, summary.frames))
     if not summary.lifted:
         found = "".join(f"; {finding}" for finding in summary.findings)
         raise ValueError(
             f"none of {summary.total} objects is lifted: {summary.left_out_text}{found}"
         )
     return summary
+
+
+def _no_object(path: Path, frames: int) -> str:
+    """Return the error text for an input without an object."""
+    return f"{path} has no object in its {frames} frame{'s' * (frames != 1)}"
 
 
 @contextmanager

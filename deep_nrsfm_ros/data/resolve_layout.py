@@ -97,11 +97,11 @@ def check_names(layout: KeypointLayout, model: Model) -> list[Finding]:
         ) from None
     findings = []
     if close and are_mostly_known(names, wanted):
-        count = f"{len(close)} of {len(names)} names are unknown"
+        unknown = f"{len(close)} of {len(names)} names are unknown"
         findings.append(
             Finding(
                 "misspelt",
-                f"{count} to model {model.name!r}, which lacks these keypoints then: {guesses}; "
+                f"{unknown} to model {model.name!r}, which lacks these keypoints then: {guesses}; "
                 "correct the names",
             )
         )

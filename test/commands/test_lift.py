@@ -248,6 +248,21 @@ def test_what_looks_wrong_is_said(
     assert expected in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("content", ["[]", '{"people": []}', "[[], []]"])
+def test_nobody_is_no_question_of_the_layout(
+    content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(content)
+    with pytest.raises(SystemExit):
+        main([str(path), "--output", str(tmp_path / "out.npz")])
+    assert capsys.readouterr().err.startswith(f"failed: {path} has no object in its ")
+    np.save(tmp_path / "a.npy", POINTS[:0])
+    with pytest.raises(SystemExit):
+        main([str(tmp_path / "a.npy"), "--output", str(tmp_path / "out.npz")])
+    assert capsys.readouterr().err.endswith("a.npy has no object in its 0 frames\n")
+
+
 def test_people_far_away_and_those_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
