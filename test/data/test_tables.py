@@ -203,8 +203,9 @@ def test_other_tables(tmp_path: Path) -> None:
         read(tmp_path / "a.csv", "date,price\n1,2\n")
     with pytest.raises(KeypointFileError, match="needs the rows scorer, bodyparts and coords"):
         read(tmp_path / "a.csv", "scorer,a\n1,2\n")
-    with pytest.raises(KeypointFileError, match="a.csv: it is neither"):
-        read(tmp_path / "a.csv", "")
+    for text in ("", "\n", " , \n"):
+        with pytest.raises(KeypointFileError, match="a.csv: the file is empty"):
+            read(tmp_path / "a.csv", text)
 
 
 def trc(values: np.ndarray, names: Any, units: str = "m") -> str:

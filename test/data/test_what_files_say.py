@@ -75,7 +75,7 @@ def test_nobody_and_odd_entries_leave_the_others(tmp_path: Path) -> None:
         "3 that have no keypoints (clip_0001_keypoints.json, clip_0002",
         "1 that have no keypoints, but face_keypoints_2d (clip_0004",
         "1 that are no object (clip_0004_keypoints.json: 5)",
-        "1 that have 1 keypoints, not 17",
+        "1 that have 1 keypoints, not 17 (clip_0003_keypoints.json)",
         "3 that cannot be read (calibration.json: neither COCO",
     ):
         assert expected in text

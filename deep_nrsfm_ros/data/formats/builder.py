@@ -441,14 +441,21 @@ class DetectionsBuilder:
         q = len(layout) if layout else most
         if counts and q not in counts:
             raise KeypointFileError(wrong_count(most, layout))
-        for other, count in counts.items():
+        for other in counts:
             if other != q:
-                self._left_out_counts[f"have {other} keypoints, not {q}"] += count
+                self._leave_out_groups(other, f"have {other} keypoints, not {q}")
         groups = [group for (_, count), group in self._groups.items() if count == q]
         merged = groups[0] if groups else _Group(q)
         for group in groups[1:]:
             merged.extend(group)
         return merged
+
+    def _leave_out_groups(self, keypoints: int, reason: str) -> None:
+        """Count the objects of so many keypoints as left out, in their frames."""
+        for (_, q), group in self._groups.items():
+            if q == keypoints:
+                for frame in group.frame:
+                    self.leave_out(reason, self.frame_name(frame))
 
     def _in_order(self) -> tuple[NDArray[np.int64], Frames, NDArray[np.int64]]:
         """Return the order of the frames in time, what they are called, and their stamps."""

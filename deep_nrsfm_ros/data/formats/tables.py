@@ -57,7 +57,9 @@ def read_csv(path: Path, builder: DetectionsBuilder) -> None:
         if delimiter != ",":  # spreadsheets of half of Europe write 1,5 for 1.5
             rows = ([_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in rows)
         head = [cell.strip() for cell in next(rows, [])]
-        if head and head[0].lower() == "scorer":
+        if not any(head):
+            raise KeypointFileError("the file is empty, or its first line is")
+        if head[0].lower() == "scorer":
             _deeplabcut_rows(head, rows, builder)
             return
         names = [re.sub(r"[^a-z0-9]+", "_", cell.lower()).strip("_") for cell in head]
@@ -357,7 +359,7 @@ def _coordinate_columns(
             places.setdefault(part, {})[coordinate] = i
     complete = {part: at for part, at in places.items() if "x" in at and "y" in at}
     if not complete:
-        shown = ", ".join(head[:6]) or "nothing"
+        shown = ", ".join(head[:6])
         raise KeypointFileError(f"it is {_EXPECTED}; its columns are {shown}")
     _find_incomplete(places, builder)
     if not all(part.isdecimal() for part in complete):
