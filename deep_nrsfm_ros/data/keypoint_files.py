@@ -39,7 +39,7 @@ from deep_nrsfm_ros.lifting.observation import (
     without_border,
     without_value,
 )
-from deep_nrsfm_ros.lifting.sanity import to_pixels
+from deep_nrsfm_ros.lifting.sanity import Finding, to_pixels
 from deep_nrsfm_ros.messages.decoding import implied_layout
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 from deep_nrsfm_ros.messages.stamps import one_clock
@@ -215,9 +215,12 @@ def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections
 
 def _find_damage(builder: DetectionsBuilder, problem: str) -> None:
     """Add the finding that a file is read up to a damaged place."""
-    builder.findings["damaged"] = (
-        f"it is read up to a damaged place only, and whatever follows is lost: {problem}; write or "
-        "copy the file anew"
+    builder.find(
+        Finding(
+            "damaged",
+            f"it is read up to a damaged place only, and what follows is lost: {problem}; write or "
+            "copy the file anew",
+        )
     )
 
 

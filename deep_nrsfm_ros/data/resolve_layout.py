@@ -97,12 +97,11 @@ def check_names(layout: KeypointLayout, model: Model) -> list[Finding]:
         ) from None
     findings = []
     if close and are_mostly_known(names, wanted):
-        unknown = f"{len(close)} of {len(names)} names are unknown"
         findings.append(
             Finding(
                 "misspelt",
-                f"{unknown} to model {model.name!r}, which lacks these keypoints then: {guesses}; "
-                "correct the names",
+                f"{len(close)} of {len(names)} names of keypoints are unknown, and model "
+                f"{model.name!r} lacks those that are nearly the same: {guesses}; correct them",
             )
         )
     for side, other in (("left", "right"), ("right", "left")):

@@ -112,7 +112,6 @@ class DetectionsBuilder:
     Attributes:
         options: of reading.
         warnings: sentences about what was left out.
-        findings: what looks wrong, by its code.
         is_mediapipe: the input is landmarks, which MediaPipe gives as fractions of the image's
             size.
     """
@@ -121,7 +120,7 @@ class DetectionsBuilder:
         """Start without frames."""
         self.options = options
         self.warnings: list[str] = []
-        self.findings: dict[str, str] = {}
+        self._findings: dict[str, Finding] = {}
         self.is_mediapipe = False
         self._groups: dict[tuple[Any, int], _Group] = {}
         self._identities: dict[str, str] = {}
@@ -213,6 +212,10 @@ class DetectionsBuilder:
     def name_category(self, category: Any, name: str) -> None:
         """Set the name of a category."""
         self._categories[category] = name
+
+    def find(self, finding: Finding) -> None:
+        """Add what looks wrong in the input; one of its code replaces it."""
+        self._findings[finding.code] = finding
 
     def leave_out(self, reason: str, place: str) -> None:
         """Count an entry of the input that is left out."""
@@ -307,7 +310,7 @@ class DetectionsBuilder:
             scores=scores,
             layout=layout,
             warnings=(*self.warnings, *self.reasons()),
-            findings=tuple(Finding(code, text) for code, text in self.findings.items()),
+            findings=tuple(self._findings.values()),
         )
 
     def in_box(self, values: NDArray[np.float64], box: Any) -> None:
@@ -339,17 +342,23 @@ class DetectionsBuilder:
                 "count as seen"
             )
         for finding in confidence_scale(group.confidence[: len(group.frame)]):
-            self.findings[finding.code] = finding.message
+            self.find(finding)
         if self._outside_box > _MANY * max(self._with_box, 1):
-            self.findings["crop"] = (
-                f"the keypoints of {self._outside_box} of {self._with_box} objects are not in "
-                "their box: are they pixels of the box's crop? Pixels of the image are needed"
+            self.find(
+                Finding(
+                    "crop",
+                    f"the keypoints of {self._outside_box} of {self._with_box} objects are not in "
+                    "their box: are they pixels of the box's crop? Pixels of the image are needed",
+                )
             )
         if len(self._keys) == 1 and len(group.frame) >= _CROWD and _is_one_object(group):
-            self.findings["one-frame"] = (
-                f"all {len(group.frame)} objects are of one frame, and lie on each other: if each "
-                "is of a frame of its own, give each the number of its frame (`frame`), or write a "
-                "line for each frame (.jsonl)"
+            self.find(
+                Finding(
+                    "one-frame",
+                    f"all {len(group.frame)} objects are of one frame, and lie on each other: if "
+                    "each is of a frame of its own, give it the number of its frame (`frame`), or "
+                    "write a line for each frame (.jsonl)",
+                )
             )
         return warnings
 
@@ -499,9 +508,12 @@ class DetectionsBuilder:
         if all(self._frame_names) and (found := numbers_in(self._frame_names)) is not None:
             return found
         if series := series_of(self._frame_names):
-            self.findings["series"] = (
-                f"the names of its frames are {len(series)} series ({', '.join(series[:4])}): are "
-                "they of several cameras or videos? Read each by itself"
+            self.find(
+                Finding(
+                    "series",
+                    f"the names of its frames are {len(series)} series ({', '.join(series[:4])}): "
+                    "are they of several cameras or videos? Read each by itself",
+                )
             )
         if all(isinstance(key, int) and abs(key) < 2**62 for key in keys):
             return np.array(keys, np.int64)

@@ -23,6 +23,7 @@ from deep_nrsfm_ros.data.formats.builder import (
     as_identity,
 )
 from deep_nrsfm_ros.extras import require_extra
+from deep_nrsfm_ros.lifting.sanity import Finding
 
 _CONFIDENCE = ("likelihood", "visibility", "score", "confidence", "conf", "presence", "v", "c", "s")
 _COORDINATES = ("x", "y", "z", *_CONFIDENCE)
@@ -239,9 +240,12 @@ def _find_incomplete(places: Mapping[str, Mapping[str, int]], builder: Detection
     ]
     if halves:
         more = ", ..." * (len(halves) > _SHOWN)
-        builder.findings["incomplete"] = (
-            f"{', '.join(halves[:_SHOWN])}{more}: these keypoints are missing in all objects; add "
-            "the columns, or correct their names"
+        builder.find(
+            Finding(
+                "incomplete",
+                f"columns are missing: {', '.join(halves[:_SHOWN])}{more}, so that no object has "
+                "these keypoints; add the columns, or correct their names",
+            )
         )
 
 
