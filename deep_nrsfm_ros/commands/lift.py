@@ -58,7 +58,11 @@ class Camera(NamedTuple):
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog=program_name("lift"), description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog=program_name("lift"),
+        usage="%(prog)s [options] INPUT --output OUTPUT (--help lists the options)",
+        description=__doc__,
+    )
     parser.add_argument("input", type=Path, help=f"keypoints: {KINDS}")
     parser.add_argument(
         "--output",

@@ -12,7 +12,17 @@ from deep_nrsfm_ros.data.recording import Recording
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.layout_fit import better_layout, fit_layouts
-from deep_nrsfm_ros.lifting.sanity import Finding, Size, check, facing, is_person, orientation
+from deep_nrsfm_ros.lifting.sanity import (
+    LOW_CONFIDENCE,
+    POOR_RESIDUAL,
+    USUAL_RESIDUAL,
+    Finding,
+    Size,
+    check,
+    facing,
+    is_person,
+    orientation,
+)
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import Model
 
@@ -47,7 +57,11 @@ class Summary:
         counts = f"{self.lifted} of {self.total} objects in {self.frames} frames lifted"
         if not self.lifted:
             return counts
-        return f"{counts}; median residual {self.residual:.2f}, confidence {self.confidence:.2f}"
+        return (
+            f"{counts}; median residual {self.residual:.2f} (below {USUAL_RESIDUAL:g} is usual, "
+            f"from {POOR_RESIDUAL:g} on poor), confidence {self.confidence:.2f} (0 to 1, below "
+            f"{LOW_CONFIDENCE:g} is low)"
+        )
 
     @property
     def left_out_text(self) -> str:

@@ -47,6 +47,7 @@ class Detections:
         frames: numbers and names of the frames; None = numbered from 0, without names.
         scores: (m,) float32, score of the object in the detector's own scale; None = all 1.
         layout: layout in which the keypoints are given; None = nothing says it.
+        usual_layout: layout that is usual in a file of this format, without `layout`; None = none.
         warnings: sentences about what was left out of the source.
         findings: what looks wrong in the source.
     """
@@ -60,6 +61,7 @@ class Detections:
     frames: Frames = None  # type: ignore[assignment]  # never None after __post_init__
     scores: NDArray[np.float32] = None  # type: ignore[assignment]
     layout: KeypointLayout | None = None
+    usual_layout: KeypointLayout | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

@@ -21,10 +21,11 @@ from deep_nrsfm_ros.lifting.layout_fit import (
     choose_layout,
     fit_layouts,
 )
-from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
+from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, is_person
 from deep_nrsfm_ros.model_files.model_file import Model
 
 _SHOWN = 4  # names in a text
+_TIE = 0.02  # difference of residuals that chance makes
 _LIMBS = 3  # keypoints of a side, without which a person has only one
 
 
@@ -45,7 +46,8 @@ class ResolvedLayout(NamedTuple):
 def resolve_layout(detections: Detections, model: Model) -> ResolvedLayout:
     """Return the layout in which the keypoints fit best.
 
-    The model's own layout is taken unless another one fits clearly better.
+    The model's own layout is taken unless another one fits clearly better. Of several that fit
+    equally well, the one that is usual in the input's format is taken.
 
     Args:
         detections: keypoints of which nothing says the layout.
@@ -58,9 +60,14 @@ def resolve_layout(detections: Detections, model: Model) -> ResolvedLayout:
     q = detections.confidence.shape[1]
     chosen = choose_layout(fits, model.layout)
     if chosen:
+        usual = detections.usual_layout if is_person(model.layout) else None
+        same = (fit for fit in fits if fit.layout is usual and _is_tie(fit, chosen))
+        chosen = next(same, chosen)
         rivals = ambiguity(detections.points, detections.confidence, model, fits, chosen)
         poor = "taken although no layout fits well; " * (chosen.residual >= POOR_RESIDUAL)
-        return ResolvedLayout(chosen.layout, poor + _ranking(chosen, fits), rivals)
+        by_format = "usual in files like COCO's, and " * (chosen.layout is usual)
+        reason = poor + by_format + _ranking(chosen, fits, model)
+        return ResolvedLayout(chosen.layout, reason, rivals)
     for layout in candidate_layouts(q, model):
         return ResolvedLayout(layout, f"{q} keypoints; no object has enough of them to try it")
     if q == len(model.layout):
@@ -123,8 +130,21 @@ def _shown(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + ", ..." * (len(names) > _SHOWN)
 
 
-def _ranking(chosen: LayoutFit, fits: list[LayoutFit]) -> str:
+def _ranking(chosen: LayoutFit, fits: list[LayoutFit], model: Model) -> str:
     """Return the residual of the chosen layout, and those of the others."""
-    others = ", ".join(f"{fit.layout.name} {fit.residual:.2f}" for fit in fits if fit is not chosen)
+    own = len(KeypointMap(chosen.layout, model.layout).filled)
+    shown = []
+    for fit in fits:
+        if fit is chosen:
+            continue
+        fewer = own - len(KeypointMap(fit.layout, model.layout).filled)
+        tie = f" with {fewer} keypoints fewer" if fewer > 0 and _is_tie(fit, chosen) else ""
+        shown.append(f"{fit.layout.name} {fit.residual:.2f}{tie}")
+    others = ", ".join(shown)
     text = f"it fits with residual {chosen.residual:.2f}"
     return f"{text} ({others})" if others else f"{text}; no other layout has that size"
+
+
+def _is_tie(fit: LayoutFit, chosen: LayoutFit) -> bool:
+    """Return whether a layout fits nearly as well as the chosen one."""
+    return fit.residual < chosen.residual + _TIE

@@ -26,6 +26,8 @@ Size = tuple[int, int]
 
 POOR_RESIDUAL = 0.3
 """Median reprojection error of objects from which on the fit is poor."""
+USUAL_RESIDUAL = 0.1
+"""Median reprojection error of objects below which the fit is usual."""
 LOW_CONFIDENCE = 0.3
 """Median confidence of objects below which the answer is doubtful."""
 

@@ -172,6 +172,34 @@ def test_the_layout_is_found(
     assert "warning" not in said.err
 
 
+def test_the_format_says_the_layout_and_the_summary_its_scale(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, confidence = in_layout(COCO17)
+    values = np.concatenate([points, confidence[..., None]], -1).reshape(len(points), -1).tolist()
+    entries = [
+        {"image_id": i, "category_id": 1, "keypoints": v, "score": 0.9}
+        for i, v in enumerate(values)
+    ]
+    (tmp_path / "a.json").write_text(json.dumps(entries))
+    main([str(tmp_path / "a.json"), "--output", str(tmp_path / "out.npz")])
+    said = capsys.readouterr()
+    expected = "keypoint layout coco17: usual in files like COCO's, and it fits with residual 0."
+    assert said.err.startswith(expected) and " with 2 keypoints fewer" in said.err
+    assert " (below 0.1 is usual, from 0.3 on poor), confidence 0." in said.out
+    assert said.out.endswith(" (0 to 1, below 0.3 is low)\n")
+
+
+@pytest.mark.parametrize("wrong", [["--correction", "bone"], ["--nonsense"], []])
+def test_a_wrong_option_is_not_lost_in_the_usage(
+    wrong: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["a.npy", *wrong])
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 2 and ": error: " in said[1]
+
+
 def test_the_wrong_layout_is_doubtful(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert lift(tmp_path, "coco17", "--keypoint-layout", "human17") == 3
     assert "is it coco17? It fits 0.0" in capsys.readouterr().err

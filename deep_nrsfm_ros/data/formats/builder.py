@@ -23,7 +23,7 @@ from deep_nrsfm_ros.data.formats.frame_numbers import (
 from deep_nrsfm_ros.data.formats.names import NAMED_BY_INPUT, contradiction, layout_of_names
 from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
-from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
 from deep_nrsfm_ros.lifting.observation import to_observation
 from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale, looks_normalised
 
@@ -114,6 +114,7 @@ class DetectionsBuilder:
         warnings: sentences about what was left out.
         is_mediapipe: the input is landmarks, which MediaPipe gives as fractions of the image's
             size.
+        is_coco: the input is objects with a category and an image, as COCO has them.
     """
 
     def __init__(self, options: ReadOptions) -> None:
@@ -121,7 +122,7 @@ class DetectionsBuilder:
         self.options = options
         self.warnings: list[str] = []
         self._findings: dict[str, Finding] = {}
-        self.is_mediapipe = False
+        self.is_mediapipe = self.is_coco = False
         self._groups: dict[tuple[Any, int], _Group] = {}
         self._identities: dict[str, str] = {}
         self._frames: dict[Any, int] = {}
@@ -309,6 +310,7 @@ class DetectionsBuilder:
             frames=frames,
             scores=scores,
             layout=layout,
+            usual_layout=COCO17 if self.is_coco and points.shape[1] == len(COCO17) else None,
             warnings=(*self.warnings, *self.reasons()),
             findings=tuple(self._findings.values()),
         )

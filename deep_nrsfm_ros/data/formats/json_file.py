@@ -256,6 +256,7 @@ class JsonReader:
         score = next((s for n in _SCORE if (s := as_score(person.get(n))) is not None), None)
         category = person.get("category_id")
         category = category if isinstance(category, (int, str)) else None
+        self._builder.is_coco |= category is not None and "image_id" in person
         self._builder.add(frame, values, identity, score, category)
 
     def _points(self, points: list[Mapping[str, Any]]) -> list[list[Any]]:
