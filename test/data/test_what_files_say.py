@@ -211,6 +211,36 @@ def test_keypoints_by_name_make_the_layout(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.confidence, 0.9)
 
 
+def test_names_say_the_places_of_keypoints(tmp_path: Path) -> None:
+    """Frames may give them in another order, or lack some, which later frames have."""
+    names = COCO17.keypoints
+    whole = dict(zip(names, np.reshape(person(), (Q, 3)).tolist(), strict=True))
+    backwards = dict(reversed(whole.items()))
+    lacking = {name: whole[name] for name in names[3:]}
+    null: dict[str, Any] = {**whole, "left_ear": None}
+    frames = [lacking, whole, backwards, null]
+    fields = [
+        [{"name": name, "x": v[0], "y": v[1], "score": v[2]} for name, v in frame.items() if v]
+        for frame in frames
+    ]
+    for content in (
+        frames,
+        [{"frame": 10 * i, "track_id": 7, **frame} for i, frame in enumerate(frames)],
+        [{"keypoints": one, "frame": 10 * i} for i, one in enumerate(fields)],
+    ):
+        found = read(tmp_path / "a.json", content)
+        assert not found.warnings and found.frame.tolist() == [0, 1, 2, 3]
+        assert found.layout and found.layout.keypoints == (*names[3:], *names[:3])
+        at = found.layout.keypoints.index
+        for name, value in whole.items():
+            seen = found.confidence[:, at(name)] > 0
+            assert seen.tolist() == [name in names[3:], True, True, name != "left_ear"]
+            np.testing.assert_allclose(found.points[seen, at(name), 0], value[0], rtol=1e-6)
+    found = read(tmp_path / "a.json", [{"track_id": 7, "time": i / 10, **whole} for i in range(3)])
+    assert found.layout is COCO17 and found.identities.tolist() == ["7"] * 3
+    assert np.diff(found.stamps).tolist() == [100_000_000] * 2
+
+
 def test_a_list_of_a_few_numbers_is_no_object(tmp_path: Path) -> None:
     for content in ([[1, 2]], [[[1, 2], [3, 4]]], [{"a": 1, "b": 2, "c": 3}]):
         with pytest.raises(KeypointFileError):

@@ -99,6 +99,14 @@ class _Group:
             points[rows], confidence[rows] = observation.points, observation.confidence
         return points, confidence
 
+    def widen(self, keypoints: int) -> None:
+        """Add keypoints at the end, which the objects so far lack."""
+        points, confidence = self.points, self.confidence
+        rows, q = confidence.shape
+        self.points = np.zeros((rows, keypoints, 2), np.float32)
+        self.confidence = np.zeros((rows, keypoints), np.float32)
+        self.points[:, :q], self.confidence[:, :q] = points, confidence
+
     def _resize(self, rows: int) -> None:
         """Change the number of rows in place: the system moves large arrays without a copy."""
         q = self.confidence.shape[1]
@@ -232,6 +240,7 @@ class DetectionsBuilder:
         identity: str | None = None,
         score: float | None = None,
         category: Any = None,
+        by_name: bool = False,
     ) -> None:
         """Add an object.
 
@@ -241,6 +250,7 @@ class DetectionsBuilder:
             identity: None = the input gives none.
             score: of the object; None = the input gives none.
             category: its number in the input.
+            by_name: keypoints may be added at the end later, which this object lacks.
         """
         if score is not None:
             self._has_scores = True
@@ -251,6 +261,8 @@ class DetectionsBuilder:
         q = len(values)
         if ((values[:, 2] < 0) & (values[:, 2] != -1)).any():
             self._not_confidence += 1
+        if by_name:
+            self._widen(category, q)
         group = self._groups.get((category, q))
         if group is None:
             group = self._groups[category, q] = _Group(q)
@@ -259,6 +271,17 @@ class DetectionsBuilder:
         group.scores.append(1.0 if score is None else score)
         # One text for all objects of an identity.
         group.identities.append(identity and self._identities.setdefault(identity, identity))
+
+    def _widen(self, category: Any, keypoints: int) -> None:
+        """Widen the objects of a category that have fewer keypoints."""
+        for own, q in list(self._groups):
+            if own == category and q < keypoints:
+                group = self._groups.pop((own, q))
+                group.widen(keypoints)
+                if wide := self._groups.get((own, keypoints)):
+                    wide.extend(group)
+                else:
+                    self._groups[own, keypoints] = group
 
     def detections(self, expected: str) -> Detections:
         """Return all objects that were added.

@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from deep_nrsfm_ros.data.formats.builder import (
     NO_KEYPOINTS,
     TIMES,
@@ -25,6 +27,7 @@ from deep_nrsfm_ros.data.formats.builder import (
 )
 from deep_nrsfm_ros.data.formats.json_items import Readable, json_items
 from deep_nrsfm_ros.data.formats.names import layout_of_dataset
+from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS
 
 EXPECTED = (
     "neither COCO (`annotations`, or a list of results), OpenPose (`people`), MMPose "
@@ -40,6 +43,7 @@ _FRAME = ("image_id", "frame_id", "frame", "frame_number", "frame_index", "image
 _SCORES = ("keypoint_scores", "keypoints_scores", "keypoint_score", "scores", "confidence")
 _IDENTITY = ("person_id", "track_id", "idx", "instance_id")
 _SCORE = ("score", "bbox_score", "confidence")
+_BESIDE = {*_FRAME, *_IDENTITY, *_SCORE, *TIMES}
 _FEWEST = 3  # keypoints of an object without a field that names them
 _CONFIDENCE = ("visibility", "score", "confidence", "presence", "likelihood")
 
@@ -66,6 +70,7 @@ class JsonReader:
         self._builder = builder
         layout = builder.options.layout or builder.options.fallback
         self._expected = len(layout) if layout else None
+        self._order: dict[str, int] = {}  # places of keypoints with names
 
     def read(self, file: Readable, frame: DefaultFrame) -> str:
         """Read a document; return what is wrong if it is of no known form, else "".
@@ -151,7 +156,9 @@ class JsonReader:
             self._frame(value, frame)
             return True
         if points := _named_points(value):
-            self._person({"keypoints": points}, self._frame_of({}, frame))
+            index = self._frame_of(value, frame)
+            self._time(value, index)
+            self._person({**_beside(value), "keypoints": points}, index)
             return True
         field = next((name for name in _KEYPOINTS if name in value), "")
         if field in _LANDMARKS:
@@ -243,8 +250,10 @@ class JsonReader:
             if isinstance(keypoints, dict):
                 keypoints = _named_points(keypoints) or _columns(keypoints)
                 scores = None
+            by_name = False
             if _are_points(keypoints):
-                keypoints, scores = self._points(keypoints), None
+                by_name = self._have_names(keypoints)
+                keypoints, scores = self._points(keypoints, by_name), None
             values = as_values(keypoints, scores, self._expected)
             self._builder.in_box(values, person.get("bbox", person.get("box")))
         except ValueError as error:
@@ -257,18 +266,43 @@ class JsonReader:
         category = person.get("category_id")
         category = category if isinstance(category, (int, str)) else None
         self._builder.is_coco |= category is not None and "image_id" in person
-        self._builder.add(frame, values, identity, score, category)
+        self._builder.add(frame, values, identity, score, category, by_name)
 
-    def _points(self, points: list[Mapping[str, Any]]) -> list[list[Any]]:
-        """Return x, y and confidence of points with named coordinates; use their names."""
-        names = [point.get("name", point.get("part")) for point in points]
-        if all(isinstance(name, str) for name in names):
+    def _have_names(self, points: list[Mapping[str, Any]]) -> bool:
+        """Return whether points are told apart by their names; give the builder all names so far.
+
+        Raises:
+            ValueError: the objects so far have too many names.
+        """
+        names = [_name(point) for point in points]
+        if not all(isinstance(name, str) for name in names):
+            return False
+        if len(set(names)) < len(names):
             self._builder.name_keypoints(names)
-        rows = []
-        for point in points:
+            return False
+        new = [name for name in names if name not in self._order]
+        if len(self._order) + len(new) > MAX_KEYPOINTS:
+            raise ValueError(f"have names of more than {MAX_KEYPOINTS} keypoints with the others")
+        for name in new:
+            self._order[name] = len(self._order)
+        if new:
+            self._builder.name_keypoints(list(self._order))
+        return True
+
+    def _points(self, points: list[Mapping[str, Any]], by_name: bool) -> list[list[Any]]:
+        """Return x, y and confidence of points with named coordinates.
+
+        Args:
+            points: of an object.
+            by_name: their names say their places, whatever their order; those that the object
+                lacks are NaN.
+        """
+        rows = [[np.nan] * 3 for _ in (self._order if by_name else points)]
+        for i, point in enumerate(points):
             position = point.get("position", point)
             confidence = next((point[n] for n in _CONFIDENCE if n in point), 1.0)
-            rows.append([position.get("x"), position.get("y"), confidence])
+            place = self._order[_name(point)] if by_name else i
+            rows[place] = [position.get("x"), position.get("y"), confidence]
         return rows
 
     def _place(self, frame: int) -> str:
@@ -362,16 +396,32 @@ def _are_numbers(value: list[Any]) -> bool:
 
 
 def _named_points(value: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return points with their names, of {name: {x, y, ...}} or {name: [x, y, s]}; else []."""
+    """Return points with their names, of {name: {x, y, ...}} or {name: [x, y, s]}; else [].
+
+    A point may be null, and beside the points there may be a frame, a time and an identity.
+    """
     points: list[dict[str, Any]] = []
     for name, point in value.items():
         if isinstance(point, dict) and "x" in point and "y" in point:
             points.append({**point, "name": name})
         elif isinstance(point, list) and len(point) in (2, 3) and _are_coordinates(point):
             points.append({"name": name, **dict(zip(("x", "y", "score"), point, strict=False))})
-        else:
+        elif point is None and name not in _BESIDE:
+            points.append({"name": name, "x": None, "y": None})
+        elif name not in _BESIDE:
             return []
-    return points if len(points) >= _FEWEST else []
+    present = sum(point["x"] is not None for point in points)
+    return points if present >= _FEWEST else []
+
+
+def _beside(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what an object says of itself beside its named points."""
+    return {name: value[name] for name in (*_IDENTITY, *_SCORE) if name in value}
+
+
+def _name(point: Mapping[str, Any]) -> Any:
+    """Return the name of a keypoint; None if it has none."""
+    return point.get("name", point.get("part"))
 
 
 def _are_coordinates(values: list[Any]) -> bool:
