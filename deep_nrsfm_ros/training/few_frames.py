@@ -13,13 +13,12 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus
 from deep_nrsfm_ros.nrsfm.network import complete, whitening_network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.trainer import second_moment
+from deep_nrsfm_ros.training.trainer import KnownShapes, second_moment
 
 MIN_STEPS = 2000
 """Steps from which the factorisations are worth their seconds."""
@@ -81,16 +80,16 @@ def factorise(
     return found if found.spread <= MAX_SPREAD else None
 
 
-class Lesson:
+class FactorisedShapes:
     """The shapes of a factorisation as known shapes of the cycle loss."""
 
-    def __init__(self, known: Consensus) -> None:
+    def __init__(self, factorisation: Consensus) -> None:
         """Keep shapes (f, p, 3) and cameras M^T (f, 2, 3) of the frames."""
-        self.shapes = torch.from_numpy(known.shapes.astype(np.float32))
-        self.cameras = torch.from_numpy(known.rotations[:, :2].astype(np.float32))
+        self.shapes = torch.from_numpy(factorisation.shapes.astype(np.float32))
+        self.cameras = torch.from_numpy(factorisation.rotations[:, :2].astype(np.float32))
 
-    def draw(self, size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return `size` random shapes (size, p, 3) and cameras (size // 4, 2, 3) of the first ones.
+    def draw(self, size: int, generator: torch.Generator) -> KnownShapes:
+        """Return `size` random shapes, with the cameras of the first quarter of them.
 
         Half of the shapes are those of frames, and half of these have the cameras of their frames.
         Without them a network may tell the frames from what it is taught, and lift them in other
@@ -104,4 +103,4 @@ class Lesson:
         share = torch.rand((size, 1, 1), generator=generator)
         share[: size // 2] = 0
         shapes = torch.lerp(self.shapes[first], self.shapes[second], share)
-        return shapes, self.cameras[first[: size // 4]]
+        return KnownShapes(shapes, self.cameras[first[: size // 4]])

@@ -15,7 +15,7 @@ from deep_nrsfm_ros.nrsfm.geometry import rotation_from_camera
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.training import few_frames, loop
-from deep_nrsfm_ros.training.few_frames import MAX_SPREAD, MIN_FRAMES, Lesson, factorise
+from deep_nrsfm_ros.training.few_frames import MAX_SPREAD, MIN_FRAMES, FactorisedShapes, factorise
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
 
@@ -89,8 +89,9 @@ def test_missing_keypoints_are_filled_in(figure: Any, monkeypatch: pytest.Monkey
 def test_taught_shapes_are_known_or_lie_between_known_ones() -> None:
     known = np.stack((np.zeros((5, 3)), np.ones((5, 3))))
     rotations = np.stack((np.eye(3), np.diag([-1.0, -1.0, 1.0])))
-    lesson = Lesson(Consensus(known, rotations, np.ones(2), 0.01, 5))
-    taught, cameras = lesson.draw(64, torch.Generator().manual_seed(0))
+    factorised = FactorisedShapes(Consensus(known, rotations, np.ones(2), 0.01, 5))
+    taught, cameras = factorised.draw(64, torch.Generator().manual_seed(0))
+    assert cameras is not None
     own = torch.where(taught[:16, 0, 0] > 0, -1.0, 1.0)  # the camera of the same frame
     torch.testing.assert_close(cameras[:, 0, 0], own)
     assert taught.shape == (64, 5, 3)
@@ -112,8 +113,8 @@ def test_the_network_is_taught_the_factorisation(
     small = preset(steps=300)
     small = small._replace(architecture=dataclasses.replace(small.architecture, widths=(64, 32)))
     trainer = loop.train(points, np.ones(points.shape[:2], bool), small)
-    assert trainer.known is turned
-    assert shape_errors(trainer.known.shapes, truth).proper < 1e-6
+    assert trainer.factorisation is turned
+    assert shape_errors(trainer.factorisation.shapes, truth).proper < 1e-6
     model = finish(trainer, "few", figure.layout, "test")
     assert model.provenance["factorisation"] == {"solutions": 5, "spread": 0.01}
     assert trainer.measure()[1] < 0.2
