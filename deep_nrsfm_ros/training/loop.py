@@ -34,6 +34,8 @@ from deep_nrsfm_ros.training.setup import DEFAULT_SETUP, Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
+_FACTORISATION_SHARE = 0.5  # of the time limit, at most
+_FACTORISED = "factorised"  # name of a tensor of checkpoints: 1 if factorised shapes teach
 _SMALLEST_EXTENT = 1e-4  # of the largest one; a frame of less has no extent
 _ROUNDING = 1e-5  # of the largest coordinate of a frame; an extent of less is that of float32
 
@@ -129,16 +131,9 @@ def train(
     part = dataclasses.replace(frames, usable=usable).to(device)
     if group.rank:
         checkpointing = dataclasses.replace(checkpointing, file=None)
-    alone = setup.start is None and group.size == 1
-    found = None
-    if alone:
-        found = factorise(part, preset, callbacks.should_stop, callbacks.on_message)
-    loop = _Loop(part, preset, setup, callbacks, checkpointing, found)
     file = checkpointing.file
     saved = group.broadcast(read_checkpoint(file) if file is not None and file.exists() else None)
-    if saved is not None:
-        loop.restore(saved)
-    return loop.train()
+    return _Loop(part, preset, setup, callbacks, checkpointing, saved).train()
 
 
 class _Loop:
@@ -155,12 +150,18 @@ class _Loop:
         setup: Setup,
         callbacks: Callbacks,
         checkpointing: Checkpointing,
-        factorisation: Consensus | None,
+        saved: dict[str, Tensor] | None = None,
     ) -> None:
+        """Begin a training, or continue the one of the tensors that were saved.
+
+        Raises:
+            ValueError: the tensors belong to another training.
+        """
         recipe = preset.recipe
         self.frames, self.preset, self.setup = frames, preset, setup
         self.callbacks, self.checkpointing, self.group = callbacks, checkpointing, setup.group
-        self.factorisation = factorisation
+        self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
+        factorisation = self.factorisation = self._factorisation(saved)
         # Seeds differ in which frames they mirror; factorised shapes leave them no choice.
         self.screening = recipe.seeds > 1 and setup.start is None and factorisation is None
         self.first_seed = recipe.seed * (recipe.seeds if self.screening else 1)
@@ -171,10 +172,27 @@ class _Loop:
         self.mirror = MirrorCheck(frames, preset.normaliser, most_frames(recipe), self.group)
         factorised = None if factorisation is None else FactorisedShapes(factorisation)
         self.known_shapes = KnownShapesSource(self.mirror, recipe, factorised)
-        self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
         self.saved = time.monotonic()
         self.stopped, self.time_fraction = False, 0.0
         self.iterations = 0  # of this process, over all seeds
+        if saved is not None:
+            self._restore(saved)
+
+    def _factorisation(self, saved: dict[str, Tensor] | None) -> Consensus | None:
+        """Return the shapes that few frames teach, if any; the clock counts the time they take.
+
+        A training that continues has them again if it had them before, however long they take.
+        """
+        had_none = saved is not None and not saved.get(_FACTORISED, torch.ones(()))
+        if had_none or self.setup.start is not None or self.group.size > 1:
+            return None
+        calls, limit = self.callbacks, self.clock.limit
+        most_seconds = _FACTORISATION_SHARE * limit if limit and saved is None else math.inf
+        found = factorise(
+            self.frames, self.preset, calls.should_stop, calls.on_message, most_seconds
+        )
+        self.clock.begin_steps()
+        return found
 
     def train(self) -> Trainer:
         """Train to the end, or until the callbacks or the limits end it; return the trainer."""
@@ -264,9 +282,10 @@ class _Loop:
         self.saved = time.monotonic()
 
     def state(self) -> dict[str, Tensor]:
-        """Return all that `restore` needs, as named tensors."""
+        """Return all that a training needs to continue, as named tensors."""
         tensors = self.trainer.state() | self.best.state() | self.known_shapes.state()
         tensors["seconds"] = torch.tensor(self.clock.seconds(), dtype=torch.float64)
+        tensors[_FACTORISED] = torch.tensor(float(self.factorisation is not None))
         if self.screening:
             tensors["screening"] = torch.tensor(self.leader_error, dtype=torch.float64)
         if self.leader:
@@ -274,12 +293,12 @@ class _Loop:
             tensors |= {f"leader.{name}": tensor for name, tensor in leader.items()}
         return tensors
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
+    def _restore(self, tensors: dict[str, Tensor]) -> None:
         """Continue from a `state`; raise ValueError if it belongs to another training."""
         self.trainer.restore(tensors)
         self.best.restore(tensors)
         self.known_shapes.restore(tensors)
-        self.clock.earlier_seconds = float(tensors.get("seconds", 0.0))
+        self.clock.earlier_seconds += float(tensors.get("seconds", 0.0))
         last_seed = self.first_seed + self.preset.recipe.seeds - 1
         if "screening" not in tensors:
             self.screening = False

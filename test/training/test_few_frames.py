@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +21,9 @@ from deep_nrsfm_ros.training import few_frames, loop
 from deep_nrsfm_ros.training.few_frames import MAX_SPREAD, MIN_FRAMES, FactorisedShapes, factorise
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.limits import Limits
+from deep_nrsfm_ros.training.loop import Checkpointing
+from deep_nrsfm_ros.training.setup import Setup
 
 FRAMES = 40
 
@@ -120,7 +126,53 @@ def test_the_network_is_taught_the_factorisation(
     assert trainer.measure()[1] < 0.2
 
 
-def test_it_can_be_stopped_between_factorisations(figure: Any) -> None:
-    answers = iter([False, False, True])
+def test_it_can_be_stopped_within_a_factorisation(figure: Any) -> None:
+    answers = iter([False] * 40 + [True])
     assert factorise(store(figure), preset(), lambda: next(answers)) is None
     assert next(answers, "none is left") == "none is left"
+
+
+def test_it_is_given_up_where_it_takes_too_long(figure: Any) -> None:
+    said: list[str] = []
+    assert factorise(store(figure), preset(), on_message=said.append, most_seconds=0.01) is None
+    assert "given up" in said[-1]
+
+
+def test_half_of_a_time_limit_is_left_for_the_steps(
+    figure: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(W: np.ndarray, before_each: Callable[[], None]) -> None:
+        for _ in range(50):
+            before_each()
+            time.sleep(0.1)
+
+    points, limits = figure.points[:FRAMES], Limits(minutes=0.03)
+    began = time.monotonic()
+    monkeypatch.setattr(few_frames, "consensus", slow)
+    trainer = loop.train(points, np.ones(points.shape[:2], bool), preset(), Setup(limits=limits))
+    assert trainer.factorisation is None
+    assert trainer.step > 0
+    assert time.monotonic() - began < 4
+
+
+def test_a_training_continues_without_factorisations_if_it_had_none(
+    figure: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    points, file = figure.points[:FRAMES], tmp_path / "checkpoint.safetensors"
+    visible = np.ones(points.shape[:2], bool)
+
+    def none(*_: object, **__: object) -> None:
+        return None
+
+    monkeypatch.setattr(loop, "factorise", none)
+    stops = iter([False] * 5 + [True] * 99)
+    stopping = loop.Callbacks(should_stop=lambda: next(stops))
+    loop.train(points, visible, preset(), callbacks=stopping, checkpointing=Checkpointing(file))
+    monkeypatch.undo()
+    stops = iter([False] * 5 + [True] * 99)
+    stopping = loop.Callbacks(should_stop=lambda: next(stops))
+    trainer = loop.train(
+        points, visible, preset(), callbacks=stopping, checkpointing=Checkpointing(file)
+    )
+    assert trainer.factorisation is None
+    assert trainer.step == 10
