@@ -50,7 +50,7 @@ class LiftingOptions:
         low=1,
         high=64,
     )
-    mirror: bool = option(
+    test_time_mirror: bool = option(
         False,
         "whether the mirror image is lifted and averaged as well: slightly more accurate on "
         "average, at twice the time and with an occasional mirrored frame; needs a layout with "
