@@ -29,9 +29,10 @@ from deep_nrsfm_ros.nrsfm.geometry import random_cameras
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
-from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, Setup, train
+from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
 from deep_nrsfm_ros.training.progress import Progress
 from deep_nrsfm_ros.training.schedule import with_steps
+from deep_nrsfm_ros.training.setup import Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 
 SNAPSHOTS = 10

@@ -23,8 +23,9 @@ from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.loop import Setup, train
+from deep_nrsfm_ros.training.loop import train
 from deep_nrsfm_ros.training.mirror import MirrorCheck
+from deep_nrsfm_ros.training.setup import Setup
 
 SUBJECTS = ("01", "05", "127")
 SEEDS = (0, 1, 2, 3, 4)

@@ -223,8 +223,8 @@ def train(folder: Path, collections: Sequence[str], options: Options) -> tuple[M
     """Return a model of right hands of some collections, and the seconds that it took."""
     from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
     from deep_nrsfm_ros.training.finish import finish
-    from deep_nrsfm_ros.training.loop import Setup
     from deep_nrsfm_ros.training.loop import train as run
+    from deep_nrsfm_ros.training.setup import Setup
 
     began = time.process_time()
     detected = np.concatenate([collection(folder, name) for name in collections])

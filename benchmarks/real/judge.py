@@ -44,7 +44,8 @@ from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.judge import Figures, Judge, rank, worse_figures
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
-from deep_nrsfm_ros.training.loop import Setup, train
+from deep_nrsfm_ros.training.loop import train
+from deep_nrsfm_ros.training.setup import Setup
 
 Floats = NDArray[Any]
 

@@ -22,6 +22,7 @@ from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Preset
 from deep_nrsfm_ros.training.distributed import join
 from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.setup import Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 
 P = 31
@@ -58,7 +59,7 @@ def contenders(case: str, data: FrameStore) -> tuple[Trainer, PlainTraining]:
     weights = LayoutLossWeights(bone_length_weight=bone_length_weight)
     layout_loss = LayoutLoss(weights, CMU31) if bone_length_weight else None
     chosen = preset(name, BATCH)
-    ours = Trainer(data, chosen, 0, layout_loss=layout_loss)
+    ours = Trainer(data, chosen, 0, Setup(layout_loss=layout_loss))
     return ours, PlainTraining(ours.net, data.points, chosen, layout_loss)
 
 
@@ -124,7 +125,7 @@ def torchrun_worker(batch: int, seconds: float) -> None:
     """Train as one of the processes started by torchrun; rank 0 prints the samples per second."""
     torch.set_num_threads(1)
     group = join()
-    trainer = Trainer(frames(10_000), preset("default", batch), 0, group=group)
+    trainer = Trainer(frames(10_000), preset("default", batch), 0, Setup(group=group))
     (durations,) = interleaved({"": trainer.advance}, 8, 0.0).values()
     # All processes take the number of steps of rank 0, or they would wait for each other.
     steps = group.broadcast(max(1, round(seconds / float(np.median(durations)))))

@@ -32,11 +32,11 @@ CONVENTIONS = {
 """What each figure of `figures` means."""
 OF_TRAIN = Path("models")
 """Where `train` writes, unless `--output` says otherwise."""
-ALONE = LiftingOptions(correction="none", test_time_rotations=1, mirror=False)
+ALONE = LiftingOptions(correction="none", test_time_rotations=1, test_time_mirror=False)
 LIFTING = {
     "network alone": ALONE,
     "back-projected": LiftingOptions(
-        correction="back_projection", test_time_rotations=1, mirror=False
+        correction="back_projection", test_time_rotations=1, test_time_mirror=False
     ),
     "without bones": LiftingOptions(correction="learned"),
     "as shipped": LiftingOptions(),

@@ -149,10 +149,10 @@ def check_options(args: argparse.Namespace, model: Model) -> None:
         raise ValueError("--noise has no effect with --correction none: leave one out")
     if reason := lifting.unused_height(model.layout):
         raise ValueError(f"--person-height has no effect, since {reason}")
-    if lifting.mirror and model.layout.partners() is None:
+    if lifting.test_time_mirror and model.layout.partners() is None:
         raise ValueError(
-            f"--mirror has no effect on model {model.name!r}: its layout {model.layout.name!r} has "
-            "no handedness, or no pairs of left_ and right_ keypoints"
+            f"--test-time-mirror has no effect on model {model.name!r}: its layout "
+            f"{model.layout.name!r} has no handedness, or no pairs of left_ and right_ keypoints"
         )
 
 

@@ -256,7 +256,7 @@ def _constants(
         normaliser=model.normaliser,
         object_frame=model.object_frame,
         test_time_rotations=np.array([[c, -s], [s, c]], np.float32).transpose(2, 0, 1).copy(),
-        partners=model.layout.partners() if options.mirror else None,
+        partners=model.layout.partners() if options.test_time_mirror else None,
         covariance=covariance,
         bones=bones,
         # The constants of the confidence were fitted with this covariance.

@@ -50,7 +50,7 @@ class LiftingOptions:
         low=1,
         high=64,
     )
-    mirror: bool = option(
+    test_time_mirror: bool = option(
         False,
         "whether the mirror image is lifted and averaged as well: slightly more accurate on "
         "average, at twice the time and with an occasional mirrored frame; needs a layout with "
@@ -79,9 +79,8 @@ class LiftingOptions:
     )
     person_height: float = option(
         0.0,
-        "height in metres of the people who are lifted: sizes and places are in metres for them; "
-        "it stands for a reference_length of 2/7 of it, from neck to mid-hip, and is used where "
-        "reference_length is 0; 0 = unknown, 1.75 typical",
+        "height of the people who are lifted, in metres; sets reference_length (neck to mid-hip) "
+        "to 2/7 of it, unless that is set; 0 = unknown, 1.75 typical",
         low=0.0,
         high=100.0,
     )
@@ -128,8 +127,8 @@ class HistoryOptions:
     )
     hidden_time: float = option(
         1.0,
-        "time constant in s with which a keypoint that is missing in the image forgets where it "
-        "was relative to the object; 0 = off, 1 typical",
+        "time constant in s with which the remembered place of a missing keypoint, relative to the "
+        "object, gives way to the lifted one; 0 = off, 1 typical",
         low=0.0,
         high=10.0,
     )

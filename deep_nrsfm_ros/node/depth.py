@@ -52,10 +52,10 @@ class DepthOptions:
 
     topic: str = option(
         "",
-        "topic of measured depth in the camera of the keypoints: objects are given the place and "
-        "the size with which most of their confident keypoints have the measured depth, in metres "
-        "whatever their true size; without depth at a message, an object keeps the size that its "
-        "identity has had; needs camera_info; empty = no depth",
+        "topic of measured depth, seen by the keypoints' camera; it sets place and size of an "
+        "object in metres, so that most confident keypoints have the measured depth; without depth "
+        "at a message, an object keeps the size that its identity has had; needs camera_info; "
+        "empty = no depth",
         read_only=True,
     )
     type_: str = option(

@@ -397,6 +397,8 @@ class LifterNode(Node):
 
     def _placed(self, source: KeypointTopic, scene: Scene, up: NDArray[np.float64] | None) -> Scene:
         """Return objects at the place and size that depth or the floor gives, in `target_frame`."""
+        if not (self._depth or self._floor or self._target.name):
+            return scene
         header, lifted, identities, _, moment = scene
         names = _names_of(source.topic, identities) if self._depth or self._floor else []
         placed = None

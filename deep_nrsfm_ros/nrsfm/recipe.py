@@ -33,8 +33,8 @@ class Recipe:
     optimiser: str = option(
         "adam",
         "how the weights follow the gradient: adam as in the paper; soap = Adam in the axes in "
-        "which the gradient's second moment is diagonal, in a third of the steps; measured on "
-        "people who are seen from all sides",
+        "which the gradient's second moment is diagonal, which needs a third of the steps (set "
+        "steps, whose default is that of adam); measured on people seen from all sides",
         choices=("adam", "soap"),
     )
     learning_rate: float = option(
@@ -79,9 +79,10 @@ class Recipe:
     )
     reference: str = option(
         "repair",
-        "known shapes of the cycle loss that are made of frames of nearly the same shape, not by "
-        "the network: repair = while frames are mirrored, always = from a fifth of the steps on, "
-        "off = never; without effect where cycle is 0 or frames show one side only",
+        "repair of mirrored frames by shapes made of similar frames, which the cycle loss takes in "
+        "place of the network's own: repair = while the test finds mirrored frames, always = also "
+        "from a fifth of the steps on, off = never; without effect where cycle is 0, where "
+        "factorisations teach the network (few_frames), or where frames show one side only",
         choices=("repair", "always", "off"),
     )
     error_scale: float = option(
@@ -96,28 +97,29 @@ class Recipe:
     )
     limb_exchange: float = option(
         float(AUTOMATIC),
-        "share of the known shapes of the cycle loss in which limbs are exchanged between shapes "
-        "and turned at the joints, at the first step; it falls to 0 by the last step; lifts people "
-        "and motions that the frames do not show better, and those of the frames a little worse; "
-        "a limb is what one edge of the layout joins to the rest; without effect where cycle is 0; "
-        "0 = off, 1 = all; -1 = 1 where the training starts from a model of a layout with limbs, "
-        "else 0",
+        "share of the shapes that the network must find again from another view (cycle loss) that "
+        "get limbs of other frames, turned at the joints, at the first step; it falls to 0 by the "
+        "last step; lifts people and motions that the frames do not show better, and those of the "
+        "frames a little worse; a limb is what one edge of the layout joins to the rest; without "
+        "effect where cycle is 0; 0 = off; 1 = all, for motions that the data lack; -1 = 1 where "
+        "the training starts from a model of a layout with limbs, 0 from random weights",
         low=float(AUTOMATIC),
         high=1.0,
     )
     few_frames: int = option(
         2000,
-        "frames up to which the known shapes of the cycle loss come from classic factorisations of "
-        "all frames, on which a network cannot improve with so few; 0 = never; without effect in "
-        "trainings of fewer than 2000 steps, that start from a model, or of several processes",
+        "largest number of frames for which classic factorisations of all frames teach the "
+        "network, which alone finds worse shapes with so few; 0 = never; without effect in "
+        "trainings of fewer than 2000 steps, that start from a model, or of several processes, and "
+        "where more than a fifth of the keypoints is missing or the factorisations disagree",
         low=0,
         high=10_000,
     )
     start_share: float = option(
         0.6,
-        "share of the model that a training starts from in the result, whose weights are the mean "
-        "of its and the trained ones; without effect where keypoints differ; 0 = the trained "
-        "weights alone, which fit frames like those of the training more closely, 0.6 typical",
+        "weight of the model that a training starts from in the result, of whose network weights "
+        "each is share * start + (1 - share) * trained; only with the same keypoints; 0 = trained "
+        "alone, fits frames like those of the training more closely; 0.6 typical",
         low=0.0,
         high=1.0,
     )

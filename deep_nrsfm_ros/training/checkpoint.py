@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checkpoints: named tensors in a file that is complete or does not exist.
 
-The content comes from the methods `state` of `_Loop` (loop.py), `Trainer` (trainer.py) and
-`BestCheckpoint` (best_checkpoint.py).
+The content comes from the methods `state` of `_Loop` (loop.py), `Trainer` (trainer.py),
+`KnownShapesSource` (mirror.py) and `BestCheckpoint` (best_checkpoint.py).
 """
 
 from __future__ import annotations

@@ -168,10 +168,10 @@ def _provenance(trainer: Trainer, source: str) -> dict[str, Any]:
     }
     if trainer.objective.layout_loss is not None:
         provenance["layout_loss"] = dataclasses.asdict(trainer.objective.layout_loss.weights)
-    if trainer.known is not None:
+    if trainer.factorisation is not None:
         provenance["factorisation"] = {
-            "solutions": trainer.known.solutions,
-            "spread": round(trainer.known.spread, 4),
+            "solutions": trainer.factorisation.solutions,
+            "spread": round(trainer.factorisation.spread, 4),
         }
     provenance |= {"seed": trainer.seed, "step": trainer.step}
     if trainer.kept_step is not None:

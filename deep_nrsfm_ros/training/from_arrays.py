@@ -80,8 +80,9 @@ def train(
     require_extra("train", "training")
     from deep_nrsfm_ros.training.finish import finish
     from deep_nrsfm_ros.training.judge import judge
-    from deep_nrsfm_ros.training.loop import Callbacks, Setup
+    from deep_nrsfm_ros.training.loop import Callbacks
     from deep_nrsfm_ros.training.loop import train as run
+    from deep_nrsfm_ros.training.setup import Setup
 
     check_name("name", name)
     if isinstance(layout, str):

@@ -192,9 +192,10 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
     except ValueError as error:  # no training is lost because its model is poor
         unknown = Figures(*[math.nan] * len(Figures._fields))
         return Judgement(f"{error}; {_advice(model, '')} would help", "", unknown)
-    where = "held-out" if frames.held_out is not frames.training else "training"
     name = rival.name if rival is not None and old else ""
-    on = f"on {len(frames.held_out)} {where} frames"
+    on = f"on {len(frames.held_out)} held-out frames"
+    if frames.held_out is frames.training:
+        on = f"on the {len(frames.held_out)} frames of its training, which is weak evidence"
     than = f"compared with model {name!r} {on}" if name else on
     shown = [each for each in IN_WORDS if each in _known(new) and (old or each not in _BESIDE)]
     summary = "; ".join(_in_words(each, new, old) for each in shown)
@@ -202,7 +203,9 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
     if worse := worse_figures(new, old):
         reasons = "; ".join(_in_words(each, new, old) for each in worse)
         reason = f"{than}, {reasons}; {_advice(model, name)} would help"
-    verdict = f"is better than model {name!r} {on}" if name else f"has no other beside it; {on}"
+    verdict = (
+        f"is better than model {name!r} {on}" if name else f"has no other to compare with; {on}"
+    )
     return Judgement(reason, f"the new model {verdict}: {summary}", new, name, old)
 
 

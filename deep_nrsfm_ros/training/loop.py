@@ -21,48 +21,23 @@ from torch import Tensor
 from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible
-from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
-from deep_nrsfm_ros.nrsfm.network import Network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
-from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
-from deep_nrsfm_ros.training.few_frames import Lesson, factorise
+from deep_nrsfm_ros.training.few_frames import FactorisedShapes, factorise
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.limb_exchange import LimbExchange
-from deep_nrsfm_ros.training.limits import WHOLE, Limits
-from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck, Teacher, most_frames
+from deep_nrsfm_ros.training.mirror import TOLERATED, KnownShapesSource, MirrorCheck, most_frames
 from deep_nrsfm_ros.training.progress import Clock, Progress
 from deep_nrsfm_ros.training.schedule import lacks_whitening, with_limb_exchange, with_steps
+from deep_nrsfm_ros.training.setup import DEFAULT_SETUP, Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
+_FACTORISATION_SHARE = 0.5  # of the time limit, at most
+_FACTORISED = "factorised"  # name of a tensor of checkpoints: 1 if factorised shapes teach
 _SMALLEST_EXTENT = 1e-4  # of the largest one; a frame of less has no extent
 _ROUNDING = 1e-5  # of the largest coordinate of a frame; an extent of less is that of float32
-
-
-@dataclass(frozen=True)
-class Setup:
-    """What a training starts from and how long it goes on, besides data and preset.
-
-    Attributes:
-        start: network to begin with, of the preset's architecture (see `fine_tuning`); None
-            begins with random networks, of which the screening chooses one.
-        layout_loss: loss of the keypoint layout that is added to the recipe's; None is none.
-        limb_exchange: the limbs of the keypoint layout, which `Recipe.limb_exchange` needs; None:
-            it has none.
-        limits: when the training ends before its last step, and which state it keeps.
-        group: the processes that share the training.
-        own_frames: whether each process has frames of its own; else all have all frames.
-    """
-
-    start: Network | None = None
-    layout_loss: LayoutLoss | None = None
-    limb_exchange: LimbExchange | None = None
-    limits: Limits = WHOLE
-    group: ProcessGroup = ALONE
-    own_frames: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,7 +72,7 @@ class Checkpointing:
     seconds: float = 30.0
 
 
-DEFAULT_SETUP, NO_CALLBACKS, NO_CHECKPOINTS = Setup(), Callbacks(), Checkpointing()
+NO_CALLBACKS, NO_CHECKPOINTS = Callbacks(), Checkpointing()
 
 
 def train(
@@ -156,16 +131,9 @@ def train(
     part = dataclasses.replace(frames, usable=usable).to(device)
     if group.rank:
         checkpointing = dataclasses.replace(checkpointing, file=None)
-    alone = setup.start is None and group.size == 1
-    known = None
-    if alone:
-        known = factorise(part, preset, callbacks.should_stop, callbacks.on_message)
-    loop = _Loop(part, preset, setup, callbacks, checkpointing, known)
     file = checkpointing.file
     saved = group.broadcast(read_checkpoint(file) if file is not None and file.exists() else None)
-    if saved is not None:
-        loop.restore(saved)
-    return loop.train()
+    return _Loop(part, preset, setup, callbacks, checkpointing, saved).train()
 
 
 class _Loop:
@@ -182,26 +150,49 @@ class _Loop:
         setup: Setup,
         callbacks: Callbacks,
         checkpointing: Checkpointing,
-        known: Consensus | None,
+        saved: dict[str, Tensor] | None = None,
     ) -> None:
+        """Begin a training, or continue the one of the tensors that were saved.
+
+        Raises:
+            ValueError: the tensors belong to another training.
+        """
         recipe = preset.recipe
         self.frames, self.preset, self.setup = frames, preset, setup
         self.callbacks, self.checkpointing, self.group = callbacks, checkpointing, setup.group
-        self.known = known
-        # Seeds differ in which frames they mirror; known shapes leave them no choice.
-        self.screening = recipe.seeds > 1 and setup.start is None and known is None
+        self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
+        factorisation = self.factorisation = self._factorisation(saved)
+        # Seeds differ in which frames they mirror; factorised shapes leave them no choice.
+        self.screening = recipe.seeds > 1 and setup.start is None and factorisation is None
         self.first_seed = recipe.seed * (recipe.seeds if self.screening else 1)
         self.trainer = self._trainer(self.first_seed)
         self.leader: Trainer | None = None
         self.leader_error = math.inf
         self.best = BestCheckpoint(setup.limits, recipe)
         self.mirror = MirrorCheck(frames, preset.normaliser, most_frames(recipe), self.group)
-        lesson = None if known is None else Lesson(known)
-        self.teacher = Teacher(self.mirror, recipe, lesson)
-        self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
+        factorised = None if factorisation is None else FactorisedShapes(factorisation)
+        self.known_shapes = KnownShapesSource(self.mirror, recipe, factorised)
         self.saved = time.monotonic()
         self.stopped, self.time_fraction = False, 0.0
         self.iterations = 0  # of this process, over all seeds
+        if saved is not None:
+            self._restore(saved)
+
+    def _factorisation(self, saved: dict[str, Tensor] | None) -> Consensus | None:
+        """Return the shapes that few frames teach, if any; the clock counts the time they take.
+
+        A training that continues has them again if it had them before, however long they take.
+        """
+        had_none = saved is not None and not saved.get(_FACTORISED, torch.ones(()))
+        if had_none or self.setup.start is not None or self.group.size > 1:
+            return None
+        calls, limit = self.callbacks, self.clock.limit
+        most_seconds = _FACTORISATION_SHARE * limit if limit and saved is None else math.inf
+        found = factorise(
+            self.frames, self.preset, calls.should_stop, calls.on_message, most_seconds
+        )
+        self.clock.begin_steps()
+        return found
 
     def train(self) -> Trainer:
         """Train to the end, or until the callbacks or the limits end it; return the trainer."""
@@ -253,13 +244,8 @@ class _Loop:
         self.trainer, self.leader, self.screening = self.leader, None, False
 
     def _trainer(self, seed: int) -> Trainer:
-        """Return a new trainer; only the first one, without screening, takes the start."""
-        setup = self.setup
-        trainer = Trainer(
-            *(self.frames, self.preset, seed, setup.start, setup.group, setup.layout_loss)
-        )
-        trainer.known, trainer.limb_exchange = self.known, setup.limb_exchange
-        return trainer
+        """Return a new trainer of a seed."""
+        return Trainer(self.frames, self.preset, seed, self.setup, self.factorisation)
 
     def _advance(self, steps: int, time_budget: float, *, chosen: bool = False) -> None:
         """Train up to step `steps`, or until `time_budget` of the time limit has elapsed.
@@ -278,7 +264,7 @@ class _Loop:
             if self.stopped or time_is_up(trainer.step, trainer.time_fraction, time_budget):
                 return
             if chosen:
-                self.teacher.prepare(trainer)
+                self.known_shapes.prepare(trainer)
             trainer.advance()
             if best:
                 best.update(trainer)
@@ -296,9 +282,10 @@ class _Loop:
         self.saved = time.monotonic()
 
     def state(self) -> dict[str, Tensor]:
-        """Return all that `restore` needs, as named tensors."""
-        tensors = self.trainer.state() | self.best.state() | self.teacher.state()
+        """Return all that a training needs to continue, as named tensors."""
+        tensors = self.trainer.state() | self.best.state() | self.known_shapes.state()
         tensors["seconds"] = torch.tensor(self.clock.seconds(), dtype=torch.float64)
+        tensors[_FACTORISED] = torch.tensor(float(self.factorisation is not None))
         if self.screening:
             tensors["screening"] = torch.tensor(self.leader_error, dtype=torch.float64)
         if self.leader:
@@ -306,12 +293,12 @@ class _Loop:
             tensors |= {f"leader.{name}": tensor for name, tensor in leader.items()}
         return tensors
 
-    def restore(self, tensors: dict[str, Tensor]) -> None:
+    def _restore(self, tensors: dict[str, Tensor]) -> None:
         """Continue from a `state`; raise ValueError if it belongs to another training."""
         self.trainer.restore(tensors)
         self.best.restore(tensors)
-        self.teacher.restore(tensors)
-        self.clock.earlier_seconds = float(tensors.get("seconds", 0.0))
+        self.known_shapes.restore(tensors)
+        self.clock.earlier_seconds += float(tensors.get("seconds", 0.0))
         last_seed = self.first_seed + self.preset.recipe.seeds - 1
         if "screening" not in tensors:
             self.screening = False

@@ -32,9 +32,9 @@ from deep_nrsfm_ros.nrsfm.network import Network, reconstruct, whiten, whitening
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 from deep_nrsfm_ros.nrsfm.recipe import Recipe
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
-from deep_nrsfm_ros.training.few_frames import Lesson
+from deep_nrsfm_ros.training.few_frames import FactorisedShapes
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.trainer import Trainer, second_moment
+from deep_nrsfm_ros.training.trainer import KnownShapes, Trainer, second_moment
 
 MOST_FRAMES = 15_000
 """Frames of the reference: 11 s on one core, 220 MB."""
@@ -42,8 +42,8 @@ TOLERATED = 0.005
 """Share of mirrored frames up to which a network counts as not mirrored."""
 REPAIRED = 0.001
 """Share of mirrored frames up to which a network is not repaired."""
-FIRST_LESSON = 0.2
-"""Progress of a training from which its network is taught always, if the recipe says so."""
+ALWAYS_FROM = 0.2
+"""Progress of a training from which `Recipe.reference` "always" takes the reference shapes."""
 MIN_TESTED = 0.5
 """Share of the frames that the test must tell something about, for its share to count."""
 
@@ -145,7 +145,7 @@ class MirrorCheck:
         share, tested = self._group.mean((test.share, float(test.tested.mean())))
         return share if tested >= MIN_TESTED else math.nan
 
-    def known_shapes(self, net: Network) -> Tensor:
+    def reference_shapes(self, net: Network) -> Tensor:
         """Return the reference shapes (m, p, 3) in the axes and the handedness of a network.
 
         Mirrored frames come out with the handedness of the majority, in the axes of a neighbour
@@ -185,8 +185,10 @@ def _arrays(net: Network) -> Network:
     return net.map(lambda w: w if isinstance(w, np.ndarray) else w.detach().cpu().numpy())
 
 
-class Teacher:
-    """Reference shapes as the known shapes of the cycle loss, where frames are mirrored.
+class KnownShapesSource:
+    """Sets the known shapes of the cycle loss that are not the network's own.
+
+    They are factorised shapes, or where frames are mirrored the reference shapes of the test.
 
     The test is made after the screening and at each tenth of the steps. A network that mirrors
     more than `REPAIRED` is taught until the next test: images of the reference shapes from random
@@ -194,55 +196,61 @@ class Teacher:
     repeat its mistakes.
 
     Attributes:
-        known: (m, p, 3) the reference shapes in the network's axes while it is taught, else None.
+        reference: (m, p, 3) the reference shapes in the network's axes while it is taught by them,
+            else None.
     """
 
-    def __init__(self, check: MirrorCheck, recipe: Recipe, lesson: Lesson | None = None) -> None:
+    def __init__(
+        self, check: MirrorCheck, recipe: Recipe, factorised: FactorisedShapes | None = None
+    ) -> None:
         """Start without reference shapes.
 
         Args:
             check: the mirror test.
             recipe: of the training.
-            lesson: what is taught from the first step to the last instead; see `few_frames`.
+            factorised: what is taught from the first step to the last instead; see `few_frames`.
         """
-        self.lesson = lesson
+        self.factorised = factorised
         self.check, self.mode = check, recipe.reference
         self.interval = max(recipe.steps // 10, 1)
         self.first = max(min(recipe.screening, self.interval), 1)  # a random network has no axes
-        self.known: Tensor | None = None
+        self.reference: Tensor | None = None
 
     def prepare(self, trainer: Trainer) -> None:
         """Set the known shapes of the trainer's next step, if it is to be taught."""
         step = trainer.step
-        if self.lesson is not None:
-            generator = torch.Generator().manual_seed((trainer.seed << 32) + step)
-            shapes, cameras = self.lesson.draw(trainer.batch, generator)
-            device = trainer.weights.device
-            trainer.shapes, trainer.cameras = shapes.to(device), cameras.to(device)
+        if self.factorised is not None:
+            known = self.factorised.draw(trainer.batch, _generator(trainer))
+            trainer.known = known.to(trainer.weights.device)
             return
         if self.mode == "off" or not trainer.preset.recipe.cycle:
             return
         if step == self.first or (step and step % self.interval == 0):
-            self.known = self._lesson(trainer)
-        if self.known is None:
+            self.reference = self._reference_shapes(trainer)
+        if self.reference is None:
             return
-        generator = torch.Generator().manual_seed((trainer.seed << 32) + step)
-        chosen = torch.randint(len(self.known), (trainer.batch,), generator=generator)
-        trainer.shapes = self.known[chosen].to(trainer.weights.device)
+        size = (trainer.batch,)
+        chosen = torch.randint(len(self.reference), size, generator=_generator(trainer))
+        trainer.known = KnownShapes(self.reference[chosen]).to(trainer.weights.device)
 
-    def _lesson(self, trainer: Trainer) -> Tensor | None:
+    def _reference_shapes(self, trainer: Trainer) -> Tensor | None:
         """Return the reference shapes to teach until the next test, None for none."""
         share = self.check.share(trainer.net)
-        always = self.mode == "always" and trainer.progress >= FIRST_LESSON
+        always = self.mode == "always" and trainer.progress >= ALWAYS_FROM
         if math.isnan(share) or not (share > REPAIRED or always):
             return None
-        known = self.check.known_shapes(trainer.net)
-        return known if len(known) else None
+        shapes = self.check.reference_shapes(trainer.net)
+        return shapes if len(shapes) else None
 
     def state(self) -> dict[str, Tensor]:
         """Return all that `restore` needs, as named tensors."""
-        return {} if self.known is None else {"reference": self.known}
+        return {} if self.reference is None else {"reference": self.reference}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Set to a saved state."""
-        self.known = tensors.get("reference")
+        self.reference = tensors.get("reference")
+
+
+def _generator(trainer: Trainer) -> torch.Generator:
+    """Return the source of the random numbers of the trainer's next step."""
+    return torch.Generator().manual_seed((trainer.seed << 32) + trainer.step)

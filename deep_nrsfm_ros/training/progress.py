@@ -39,6 +39,12 @@ class Clock:
         self.start, self.earlier_seconds = time.monotonic(), 0.0
         self.reported = self.start + _FIRST_REPORT - every_seconds
 
+    def begin_steps(self) -> None:
+        """Count the time until now as that of earlier work, not of steps."""
+        now = time.monotonic()
+        self.earlier_seconds += now - self.start
+        self.start = now
+
     def seconds(self) -> float:
         """Return the seconds that the training has taken, resumed runs included."""
         return self.earlier_seconds + time.monotonic() - self.start

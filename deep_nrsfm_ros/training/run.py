@@ -179,7 +179,8 @@ def _train(
     import torch  # takes seconds; a wrong configuration is refused without it
 
     from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
-    from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, Setup, train
+    from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
+    from deep_nrsfm_ros.training.setup import Setup
 
     if config.output.threads:
         torch.set_num_threads(config.output.threads)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,9 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
-from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.losses import Batch, Objective
-from deep_nrsfm_ros.nrsfm.network import Network, initialise, whitening
+from deep_nrsfm_ros.nrsfm.network import initialise, whitening
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.adam import Adam
@@ -26,9 +26,27 @@ from deep_nrsfm_ros.training.gradient_function import (
     weight_vector,
     with_weights,
 )
-from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.schedule import learning_rate
+from deep_nrsfm_ros.training.setup import DEFAULT_SETUP, Setup
 from deep_nrsfm_ros.training.soap import Soap
+
+
+class KnownShapes(NamedTuple):
+    """Shapes of the cycle loss, which the network must return from their images.
+
+    Attributes:
+        shapes: (c, p, 3).
+        cameras: (k, 2, 3) M^T of the first k shapes, those of their frames; the others are seen by
+            random cameras. None: all are.
+    """
+
+    shapes: Tensor
+    cameras: Tensor | None = None
+
+    def to(self, device: torch.device) -> KnownShapes:
+        """Return the shapes and cameras on a device."""
+        cameras = None if self.cameras is None else self.cameras.to(device)
+        return KnownShapes(self.shapes.to(device), cameras)
 
 
 class Trainer:
@@ -42,16 +60,15 @@ class Trainer:
     Attributes:
         net: the network; its learned weights are views of `weights`.
         weights: (n,) all learned weights.
-        shapes: (b, p, 3) reconstructions of the last batch, for the cycle loss; None at first.
-        cameras: (k, 2, 3) M^T of the first k known shapes in the next step; None: random ones.
+        known: known shapes of the next step's cycle loss: the network's own of the last batch,
+            unless others are set before the step; None at first.
         step: steps taken.
         time_fraction: fraction of the time limit that has elapsed, 0 without a limit.
         kept_step: step of the weights where they are not those of the last step, else None.
         end_reason: why the training has ended; "" if it was stopped or goes on.
         mirrored_share: share of frames with mirrored depth at the end, 0 to 0.5; NaN unknown.
-        known: shapes of the frames by factorisation that the network is taught; None: none.
+        factorisation: shapes of the frames that the network is taught; None: none.
         from_random: whether the training began with random weights.
-        limb_exchange: recombines the share `Recipe.limb_exchange` of the known shapes; None: none.
         total_frames: frames of all processes.
         cpu_seconds: processor time of this process in steps.
     """
@@ -61,9 +78,8 @@ class Trainer:
         frames: FrameStore,
         preset: Preset,
         seed: int,
-        start: Network | None = None,
-        group: ProcessGroup = ALONE,
-        layout_loss: LayoutLoss | None = None,
+        setup: Setup = DEFAULT_SETUP,
+        factorisation: Consensus | None = None,
     ) -> None:
         """Initialise the network, and whiten it by the frames unless it has a whitening.
 
@@ -71,12 +87,12 @@ class Trainer:
             frames: those of this process.
             preset: architecture, normaliser and recipe.
             seed: of the initialisation and of all steps.
-            start: a network to start from instead of a random one.
-            group: the processes that train together; all make their trainers and take their
-                steps at the same time.
-            layout_loss: a loss besides the preset's.
+            setup: start, layout loss, limbs and processes. All processes make their trainers and
+                take their steps at the same time.
+            factorisation: shapes of the frames that the network is taught.
         """
         architecture, normaliser, recipe = preset
+        start, group = setup.start, setup.group
         self.frames, self.preset, self.seed, self.step = frames, preset, seed, 0
         self.group, self.batch = group, group.share(preset.recipe.batch)
         self.cpu_seconds = 0.0
@@ -87,9 +103,9 @@ class Trainer:
         self.kept_step: int | None = None
         self.end_reason = ""
         self.mirrored_share = math.nan
-        self.known: Consensus | None = None
+        self.factorisation = factorisation
         self.from_random = start is None
-        self.limb_exchange: LimbExchange | None = None
+        self._limb_exchange = setup.limb_exchange
         device = frames.device
         initial = start or initialise(
             architecture,
@@ -110,13 +126,12 @@ class Trainer:
         if recipe.optimiser == "soap":
             shapes = [weight.shape for _, weight in self.initial.trainable_weights()]
             self.optimiser = Soap(self.weights, shapes, group)
-        self.objective = Objective(normaliser, recipe, layout_loss=layout_loss)
+        self.objective = Objective(normaliser, recipe, layout_loss=setup.layout_loss)
         self.gradient_function = GradientFunction(self.objective, self.net, self.batch)
         plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)
-        self.shapes: Tensor | None = None
-        self.cameras: Tensor | None = None
+        self.known: KnownShapes | None = None
         self.probe = self.sample(1024)
 
     @property
@@ -137,25 +152,25 @@ class Trainer:
             torch.randint(len(frames), (size,), generator=generator, device=frames.device)
         )
 
-    def known_shapes(self) -> Tensor | None:
-        """Return the known shapes of the next step: those of `shapes`, some recombined.
+    def recombined(self) -> KnownShapes | None:
+        """Return the `known` shapes, with exchanged limbs in the recipe's share of them.
 
-        Shapes that `cameras` see stay as they are, since these are the cameras of their frames.
+        Shapes with a camera of their own stay as they are: it sees the frame.
         """
-        shapes = self.shapes
-        if shapes is None or self.limb_exchange is None:
-            return shapes
+        if self.known is None or self._limb_exchange is None:
+            return self.known
+        shapes, cameras = self.known
         share = self.preset.recipe.limb_exchange * max(1 - self.progress, 0.0)
-        kept = 0 if self.cameras is None else len(self.cameras)
+        kept = 0 if cameras is None else len(cameras)
         count = min(round(share * len(shapes)), len(shapes) - kept)
         if not count:
-            return shapes
+            return self.known
         rng = np.random.default_rng((self.seed, self.group.rank, self.step))
         without_camera_first = shapes.roll(-kept, 0).cpu().numpy()
-        recombined = self.limb_exchange.recombine(without_camera_first, count, rng)
+        recombined = self._limb_exchange.recombine(without_camera_first, count, rng)
         result = shapes.clone()
         result[kept : kept + count] = torch.from_numpy(recombined.astype(np.float32))
-        return result
+        return KnownShapes(result, cameras)
 
     def advance(self) -> None:
         """Take one gradient step."""
@@ -165,11 +180,11 @@ class Trainer:
     def _advance(self) -> None:
         began = time.process_time()
         batch = self.sample(self.batch, self.step)
-        known = self.known_shapes()
+        shapes, cameras = self.recombined() or (None, None)
         losses, gradient = self.gradient_function(
-            self.weights, batch, known, self.generator, self.cameras
+            self.weights, batch, shapes, self.generator, cameras
         )
-        self.shapes, self.cameras = losses.shapes, None
+        self.known = KnownShapes(losses.shapes)
         if self.group.size > 1:
             gradient = gradient * (self.batch / self.preset.recipe.batch)
             self.group.sum_in_place(gradient)
@@ -214,8 +229,8 @@ class Trainer:
         """Return all that `restore` needs, as named tensors."""
         tensors = {name: torch.tensor(getattr(self, name)) for name in _COUNTS}
         tensors |= {"weights": self.weights, "L": self.initial.L}
-        if self.shapes is not None:
-            tensors["shapes"] = self.shapes
+        if self.known is not None:
+            tensors["shapes"] = self.known.shapes
         moments = self.optimiser.moments
         return tensors | {f"moments.{key}": value for key, value in moments.items()}
 
@@ -237,7 +252,7 @@ class Trainer:
         with torch.no_grad():
             self.weights.copy_(saved)
         if "shapes" in tensors:
-            self.shapes = tensors["shapes"].to(device)
+            self.known = KnownShapes(tensors["shapes"].to(device))
         self.optimiser.restore(
             {
                 name.removeprefix("moments."): value

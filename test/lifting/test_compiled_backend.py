@@ -117,7 +117,7 @@ each_vectors = [HealthCheck.function_scoped_fixture]
         noise=st.sampled_from([0.01, 0.1]),
         refill=st.integers(0, 3),
         test_time_rotations=st.integers(1, 5),
-        mirror=st.booleans(),
+        test_time_mirror=st.booleans(),
         min_visible=st.integers(3, 5),
         reference_length=st.sampled_from([0.0, 2.0]),
     ),
@@ -226,7 +226,7 @@ def test_remembers_as_numpy_does(
         LiftingOptions,
         refill=st.integers(0, 2),
         test_time_rotations=st.integers(1, 5),
-        mirror=st.booleans(),
+        test_time_mirror=st.booleans(),
     ),
     perspective=st.booleans(),
 )

@@ -101,7 +101,9 @@ def test_rotations_are_proper_and_shapes_stand_in_camera_axes(
 
 def test_the_mirror_image_is_lifted_to_the_mirror_image() -> None:
     points, confidence = pixels(missing=0.3)
-    lifter = Lifter(random_model(), LiftingOptions(correction="back_projection", mirror=True))
+    lifter = Lifter(
+        random_model(), LiftingOptions(correction="back_projection", test_time_mirror=True)
+    )
     partners = np.array(HUMAN17.partners())
     lifted = lifter(points, confidence)
     mirrored = lifter((points * [-1, 1]).astype(np.float32)[:, partners], confidence[:, partners])

@@ -20,7 +20,8 @@ from deep_nrsfm_ros.nrsfm.handedness import votes
 from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
 from deep_nrsfm_ros.nrsfm.network import Architecture, reconstruct
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights
-from deep_nrsfm_ros.training.loop import Setup, train
+from deep_nrsfm_ros.training.loop import train
+from deep_nrsfm_ros.training.setup import Setup
 
 ANIMAL = KeypointLayout(
     "animal",

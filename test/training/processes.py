@@ -17,7 +17,8 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training.distributed import ProcessGroup, join, rank
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
-from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, Setup, train
+from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
+from deep_nrsfm_ros.training.setup import Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 
 PRESET = Preset(
@@ -31,7 +32,7 @@ def first_step(points: torch.Tensor, group: ProcessGroup) -> dict[str, torch.Ten
     """Return the gradient of one step, what it was asked on, and the whitening."""
     pool = FrameStore.of(points.numpy(), np.ones(points.shape[:2], bool))
     pool = dataclasses.replace(pool, usable=group.shard(pool.usable))
-    trainer = Trainer(pool, PRESET, 0, group=group)
+    trainer = Trainer(pool, PRESET, 0, Setup(group=group))
     batch = trainer.sample(trainer.batch, 0).points
     gradients: list[torch.Tensor] = []
     update = trainer.optimiser.update

@@ -17,7 +17,8 @@ from deep_nrsfm_ros.nrsfm.losses import Batch
 from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup, join, rank
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limits import Limits
-from deep_nrsfm_ros.training.loop import Setup, train
+from deep_nrsfm_ros.training.loop import train
+from deep_nrsfm_ros.training.setup import Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 from test.fixtures.forked_python import TRAINING, run_forked
 

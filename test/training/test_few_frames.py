@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +18,12 @@ from deep_nrsfm_ros.nrsfm.geometry import rotation_from_camera
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset, Recipe
 from deep_nrsfm_ros.training import few_frames, loop
-from deep_nrsfm_ros.training.few_frames import MAX_SPREAD, MIN_FRAMES, Lesson, factorise
+from deep_nrsfm_ros.training.few_frames import MAX_SPREAD, MIN_FRAMES, FactorisedShapes, factorise
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.limits import Limits
+from deep_nrsfm_ros.training.loop import Checkpointing
+from deep_nrsfm_ros.training.setup import Setup
 
 FRAMES = 40
 
@@ -89,8 +95,9 @@ def test_missing_keypoints_are_filled_in(figure: Any, monkeypatch: pytest.Monkey
 def test_taught_shapes_are_known_or_lie_between_known_ones() -> None:
     known = np.stack((np.zeros((5, 3)), np.ones((5, 3))))
     rotations = np.stack((np.eye(3), np.diag([-1.0, -1.0, 1.0])))
-    lesson = Lesson(Consensus(known, rotations, np.ones(2), 0.01, 5))
-    taught, cameras = lesson.draw(64, torch.Generator().manual_seed(0))
+    factorised = FactorisedShapes(Consensus(known, rotations, np.ones(2), 0.01, 5))
+    taught, cameras = factorised.draw(64, torch.Generator().manual_seed(0))
+    assert cameras is not None
     own = torch.where(taught[:16, 0, 0] > 0, -1.0, 1.0)  # the camera of the same frame
     torch.testing.assert_close(cameras[:, 0, 0], own)
     assert taught.shape == (64, 5, 3)
@@ -112,14 +119,60 @@ def test_the_network_is_taught_the_factorisation(
     small = preset(steps=300)
     small = small._replace(architecture=dataclasses.replace(small.architecture, widths=(64, 32)))
     trainer = loop.train(points, np.ones(points.shape[:2], bool), small)
-    assert trainer.known is turned
-    assert shape_errors(trainer.known.shapes, truth).proper < 1e-6
+    assert trainer.factorisation is turned
+    assert shape_errors(trainer.factorisation.shapes, truth).proper < 1e-6
     model = finish(trainer, "few", figure.layout, "test")
     assert model.provenance["factorisation"] == {"solutions": 5, "spread": 0.01}
     assert trainer.measure()[1] < 0.2
 
 
-def test_it_can_be_stopped_between_factorisations(figure: Any) -> None:
-    answers = iter([False, False, True])
+def test_it_can_be_stopped_within_a_factorisation(figure: Any) -> None:
+    answers = iter([False] * 40 + [True])
     assert factorise(store(figure), preset(), lambda: next(answers)) is None
     assert next(answers, "none is left") == "none is left"
+
+
+def test_it_is_given_up_where_it_takes_too_long(figure: Any) -> None:
+    said: list[str] = []
+    assert factorise(store(figure), preset(), on_message=said.append, most_seconds=0.01) is None
+    assert "given up" in said[-1]
+
+
+def test_half_of_a_time_limit_is_left_for_the_steps(
+    figure: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(W: np.ndarray, before_each: Callable[[], None]) -> None:
+        for _ in range(50):
+            before_each()
+            time.sleep(0.1)
+
+    points, limits = figure.points[:FRAMES], Limits(minutes=0.03)
+    began = time.monotonic()
+    monkeypatch.setattr(few_frames, "consensus", slow)
+    trainer = loop.train(points, np.ones(points.shape[:2], bool), preset(), Setup(limits=limits))
+    assert trainer.factorisation is None
+    assert trainer.step > 0
+    assert time.monotonic() - began < 4
+
+
+def test_a_training_continues_without_factorisations_if_it_had_none(
+    figure: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    points, file = figure.points[:FRAMES], tmp_path / "checkpoint.safetensors"
+    visible = np.ones(points.shape[:2], bool)
+
+    def none(*_: object, **__: object) -> None:
+        return None
+
+    monkeypatch.setattr(loop, "factorise", none)
+    stops = iter([False] * 5 + [True] * 99)
+    stopping = loop.Callbacks(should_stop=lambda: next(stops))
+    loop.train(points, visible, preset(), callbacks=stopping, checkpointing=Checkpointing(file))
+    monkeypatch.undo()
+    stops = iter([False] * 5 + [True] * 99)
+    stopping = loop.Callbacks(should_stop=lambda: next(stops))
+    trainer = loop.train(
+        points, visible, preset(), callbacks=stopping, checkpointing=Checkpointing(file)
+    )
+    assert trainer.factorisation is None
+    assert trainer.step == 10

@@ -18,7 +18,8 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
-from deep_nrsfm_ros.training.loop import Callbacks, Setup, train
+from deep_nrsfm_ros.training.loop import Callbacks, train
+from deep_nrsfm_ros.training.setup import Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 
 RECIPE = Recipe(steps=100, batch=64, learning_rate=1e-3, start_share=0.0)
@@ -76,7 +77,7 @@ def test_with_the_same_keypoints_it_starts_as_good_as_its_source(
         start.net.named_weights(), source.network.named_weights(), strict=True
     ):
         np.testing.assert_array_equal(weight.numpy(), old, err_msg=name)
-    on_new_data = Trainer(start.frames, start.preset, 0, source.network)
+    on_new_data = Trainer(start.frames, start.preset, 0, Setup(source.network))
     assert start.measure() == on_new_data.measure()
 
 
@@ -250,6 +251,6 @@ def test_a_checkpoint_is_not_taken_on_by_a_training_that_starts_elsewhere(
     fresh = Trainer(trainer.frames, trainer.preset, 0)
     with pytest.raises(ValueError, match="checkpoint is of other data or another model"):
         fresh.restore(trainer.state())
-    again = Trainer(trainer.frames, trainer.preset, 0, start_from(source, figure.layout))
+    again = Trainer(trainer.frames, trainer.preset, 0, Setup(start_from(source, figure.layout)))
     again.restore(trainer.state())
     assert again.step == 2

@@ -89,7 +89,7 @@ def test_mirrored_frames_are_seen_without_another_model(
 
     alone = judge(frames, good, None)
     assert not alone.doubtful and str(alone).startswith(
-        "the new model has no other beside it; on 60"
+        "the new model has no other to compare with; on 60"
     )
     lift = module._lift
 
@@ -199,3 +199,9 @@ def test_standings_have_the_best_first_and_doubtful_ones_last(
     alone = standings(frames, [bad, good], None)
     assert [each.model.name for each in alone] == ["good", "bad"]
     assert found[0].rank < found[1].rank
+
+
+def test_a_judgement_on_the_frames_of_the_training_says_so(frames: Split, good: Model) -> None:
+    few = frames.training[:40]
+    judgement = judge(Split(few, few), good, None)
+    assert "on the 40 frames of its training" in str(judgement)

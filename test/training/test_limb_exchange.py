@@ -21,11 +21,12 @@ from deep_nrsfm_ros.nrsfm.geometry import (
 )
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.training import limb_exchange
-from deep_nrsfm_ros.training.few_frames import Lesson
+from deep_nrsfm_ros.training.few_frames import FactorisedShapes
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.loop import train
-from deep_nrsfm_ros.training.mirror import MirrorCheck, Teacher
+from deep_nrsfm_ros.training.mirror import KnownShapesSource, MirrorCheck
+from deep_nrsfm_ros.training.setup import Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 
 BODY = ("a", "b", "c", "d", "shoulder", "elbow", "hand")
@@ -131,8 +132,8 @@ def weights_after(
 ) -> np.ndarray:
     recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=share, steps=8)
     frames = FrameStore.of(figure.points, np.ones(figure.points.shape[:2], bool))
-    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
-    trainer.limb_exchange = exchange
+    setup = Setup(limb_exchange=exchange)
+    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0, setup)
     for _ in range(4):
         trainer.advance()
     result: np.ndarray = trainer.weights.numpy()
@@ -154,15 +155,15 @@ def test_only_the_first_shapes_are_recombined_and_fewer_with_progress(
 ) -> None:
     recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=0.5, steps=8)
     frames = FrameStore.of(figure.points, np.ones(figure.points.shape[:2], bool))
-    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
-    trainer.limb_exchange = limbs
+    setup = Setup(limb_exchange=limbs)
+    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0, setup)
     trainer.advance()
-    assert trainer.shapes is not None
+    assert trainer.known is not None
     for step, recombined in ((0, 32), (4, 16), (8, 0)):
         trainer.step = step
-        known = trainer.known_shapes()
-        assert known is not None
-        changed = (known != trainer.shapes).any(-1).any(-1).numpy()
+        result = trainer.recombined()
+        assert result is not None
+        changed = (result.shapes != trainer.known.shapes).any(-1).any(-1).numpy()
         np.testing.assert_array_equal(changed, np.arange(64) < recombined)
 
 
@@ -171,19 +172,21 @@ def test_a_frame_keeps_its_shape_where_its_own_camera_sees_it(
 ) -> None:
     f = 40
     rotations = rotation_from_camera(figure.cameras[:f])
-    known = Consensus(centre(figure.shapes[:f]), rotations, np.ones(f), 0.01, 5)
+    found = Consensus(centre(figure.shapes[:f]), rotations, np.ones(f), 0.01, 5)
     recipe = dataclasses.replace(trained.preset.recipe, limb_exchange=1.0, steps=8)
     frames = FrameStore.of(figure.points[:f], np.ones(figure.points[:f].shape[:2], bool))
-    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0)
-    trainer.limb_exchange = limbs
-    Teacher(MirrorCheck(frames, Normaliser()), recipe, Lesson(known)).prepare(trainer)
-    shapes, cameras = trainer.known_shapes(), trainer.cameras
-    assert shapes is not None and cameras is not None
+    setup = Setup(limb_exchange=limbs)
+    trainer = Trainer(frames, trained.preset._replace(recipe=recipe), 0, setup)
+    check, factorised = MirrorCheck(frames, Normaliser()), FactorisedShapes(found)
+    KnownShapesSource(check, recipe, factorised).prepare(trainer)
+    result = trainer.recombined()
+    assert result is not None and trainer.known is not None
+    shapes, cameras = result
+    assert cameras is not None
     images = (cameras @ shapes[: len(cameras)].mT).mT.numpy()
     apart = images[:, None] - centre(figure.points[:f])
     assert np.linalg.norm(apart, axis=(2, 3)).min(1) == pytest.approx(0, abs=1e-4)
-    assert trainer.shapes is not None
-    changed = (shapes != trainer.shapes).any(-1).any(-1).numpy()
+    changed = (shapes != trainer.known.shapes).any(-1).any(-1).numpy()
     np.testing.assert_array_equal(changed, np.arange(64) >= len(cameras))
 
 

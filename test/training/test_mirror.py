@@ -19,8 +19,9 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training import loop
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.mirror import MirrorCheck, Teacher, most_frames, warning
-from deep_nrsfm_ros.training.trainer import Trainer
+from deep_nrsfm_ros.training.mirror import KnownShapesSource, MirrorCheck, most_frames, warning
+from deep_nrsfm_ros.training.setup import Setup
+from deep_nrsfm_ros.training.trainer import KnownShapes, Trainer
 
 
 def frames_of(figure: Any, visible: np.ndarray | None = None) -> FrameStore:
@@ -62,13 +63,13 @@ def test_missing_keypoints_are_bridged(figure: Any, trained: Trainer) -> None:
     assert check.share(trained.net) < 0.02
 
 
-def test_known_shapes_have_one_handedness(
+def test_reference_shapes_have_one_handedness(
     figure: Any, trained: Trainer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     check = MirrorCheck(frames_of(figure), Normaliser())
-    plain = check.known_shapes(trained.net).numpy()
+    plain = check.reference_shapes(trained.net).numpy()
     mirror_half(check, monkeypatch)
-    repaired = check.known_shapes(trained.net).numpy()
+    repaired = check.reference_shapes(trained.net).numpy()
     assert len(plain) > 0.9 * len(figure.points)
     # In the axes of the network, in which S is compared with them, not in any others.
     np.testing.assert_allclose(plain.mean(0), repaired.mean(0), atol=0.05)
@@ -131,14 +132,14 @@ def test_the_check_reports_progress(figure: Any, trained: Trainer) -> None:
 def mirroring_trainer(figure: Any, trained: Trainer) -> Trainer:
     """Return a trainer whose network was taught to mirror the shapes on one side of a plane."""
     start = trained.net.map(lambda w: w.detach().numpy().copy())
-    trainer = Trainer(frames_of(figure), trained.preset, 1, start)
+    trainer = Trainer(frames_of(figure), trained.preset, 1, Setup(start))
     check = MirrorCheck(frames_of(figure), Normaliser())
-    X = check.known_shapes(trained.net)
+    X = check.reference_shapes(trained.net)
     place = X[:, 5, 0]
     X[place > place.quantile(0.6)] *= torch.tensor([1.0, 1.0, -1.0])
     generator = torch.Generator().manual_seed(0)
     for _ in range(200):
-        trainer.shapes = X[torch.randint(len(X), (64,), generator=generator)]
+        trainer.known = KnownShapes(X[torch.randint(len(X), (64,), generator=generator)])
         trainer.advance()
     return trainer
 
@@ -148,9 +149,9 @@ def test_a_network_that_mirrors_is_repaired(figure: Any, trained: Trainer) -> No
     check = MirrorCheck(frames_of(figure), Normaliser())
     assert check.share(trainer.net) > 0.1
     recipe = dataclasses.replace(trainer.preset.recipe, steps=2000)
-    teacher = Teacher(check, recipe)
+    source = KnownShapesSource(check, recipe)
     for _ in range(400):
-        teacher.prepare(trainer)
+        source.prepare(trainer)
         trainer.advance()
     assert check.share(trainer.net) < 0.02
 
@@ -160,12 +161,12 @@ def test_who_is_taught(figure: Any, trained: Trainer, reference: str) -> None:
     recipe = dataclasses.replace(trained.preset.recipe, reference=reference, steps=10)
     start = trained.net.map(lambda w: w.detach().numpy().copy())
     check = MirrorCheck(frames_of(figure), Normaliser())
-    trainer = Trainer(frames_of(figure), trained.preset._replace(recipe=recipe), 0, start)
-    teacher = Teacher(check, recipe)
+    trainer = Trainer(frames_of(figure), trained.preset._replace(recipe=recipe), 0, Setup(start))
+    source = KnownShapesSource(check, recipe)
     taught = []
     for _ in range(4):
-        teacher.prepare(trainer)
-        taught.append(teacher.known is not None)
+        source.prepare(trainer)
+        taught.append(source.reference is not None)
         trainer.step += 1
     # The network mirrors nothing, so that nothing is repaired.
     assert taught == ([False, False, True, True] if reference == "always" else [False] * 4)
@@ -175,6 +176,6 @@ def test_without_a_cycle_loss_nothing_is_taught(figure: Any, trained: Trainer) -
     recipe = dataclasses.replace(trained.preset.recipe, cycle=0.0)
     preset = trained.preset._replace(recipe=recipe)
     trainer = Trainer(frames_of(figure), preset, 0)
-    teacher = Teacher(MirrorCheck(frames_of(figure), Normaliser()), recipe)
-    teacher.prepare(trainer)
-    assert teacher.known is None and trainer.shapes is None
+    source = KnownShapesSource(MirrorCheck(frames_of(figure), Normaliser()), recipe)
+    source.prepare(trainer)
+    assert source.reference is None and trainer.known is None

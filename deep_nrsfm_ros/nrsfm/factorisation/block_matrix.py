@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -119,12 +120,18 @@ def _skew(Pi: Floats, G: Floats) -> tuple[Floats, Floats]:
 
 
 def least_nuclear_norm(
-    W: Floats, R: Floats, iterations: int = 150, *, weighted: bool = False
+    W: Floats,
+    R: Floats,
+    iterations: int = 150,
+    *,
+    weighted: bool = False,
+    before_each: Callable[[], None] = lambda: None,
 ) -> Floats:
     """Return S (f, p, 3): min |S#|_* subject to R S = W, S# being S as a matrix (f, 3p).
 
     ADMM: singular values are shrunk, then the shapes moved to where they project onto W.
     Weighted: each is shrunk in proportion to 1 / (sigma + floor), by the running sigma.
+    `before_each` is called before each iteration; an exception ends the work.
     """
     Y = W.astype(np.float64)
     f, p, _ = Y.shape
@@ -136,6 +143,7 @@ def least_nuclear_norm(
     S, U = held(np.zeros((f, p, 3))), np.zeros((f, p, 3))
     shrinkage = 0.05 * np.linalg.norm(S.reshape(f, -1), 2)
     for _ in range(iterations):
+        before_each()
         matrix = (S + U).reshape(f, -1)
         left, s, right = np.linalg.svd(matrix, full_matrices=False)
         floor = WEIGHT_FLOOR * s[0]

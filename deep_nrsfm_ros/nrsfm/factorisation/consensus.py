@@ -104,8 +104,8 @@ def consensus(W: Floats, before_each: Callable[[], None] = lambda: None) -> Cons
 
     Args:
         W: (f, p, 2) complete images, x right and y down; at least 4 frames and points.
-        before_each: called before each factorisation, which takes up to half a minute;
-            an exception ends the work.
+        before_each: called before each iteration of each factorisation, so every second or more
+            often for 2000 images; an exception ends the work.
     """
     W = centre(W.astype(np.float64))
     scales = image_scales(W)
@@ -145,7 +145,7 @@ def _once_more(W: Floats, agreeing: list[_Solution], before_each: Callable[[], N
     modes = [K for K in _MODES_FROM_MEAN if K < W.shape[1]] or list(MODES[:1])
     models = list(_models(W, _in_one_frame(found), modes, _EM_ITERATIONS, before_each))
     solutions = agreeing + [_solution(W, model) for model in models]
-    solutions += [_of_least_norm(W, model.Q, weighted=True) for model in models]
+    solutions += [_of_least_norm(W, model.Q, before_each, weighted=True) for model in models]
     return _mean(W, solutions)._replace(spread=found.spread)
 
 
@@ -158,17 +158,17 @@ def _in_rounds(W: Floats, models: list[LinearModel], before_each: Callable[[], N
     modes = [K for K in MODES[1:] if K < W.shape[1]] or list(MODES[:1])
     several = [model for model in models if len(model.basis) - 1 in modes]
     for K in modes:
-        before_each()
-        several.append(fit_from_rigid(W, K, iterations=_EM_ITERATIONS))
-    found = _mean(W, [_of_least_norm(W, model.Q) for model in several])
+        model = fit_from_rigid(W, K, iterations=_EM_ITERATIONS, before_each=before_each)
+        several.append(model)
+    found = _mean(W, [_of_least_norm(W, model.Q, before_each) for model in several])
     spread = found.spread
     for iterations in _ROUNDS:
         models = list(_models(W, _in_one_frame(found), modes, iterations, before_each))
-        found = _mean(W, [_of_least_norm(W, model.Q) for model in models])
+        found = _mean(W, [_of_least_norm(W, model.Q, before_each) for model in models])
     models = list(_models(W, _in_one_frame(found), modes, _LAST_ROUND, before_each))
     exact = [m for m in models if m.variance < _NO_NOISE_AT_LAST * float((W**2).mean())]
     last = exact[:1] or models  # modes grow in number: the first has the fewest
-    found = _mean(W, [_of_least_norm(W, model.Q, weighted=True) for model in last])
+    found = _mean(W, [_of_least_norm(W, model.Q, before_each, weighted=True) for model in last])
     return found._replace(spread=spread)
 
 
@@ -241,15 +241,17 @@ def _best_starts(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     cameras += [block_rotations(W, K) for K in sorted({min(K, most) for K in RANKS})]
     starts, norms = [], []
     for R in cameras:
-        before_each()
-        starts.append(_of_least_norm(W, rotation_from_camera(R.swapaxes(1, 2))))
+        starts.append(_of_least_norm(W, rotation_from_camera(R.swapaxes(1, 2)), before_each))
         norms.append(np.linalg.svd(starts[-1].S.reshape(len(W), -1), compute_uv=False).sum())
     return [s for s, norm in zip(starts, norms, strict=True) if norm <= _SAME_NORM * min(norms)]
 
 
-def _of_least_norm(W: Floats, Q: Floats, *, weighted: bool = False) -> _Solution:
+def _of_least_norm(
+    W: Floats, Q: Floats, before_each: Callable[[], None], *, weighted: bool = False
+) -> _Solution:
     """Return the shapes of lowest nuclear norm, weighted or not, for rotations Q (f, 3, 3)."""
-    return _meeting(W, Q, least_nuclear_norm(W, Q[:, :2], weighted=weighted))
+    S = least_nuclear_norm(W, Q[:, :2], weighted=weighted, before_each=before_each)
+    return _meeting(W, Q, S)
 
 
 def _exact(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
@@ -261,12 +263,16 @@ def _exact(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     models = {}
     for K in _FEW_MODES:
         for annealed in (False, True):
-            before_each()
-            models[K, annealed] = fit_from_rigid(W, K, annealed=annealed, iterations=_EM_ITERATIONS)
+            models[K, annealed] = fit_from_rigid(
+                W, K, annealed=annealed, iterations=_EM_ITERATIONS, before_each=before_each
+            )
     K, annealed = min(models, key=lambda settings: models[settings].variance)
     if models[K, annealed].variance > _NO_NOISE * float((W**2).mean()):
         return []
-    return [_solution(W, fit_from_rigid(W, K, annealed=annealed, iterations=_MORE_ITERATIONS))]
+    model = fit_from_rigid(
+        W, K, annealed=annealed, iterations=_MORE_ITERATIONS, before_each=before_each
+    )
+    return [_solution(W, model)]
 
 
 def _models(
@@ -278,8 +284,9 @@ def _models(
 ) -> Iterator[LinearModel]:
     """Yield the models of EM-PPCA with different numbers of modes."""
     for K in modes:
-        before_each()
-        yield fit_from_shapes(W, start.Q, start.S, K, iterations=iterations)
+        yield fit_from_shapes(
+            W, start.Q, start.S, K, iterations=iterations, before_each=before_each
+        )
 
 
 def _solution(W: Floats, model: LinearModel) -> _Solution:

@@ -7,6 +7,7 @@ of which the first is one. Y (f, 2, p) are the images, Q (f, 3, 3) the rotations
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -103,10 +104,17 @@ def em_ppca_by_likelihood(
 
 
 def _iterate(
-    Y: Floats, model: LinearModel, *, annealed: bool, mirror_test: bool, iterations: int
+    Y: Floats,
+    model: LinearModel,
+    *,
+    annealed: bool,
+    mirror_test: bool,
+    iterations: int,
+    before_each: Callable[[], None] = lambda: None,
 ) -> LinearModel:
-    """Return the model after `iterations` of EM."""
+    """Return the model after `iterations` of EM; `before_each` is called before each."""
     for i in range(iterations):
+        before_each()
         if mirror_test and i % MIRROR_EVERY == MIRROR_EVERY - 1:
             model = _mirror_test(Y, model)
         z, zz, _ = _posterior(Y, model)
@@ -145,7 +153,13 @@ def _modes_of(deviations: Floats, K: int) -> tuple[Floats, float]:
 
 
 def fit_from_rigid(
-    W: Floats, K: int, *, annealed: bool = False, mirror_test: bool = False, iterations: int = 300
+    W: Floats,
+    K: int,
+    *,
+    annealed: bool = False,
+    mirror_test: bool = False,
+    iterations: int = 300,
+    before_each: Callable[[], None] = lambda: None,
 ) -> LinearModel:
     """Return mean shape, K modes and cameras that EM finds from rigid factorisation.
 
@@ -155,13 +169,28 @@ def fit_from_rigid(
         annealed: see `em_ppca`.
         mirror_test: see `em_ppca`.
         iterations: of EM.
+        before_each: called before each iteration; an exception ends the work.
     """
     Y = W.astype(np.float64).swapaxes(1, 2)
-    start = _start(Y, K)
-    return _iterate(Y, start, annealed=annealed, mirror_test=mirror_test, iterations=iterations)
+    return _iterate(
+        Y,
+        _start(Y, K),
+        annealed=annealed,
+        mirror_test=mirror_test,
+        iterations=iterations,
+        before_each=before_each,
+    )
 
 
-def fit_from_shapes(W: Floats, Q: Floats, S: Floats, K: int, *, iterations: int) -> LinearModel:
+def fit_from_shapes(
+    W: Floats,
+    Q: Floats,
+    S: Floats,
+    K: int,
+    *,
+    iterations: int,
+    before_each: Callable[[], None] = lambda: None,
+) -> LinearModel:
     """Return mean shape, K modes and cameras that EM finds from given shapes and cameras.
 
     Args:
@@ -170,13 +199,21 @@ def fit_from_shapes(W: Floats, Q: Floats, S: Floats, K: int, *, iterations: int)
         S: (f, p, 3) shapes in object axes.
         K: number of modes.
         iterations: of EM.
+        before_each: called before each iteration; an exception ends the work.
     """
     Y = W.astype(np.float64).swapaxes(1, 2)
     mean = S.mean(0)
     modes, left = _modes_of((S - mean).swapaxes(1, 2), K)
     variance = left / S.size + 1e-4 * float((Y**2).mean())
     start = LinearModel(Q, np.concatenate((mean.T[None], modes)), variance)
-    return _iterate(Y, start, annealed=False, mirror_test=False, iterations=iterations)
+    return _iterate(
+        Y,
+        start,
+        annealed=False,
+        mirror_test=False,
+        iterations=iterations,
+        before_each=before_each,
+    )
 
 
 def shapes_of(W: Floats, model: LinearModel) -> Floats:
