@@ -91,16 +91,13 @@ def check(
         stamps: (f,) in ns, one for each frame, in the order of the frames; None: unknown.
         lifted: the objects, lifted; None: not lifted.
     """
-    step = max(1, -(-len(points) // _MAX_OBJECTS))
-    findings: list[Finding] = []
-    visible = confidence[::step] > 0
-    objects = points[::step]
-    findings += confidence_scale(confidence[::step])
+    findings = confidence_scale(confidence)
+    visible, objects = _sample(confidence) > 0, _sample(points)
     if visible.any():
         if sentinel := find_sentinel(objects, visible):
             spot, times = sentinel
             visible = visible & ~(objects == spot).all(-1)
-            findings.append(_sentinel(spot, times, int(confidence[::step].astype(bool).sum())))
+            findings.append(_sentinel(spot, times, int(_sample(confidence).astype(bool).sum())))
         findings += _coordinates(objects, visible, intrinsics, image_size)
     if stamps is not None:
         findings += _stamps(np.asarray(stamps, np.int64))
@@ -109,6 +106,11 @@ def check(
             findings += _places(lifted)
         findings += quality(lifted.residual, lifted.object_confidence)
     return findings
+
+
+def _sample(values: Floats) -> Floats:
+    """Return at most `_MAX_OBJECTS` of values (n, ...), evenly spaced, without a copy."""
+    return values[:: max(1, -(-len(values) // _MAX_OBJECTS))]
 
 
 def looks_normalised(points: Floats, visible: NDArray[np.bool_]) -> bool:
@@ -175,9 +177,10 @@ def confidence_scale(confidence: Floats) -> list[Finding]:
     What is above 1 counts as 1, so that on a scale of 0 to 100 weak keypoints count fully.
 
     Args:
-        confidence: of any shape, as the detector gives it; 0, negative or NaN where missing.
+        confidence: (n, ...), as the detector gives it; 0, negative or NaN where missing.
     """
-    given = confidence[(confidence > 0) & (confidence < np.inf)]
+    sample = _sample(confidence)
+    given = sample[(sample > 0) & (sample < np.inf)]
     if not given.size or (given > _HIGH).mean() <= _MANY_HIGH:
         return []
     largest = float(given.max())

@@ -562,7 +562,7 @@ def _share(low: NDArray[Any], high: NDArray[Any], box: tuple[float, ...]) -> flo
 
 def _is_one_object(group: _Group) -> bool:
     """Return whether most objects lie where the one before lies, as the same object later does."""
-    n = len(group.frame)
+    n = min(len(group.frame), _ROWS)
     points = group.points[:n].astype(np.float64)
     usable = (group.confidence[:n] > 0) & points.any(-1) & np.isfinite(points).all(-1)
     points[~usable] = np.nan
