@@ -51,7 +51,7 @@ from visualization_msgs.msg import MarkerArray
 from deep_nrsfm_ros.body.floor import FloorScale
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.data.curation import Curation
-from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap, TooFewSharedError
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Observation
@@ -708,7 +708,10 @@ class LifterNode(Node):
             else:
                 self._proposed = self._build_pipeline(changes)
         except Exception as problem:  # a bad parameter must not end the node
-            return SetParametersResult(successful=False, reason=_error_text(problem))
+            reason = _error_text(problem)
+            if isinstance(problem, TooFewSharedError):
+                reason += _one_at_a_time(changes)
+            return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, changes: list[Parameter]) -> None:
@@ -792,6 +795,16 @@ class LifterNode(Node):
 def _names_of(topic: str, identities: Sequence[str]) -> list[str]:
     """Return identities that are unique over all topics; "" stays."""
     return [identity and f"{topic} {identity}" for identity in identities]
+
+
+def _one_at_a_time(changes: Sequence[Parameter]) -> str:
+    """Return how model and layout can be exchanged if `changes` has but one of them, else ""."""
+    if {"model", "keypoint_layout"} <= {change.name for change in changes}:
+        return ""
+    return (
+        ". To exchange model and keypoint_layout, set keypoint_layout to 'auto' first, then model, "
+        "then keypoint_layout; or set both in one call (set_parameters_atomically)"
+    )
 
 
 def _error_text(problem: Exception) -> str:
