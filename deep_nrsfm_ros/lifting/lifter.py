@@ -50,8 +50,11 @@ class Lifted(NamedTuple):
     keypoints, or they lie on one line, which does not determine a camera.
 
     Attributes:
-        shapes: (n, p, 3) camera axes (x right, y down, z forward), in units of the reference
-            length; centred, or at the object's position where the camera's intrinsics are known.
+        shapes: (n, p, 3) camera axes (x right, y down, z forward); centred, or at the object's
+            position where the camera's intrinsics are known. The reference pair of the model's
+            layout is `reference_length` of its options long: of people, neck to mid-hip is 0.5 by
+            default, so shapes are in metres. Without a pair, the RMS radius is so long, 1 by
+            default.
         rotations: (n, 3, 3) from object to camera axes, p_camera = R p_object, det +1.
         scale: (n,) pixels per unit of `shapes`.
         translation: (n, 2) projection of the shape's origin in the image, in pixels.
@@ -131,8 +134,10 @@ class Lifter:
         """Lift the keypoints of n objects, or of one.
 
         Args:
-            points: (n, q, 2) or (q, 2) keypoints in the layout of this lifter, in pixels or any
-                other unit, x right and y down. A keypoint at (0, 0) or with a NaN is missing.
+            points: (n, q, 2) or (q, 2) keypoints in the layout of this lifter, x right and y down,
+                in pixels or any other unit that is the same for x and y: shares of width and
+                height, from 0 to 1, are multiplied by the image's size first. A keypoint at (0, 0)
+                or with a NaN is missing.
             confidence: (n, q) or (q,), from 0, which is missing, to 1; a boolean array of
                 visibility serves too. None: all keypoints have confidence 1.
 
@@ -167,7 +172,7 @@ class Lifter:
             identity: of the object.
 
         Returns:
-            The length of each bone in units of the reference length, by the names of its ends; a
+            The length of each bone in the unit of `Lifted.shapes`, by the names of its ends; a
             bone that was never seen is left out, and so is one of the right side, which has the
             length of the left one. And the seconds of sight behind the best known length; 0:
             nothing is learned.

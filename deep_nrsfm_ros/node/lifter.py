@@ -5,7 +5,8 @@ For every message on `keypoints` the node publishes, with the header of that mes
 
 - ~/points: n objects (rows) of p keypoints (columns): x right, y down, z forward, and confidence.
   Positions in the camera's optical frame if its CameraInfo is known, else centred on the keypoints
-  of each object; in units of the parameter reference_length; NaN where an object is not lifted.
+  of each object; the layout's reference pair has the length of the parameter reference_length;
+  NaN where an object is not lifted.
 - ~/camera_rotation: from the axes of the first object to those of the camera, or of target_frame;
   not published if the first object is not lifted. The axes are x front, y left, z up if the layout
   has a handedness.
