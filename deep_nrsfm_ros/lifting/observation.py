@@ -206,5 +206,5 @@ def check_keypoints(count: int, keypoints: int, field: str) -> None:
     if count != keypoints:
         raise MessageError(
             f"message has {count} keypoints ({field}); the keypoint layout has {keypoints}: "
-            "name the layout in which the detector gives them"
+            "name the layout in which the detector gives them (keypoint_layout)"
         )
