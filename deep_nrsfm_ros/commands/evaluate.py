@@ -30,8 +30,6 @@ CONVENTIONS = {
     "unscaled %": "as proper, without rescaling",
 }
 """What each figure of `figures` means."""
-OF_TRAIN = Path("models")
-"""Where `train` writes, unless `--output` says otherwise."""
 ALONE = LiftingOptions(correction="none", test_time_rotations=1, mirror=False)
 LIFTING = {
     "network alone": ALONE,
@@ -57,8 +55,9 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument(
         "--models-dir",
         type=Path,
-        help="folder of models, searched before those of the package (default: ./models, where "
-        f"train writes, and {default_models_dir()}, where the lifter's training writes)",
+        default=default_models_dir(),
+        help="folder of models, searched before those of the package (default: %(default)s, where "
+        "trainings write)",
     )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--cmu", type=Path, help="folder of the CMU database")
@@ -99,21 +98,17 @@ def selection_of(args: argparse.Namespace) -> TrialSelection | None:
     return None
 
 
-def find_models(names: Sequence[str], models_dir: Path | None) -> list[Model]:
-    """Return models by name or path, from `models_dir` or where trainings write.
+def find_models(names: Sequence[str], models_dir: Path) -> list[Model]:
+    """Return models by name or path.
 
     Args:
         names: names of models, or paths of model files.
-        models_dir: searched before the folders of the package; None: ./models and then the
-            lifter's folder.
+        models_dir: searched before the folders of the package.
 
     Raises:
         ModelFileError: there is no such model, or its file cannot be used.
     """
-    if models_dir:
-        folders = model_folders(models_dir.expanduser())
-    else:
-        folders = [OF_TRAIN, *model_folders(default_models_dir())]
+    folders = model_folders(models_dir.expanduser())
     return [load_model(find_model(name, folders)) for name in names]
 
 
