@@ -44,13 +44,21 @@ LIFTING = {
 default without bones, the default, and the default for keypoints without noise."""
 
 
+LABEL_FREE = (
+    "This measures against the truth of motion capture or of four cameras, so it needs data of "
+    "these. Figures without labels, of a model of your own, are in the report of its training "
+    "(MODEL.html) and in the list of `models`."
+)
+"""What the program measures, and where the other figures are."""
 _DEFAULTS: dict[str, Any] = {"subjects": ["01"], "split": "train", "stride": 1, "camera_seed": 0}
 """Options that choose trials of CMU."""
 
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog=program_name("evaluate"), description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog=program_name("evaluate"), description=f"{__doc__} {LABEL_FREE}"
+    )
     parser.add_argument("models", nargs="+", help="model files, or names of models")
     parser.add_argument(
         "--models-dir",
@@ -59,7 +67,7 @@ def arguments() -> argparse.ArgumentParser:
         help="folder of models, searched before those of the package (default: %(default)s, where "
         "trainings write)",
     )
-    source = parser.add_mutually_exclusive_group(required=True)
+    source = parser.add_mutually_exclusive_group()
     source.add_argument("--cmu", type=Path, help="folder of the CMU database")
     source.add_argument(
         "--pose2sim",
@@ -157,7 +165,10 @@ def compare_cameras(args: argparse.Namespace) -> None:
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per model and way of lifting; exit code 2 says the input was at fault."""
-    args = arguments().parse_args(argv)
+    parser = arguments()
+    args = parser.parse_args(argv)
+    if not (args.cmu or args.pose2sim):
+        parser.error(f"give --cmu or --pose2sim. {LABEL_FREE}")
     columns = ("model", "lifted", *CONVENTIONS)
     try:
         selection = selection_of(args)

@@ -29,6 +29,16 @@ def test_models_are_found_where_trainings_write(
         find_models(["absent"], default)
 
 
+def test_without_truth_it_says_where_the_other_figures_are(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["mine"])
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and "give --cmu or --pose2sim" in said
+    assert "without labels" in said and "MODEL.html" in said and "`models`" in said
+
+
 def test_options_that_choose_trials_of_cmu_mean_nothing_for_pose2sim(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
