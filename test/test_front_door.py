@@ -52,6 +52,7 @@ def test_importing_the_package_imports_nothing() -> None:
 def test_every_public_name_is_there() -> None:
     for name in deep_nrsfm_ros.__all__:
         assert name in dir(deep_nrsfm_ros) and getattr(deep_nrsfm_ros, name) is not None
+    assert dir(deep_nrsfm_ros) == sorted(deep_nrsfm_ros.__all__)
     with pytest.raises(AttributeError, match="'lift'"):
         _ = deep_nrsfm_ros.lift
 
