@@ -259,7 +259,7 @@ class LifterNode(Node):
         """
         self._lifter_diagnostics = LifterDiagnostics()
         self.get_logger().info(
-            f"lifting with model {self._pipeline.model.name!r} "
+            f"lifting with model {self._pipeline.model.name!r}: "
             + (
                 "keypoints in a layout that the first messages show (keypoint_layout: auto)"
                 if self._stream.searching
