@@ -49,7 +49,10 @@ def test_ros2_run_shows_in_the_usage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unknown_program_is_refused_with_the_nearest(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for word, hint in {"trian": "did you mean train?", "zzz": "choose one of demo, lift,"}.items():
+    for word, hint in {
+        "trian": "did you mean 'train'?",
+        "zzz": "choose one of demo, lift,",
+    }.items():
         with pytest.raises(SystemExit) as end:
             cli.main([word, "--help"])
         assert end.value.code == 2
