@@ -135,9 +135,9 @@ class Lifter:
 
         Args:
             points: (n, q, 2) or (q, 2) keypoints in the layout of this lifter, x right and y down,
-                in pixels or any other unit that is the same for x and y: shares of width and
-                height, from 0 to 1, are multiplied by the image's size first. A keypoint at (0, 0)
-                or with a NaN is missing.
+                in pixels or any other unit that is the same for x and y: multiply shares of width
+                and height, from 0 to 1, by the image's size. A keypoint at (0, 0) or with a NaN is
+                missing.
             confidence: (n, q) or (q,), from 0, which is missing, to 1; a boolean array of
                 visibility serves too. None: all keypoints have confidence 1.
 
