@@ -256,7 +256,7 @@ def test_each_object_has_its_topics(client: Client) -> None:
 
 def test_the_example_shows_an_elbow(client: Client, tmp_path: Path) -> None:
     source = (EXAMPLES / "elbow_angle.py").read_text().splitlines()
-    assert len([line for line in source if line.strip()]) <= 21
+    assert len([line for line in source if line.strip()]) <= 20
     shown = tmp_path / "shown"
     with shown.open("w") as output:
         process = ForkedPython([EXAMPLES / "elbow_angle.py"], NODE, stdout=output)
