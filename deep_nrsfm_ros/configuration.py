@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any, TypeVar, get_args, get_type_hints
 
 Config = TypeVar("Config")
@@ -47,6 +48,9 @@ class Option:
                 continue
             if self.choices and item not in self.choices:
                 raise ValueError(f"{name} is {item!r}; choose one of {', '.join(self.choices)}")
+            bounded = self.low is not None or self.high is not None
+            if bounded and not isinstance(item, Real):
+                raise ValueError(f"{name} is {item!r}; it must be a number, {self.allowed()}")
             below = self.low is not None and not item >= self.low
             above = self.high is not None and not item <= self.high
             if below or above:

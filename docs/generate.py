@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the pages that follow from the code: parameters, layouts, command line, faults, schema.
+"""Write the pages that follow from the code: parameters, layouts, command line, API, schema.
 
 Run `make reference` after a change of an option or a layout. A test fails when a page is stale.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 import ast
+import dataclasses
+import importlib
 import inspect
 import json
 import re
@@ -315,11 +317,7 @@ _MAPPING_KINDS: dict[str, dict[str, Any]] = {
 
 def schema_of_mappings() -> str:
     """Return the JSON Schema of a field mapping; the texts are those of `FieldMapping`."""
-    text = (inspect.getdoc(FieldMapping) or "").partition("Attributes:\n")[2]
-    texts = {
-        name: " ".join(words.split())
-        for name, words in re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, re.MULTILINE)
-    }
+    texts = _items(FieldMapping, "Attributes")
     properties = {
         name: {"description": texts[name], "anyOf": [kind, {"type": "null"}]}
         for name, kind in _MAPPING_KINDS.items()
@@ -356,7 +354,130 @@ def object_file_page() -> str:
     )
 
 
+_API: tuple[tuple[str, tuple[str, ...]], ...] = (
+    (
+        "Lifting",
+        (
+            "model_files.model_file:load_model",
+            "lifting.lifter:Lifter",
+            "lifting.lifter:Lifter.__call__",
+            "lifting.lifter:Lifter.lift",
+            "lifting.lifter:Lifted",
+            "lifting.options:LiftingOptions",
+        ),
+    ),
+    (
+        "Models and layouts",
+        (
+            "model_files.model_file:Model",
+            "model_files.model_file:save_model",
+            "layouts.layout:KeypointLayout",
+        ),
+    ),
+    ("Training", ("training.from_arrays:train", "nrsfm.recipe:Recipe")),
+)
+"""Sections of the Python API, and the module and the name of each entry."""
+_MODULES = (
+    *("network", "geometry", "normalisation", "losses", "metrics", "handedness", "neighbours"),
+    *("bones", "recipe"),
+)
+"""Modules of `deep_nrsfm_ros.nrsfm` that the page lists."""
+_OF_PARAMETERS = {
+    "LiftingOptions": "lifting",
+    "Recipe": "training-recipe",
+}
+"""Dataclasses whose fields are parameters too, and the section of those."""
+
+
+class _Plain:
+    """A text that is shown without quotes: an annotation, or a default that is a function."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __repr__(self) -> str:
+        return self._text
+
+
+def python_page() -> str:
+    """Return the page of the Python API, in Markdown: signatures and what each entry returns."""
+    readme = (_PACKAGE.parent / "README.md").read_text("utf-8")
+    example, _, text = readme.split("## Python\n")[1].split("\n## ")[0].partition("\n\n")
+    text = text.partition("More: [")[0].strip()
+    parts = [
+        "# Python API",
+        "You get: lifting and training as a library. Lifting needs neither ROS nor torch. Made by "
+        "`make reference`; do not edit.",
+        example,
+        text,
+        "`from deep_nrsfm_ros import NAME` gives each of the names below but the modules at the "
+        "end. `help(NAME)` and [the API in full](python_full.md) have results and errors too.",
+    ]
+    for title, entries in _API:
+        parts += [f"## {title}", *map(_entry, entries)]
+    rows = ["| module | content |", "|---|---|"]
+    for name in _MODULES:
+        module = importlib.import_module(f"deep_nrsfm_ros.nrsfm.{name}")
+        link = f"[`nrsfm.{name}`](../../deep_nrsfm_ros/nrsfm/{name}.py)"
+        rows.append(f"| {link} | {_cell(_first_paragraph(module))} |")
+    parts += ["## The method", "\n".join(rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _entry(place: str) -> str:
+    """Return signature, first paragraph and arguments of a function or a class.
+
+    A dataclass and a named tuple have their attributes instead.
+    """
+    module, _, path = place.partition(":")
+    value: Any = importlib.import_module(f"deep_nrsfm_ros.{module}")
+    for name in path.split("."):
+        value = getattr(value, name)
+    is_record = isinstance(value, type) and (
+        dataclasses.is_dataclass(value) or hasattr(value, "_fields")
+    )
+    signature = "" if is_record else _signature(value)
+    title = f"**`{path}{signature}`**"
+    if section := _OF_PARAMETERS.get(path):
+        return f"{title}: its fields are those of [these parameters](parameters.md#{section})."
+    described = vars(value)["__init__"] if isinstance(value, type) and not is_record else value
+    items = _items(described, "Attributes" if is_record else "Args")
+    rows = "\n".join(f"- `{name}`: {text}" for name, text in items.items())
+    return f"{title}\n\n{_first_paragraph(value)}\n\n{rows}"
+
+
+def _signature(value: Any) -> str:
+    """Return the signature of a function, a method or a class, without `self`."""
+    signature = inspect.signature(value)
+    parameters = [
+        p.replace(
+            annotation=_Plain(p.annotation),
+            default=_Plain("...") if inspect.isfunction(p.default) else p.default,
+        )
+        for name, p in signature.parameters.items()
+        if name != "self"
+    ]
+    returned = signature.return_annotation
+    returned = inspect.Signature.empty if returned in (None, "None") else _Plain(returned)
+    return str(signature.replace(parameters=parameters, return_annotation=returned))
+
+
+def _first_paragraph(value: Any) -> str:
+    """Return the first paragraph of a docstring, on one line."""
+    return " ".join((inspect.getdoc(value) or "").partition("\n\n")[0].split())
+
+
+def _items(value: Any, section: str) -> dict[str, str]:
+    """Return names and texts of a section of a docstring, "Attributes" or "Args"."""
+    text = (inspect.getdoc(value) or "").partition(f"{section}:\n")[2].partition("\n\n")[0]
+    return {
+        name: " ".join(words.split())
+        for name, words in re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", text, re.MULTILINE)
+    }
+
+
 PAGES = {
+    "python.md": python_page,
     "parameters.md": parameters_page,
     "layouts.md": layouts_page,
     "command_line.md": command_line_page,

@@ -21,5 +21,6 @@ def show(message: JointState) -> None:
 rclpy.init()
 node = Node("elbow_angle")
 node.create_subscription(JointState, "lifter/joint_states", show, qos_profile_sensor_data)
+print("waiting for joints of the lifter on /lifter/joint_states", flush=True)
 with suppress(KeyboardInterrupt, ExternalShutdownException):
     rclpy.spin(node)

@@ -25,5 +25,6 @@ def show(message: PointCloud2) -> None:
 rclpy.init()
 node = Node("reader")
 node.create_subscription(PointCloud2, "lifter/points", show, qos_profile_sensor_data)
+print("waiting for points of the lifter on /lifter/points", flush=True)
 with suppress(KeyboardInterrupt, ExternalShutdownException):
     rclpy.spin(node)

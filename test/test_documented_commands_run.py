@@ -103,6 +103,7 @@ def test_a_documented_command_runs(
     words = [word.replace("~", str(folder)) for word in words]
     steps = ["--steps", "1"] if name == "train" else []
     bag = "body25" if "body25" in words else "coco17"
+    monkeypatch.setenv("ROS_HOME", str(folder / "ros"))
     monkeypatch.chdir(folder / bag if "my_bag" in words else folder)
     PROGRAMS[name]([*words, *steps])
     for option in ("--output", "--html"):

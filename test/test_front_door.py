@@ -52,6 +52,7 @@ def test_importing_the_package_imports_nothing() -> None:
 def test_every_public_name_is_there() -> None:
     for name in deep_nrsfm_ros.__all__:
         assert name in dir(deep_nrsfm_ros) and getattr(deep_nrsfm_ros, name) is not None
+    assert dir(deep_nrsfm_ros) == sorted(deep_nrsfm_ros.__all__)
     with pytest.raises(AttributeError, match="'lift'"):
         _ = deep_nrsfm_ros.lift
 
@@ -102,7 +103,13 @@ def test_a_detectors_layout_is_mapped_by_name(human: Model) -> None:
     ("points", "confidence", "complaint"),
     [
         (np.ones((2, 24, 2)), None, r"'human25' needs numbers of shape \(n, 25, 2\) or \(25, 2\)"),
-        (np.ones((2, 25, 3)), None, r"points are \(2, 25, 3\)"),
+        (
+            np.ones((2, 25, 3)),
+            None,
+            r"points are \(2, 25, 3\).* second argument: points\[..., :2\], points\[..., 2\]$",
+        ),
+        (np.ones((25, 3)), None, r"second argument: points\[..., :2\]"),
+        (np.ones((2, 24, 3)), None, r"or \(25, 2\)$"),
         (np.ones(25), None, r"points are \(25,\)"),
         (np.full((25, 2), "x"), None, "needs numbers"),
         (np.ones((2, 25, 2)), np.ones(25), r"confidence is \(25,\) .* need .* \(2, 25\)"),

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import sys
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from pathlib import Path
 from deep_nrsfm_ros import __version__
 from deep_nrsfm_ros.commands.program import called_as
 from deep_nrsfm_ros.model_files.folders import PACKAGE
+from deep_nrsfm_ros.similar_names import did_you_mean
 
 PROGRAMS = {
     "demo": "lift a real person and show it on a page: a first look",
@@ -40,7 +40,8 @@ def arguments() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("command", metavar="COMMAND", help="one of the commands below")
-    parser.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    rest = parser.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    rest.required = False  # else the error of a missing command would name it too
     return parser
 
 
@@ -53,8 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = arguments()
     args = parser.parse_args(argv)
     if args.command not in PROGRAMS:
-        similar = difflib.get_close_matches(args.command, PROGRAMS, 1)
-        hint = f"did you mean {similar[0]}?" if similar else f"choose one of {', '.join(PROGRAMS)}"
+        hint = did_you_mean(args.command, PROGRAMS) or f"choose one of {', '.join(PROGRAMS)}"
         parser.error(f"there is no command {args.command!r}; {hint}")
     called_as(f"{parser.prog} {args.command}")
     module = importlib.import_module(f"deep_nrsfm_ros.commands.{args.command}")

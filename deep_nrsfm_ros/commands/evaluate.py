@@ -30,8 +30,6 @@ CONVENTIONS = {
     "unscaled %": "as proper, without rescaling",
 }
 """What each figure of `figures` means."""
-OF_TRAIN = Path("models")
-"""Where `train` writes, unless `--output` says otherwise."""
 ALONE = LiftingOptions(correction="none", test_time_rotations=1, test_time_mirror=False)
 LIFTING = {
     "network alone": ALONE,
@@ -46,21 +44,30 @@ LIFTING = {
 default without bones, the default, and the default for keypoints without noise."""
 
 
+LABEL_FREE = (
+    "This measures against the truth of motion capture or of four cameras, so it needs data of "
+    "these. Figures without labels, of a model of your own, are in the report of its training "
+    "(MODEL.html) and in the list of `models`."
+)
+"""What the program measures, and where the other figures are."""
 _DEFAULTS: dict[str, Any] = {"subjects": ["01"], "split": "train", "stride": 1, "camera_seed": 0}
 """Options that choose trials of CMU."""
 
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog=program_name("evaluate"), description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog=program_name("evaluate"), description=f"{__doc__} {LABEL_FREE}"
+    )
     parser.add_argument("models", nargs="+", help="model files, or names of models")
     parser.add_argument(
         "--models-dir",
         type=Path,
-        help="folder of models, searched before those of the package (default: ./models, where "
-        f"train writes, and {default_models_dir()}, where the lifter's training writes)",
+        default=default_models_dir(),
+        help="folder of models, searched before those of the package (default: %(default)s, where "
+        "trainings write)",
     )
-    source = parser.add_mutually_exclusive_group(required=True)
+    source = parser.add_mutually_exclusive_group()
     source.add_argument("--cmu", type=Path, help="folder of the CMU database")
     source.add_argument(
         "--pose2sim",
@@ -99,21 +106,17 @@ def selection_of(args: argparse.Namespace) -> TrialSelection | None:
     return None
 
 
-def find_models(names: Sequence[str], models_dir: Path | None) -> list[Model]:
-    """Return models by name or path, from `models_dir` or where trainings write.
+def find_models(names: Sequence[str], models_dir: Path) -> list[Model]:
+    """Return models by name or path.
 
     Args:
         names: names of models, or paths of model files.
-        models_dir: searched before the folders of the package; None: ./models and then the
-            lifter's folder.
+        models_dir: searched before the folders of the package.
 
     Raises:
         ModelFileError: there is no such model, or its file cannot be used.
     """
-    if models_dir:
-        folders = model_folders(models_dir.expanduser())
-    else:
-        folders = [OF_TRAIN, *model_folders(default_models_dir())]
+    folders = model_folders(models_dir.expanduser())
     return [load_model(find_model(name, folders)) for name in names]
 
 
@@ -162,7 +165,10 @@ def compare_cameras(args: argparse.Namespace) -> None:
 @program
 def main(argv: Sequence[str] | None = None) -> None:
     """Print one row per model and way of lifting; exit code 2 says the input was at fault."""
-    args = arguments().parse_args(argv)
+    parser = arguments()
+    args = parser.parse_args(argv)
+    if not (args.cmu or args.pose2sim):
+        parser.error(f"give --cmu or --pose2sim. {LABEL_FREE}")
     columns = ("model", "lifted", *CONVENTIONS)
     try:
         selection = selection_of(args)

@@ -15,7 +15,9 @@ Parameters: {program} --ros-args -p NAME:=VALUE; docs/reference/parameters.md li
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the node until SIGINT or SIGTERM; exit code 2 says that rclpy is not installed.
+    """Run the node until SIGINT or SIGTERM.
+
+    Exit code 2 says that rclpy is not installed, or that an argument is none of ROS.
 
     Args:
         argv: arguments of the program; None: those of the process.
@@ -31,6 +33,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     if words and words[0] in ("-h", "--help"):
         print(_USAGE.format(program=program_name("lifter"), description=__doc__))
         return
+    if unknown := _outside_ros_args(words):
+        print(
+            f"failed: {' '.join(unknown)!r} has no effect: give parameters as "
+            f"{program_name('lifter')} --ros-args -p NAME:=VALUE",
+            file=sys.stderr,
+        )
+        sys.exit(2)
     try:
         require_extra("ros", "the lifter node")
     except MissingExtraError as error:
@@ -41,6 +50,17 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     sys.argv[1:] = words  # rclpy reads the arguments of the process
     run()
+
+
+def _outside_ros_args(words: Sequence[str]) -> list[str]:
+    """Return the words that ROS ignores: those not between `--ros-args` and `--`, or the end."""
+    outside, of_ros = [], False
+    for word in words:
+        if word in ("--ros-args", "--"):
+            of_ros = word == "--ros-args"
+        elif not of_ros:
+            outside.append(word)
+    return outside
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from deep_nrsfm_ros.configuration import add_arguments
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.keypoint_files import KINDS
 from deep_nrsfm_ros.data.read_options import ReadOptions
-from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
@@ -92,7 +92,11 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("--name", help="name of the model (default: trained)")
     result.add_argument(
-        "--output", dest="folder", type=Path, help="folder of the model (default: models)"
+        "--output",
+        dest="folder",
+        type=Path,
+        help="folder of the model; other programs know the models of the default folder by name "
+        f"(default: {default_models_dir()})",
     )
     run = parser.add_argument_group("Run")
     run.add_argument(
@@ -141,6 +145,8 @@ def parse(arguments: argparse.Namespace, say: Callable[[str], None]) -> Training
         except ValueError as error:
             raise ValueError(f"--config {arguments.config}: {error}") from error
         return TrainingConfig.from_arguments(arguments, base)
+    if "folder" not in arguments:
+        arguments.folder = default_models_dir()
     if "resume" in arguments:
         return resume_arguments(arguments, say)
     return TrainingConfig.from_arguments(arguments)

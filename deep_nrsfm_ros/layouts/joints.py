@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from deep_nrsfm_ros.similar_names import did_you_mean
+
 Pair = tuple[str, str]
 
 WORDS = {
@@ -79,7 +81,8 @@ def check_joints(joints: Sequence[Joint], keypoints: Sequence[str]) -> None:
         if joint.parent and joint.parent not in names:
             raise ValueError(f"{where}: its parent {joint.parent!r} is not a joint before it")
         if missing := [name for name in joint.at if name not in keypoints]:
-            raise ValueError(f"{where}: there is no keypoint {missing[0]!r}")
+            hint = did_you_mean(missing[0], keypoints)
+            raise ValueError(f"{where}: there is no keypoint {missing[0]!r}{hint and '; ' + hint}")
         if not joint.at:
             raise ValueError(f"{where} is at no keypoint")
         names.append(joint.name)

@@ -14,6 +14,10 @@ _MIN_SHARED = 4  # a shape is unique from four points on
 _SHOWN = 6  # names of keypoints in an error text
 
 
+class TooFewSharedError(ValueError):
+    """Two layouts share too few keypoints by name for one to be lifted as the other."""
+
+
 def detected_count(visible: NDArray[np.bool_], derivations: NDArray[np.int32]) -> NDArray[np.int64]:
     """Return the number (n,) of visible keypoints, without those that follow from others.
 
@@ -54,7 +58,7 @@ class KeypointMap:
         how, or stays missing. A keypoint that is missing in one frame only is not derived.
 
         Raises:
-            ValueError: fewer than 4 keypoints match; no shape can be lifted from them.
+            TooFewSharedError: fewer than 4 keypoints match; no shape can be lifted from them.
         """
         self.source, self.target = source, target
         self.identical = source.keypoints == target.keypoints
@@ -72,7 +76,7 @@ class KeypointMap:
         mapped = (*direct, *self._derived)
         self.filled = tuple(target.keypoints[t] for t, _ in mapped)
         if len(mapped) < _MIN_SHARED:
-            raise ValueError(
+            raise TooFewSharedError(
                 f"layouts {source.name!r} and {target.name!r} share {len(mapped)} keypoints by "
                 f"name; at least {_MIN_SHARED} are needed. {source.name!r} has "
                 f"{_shown(source.keypoints)}; {target.name!r} has {_shown(target.keypoints)}"

@@ -11,11 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.layouts.joints import Joint, check_joints
+from deep_nrsfm_ros.similar_names import did_you_mean
 
 Edge = tuple[str, str]
 Tetrahedron = tuple[str, str, str, str]
 TRUNK = ("neck", "mid_hip")
 """Reference pair of people."""
+_FIELDS = {
+    "edge": "edges",
+    "rigid pair": "rigid",
+    "handedness": "handedness",
+    "reference": "reference",
+}
 MAX_KEYPOINTS = 1000
 """Most keypoints of a layout: time and memory of lifting grow with the square of the number."""
 
@@ -77,10 +84,16 @@ class KeypointLayout:
                 raise ValueError(f"layout {self.name!r}: {kind} {group!r} must be {size} names")
             if len(set(group)) != size:
                 raise ValueError(f"layout {self.name!r}: {kind} {group!r} repeats a name")
-        named = [name for _, _, group in groups for name in group]
-        for keypoint in [*named, *self.derived, *self.top, *self.bottom]:
-            if keypoint not in own:
-                raise ValueError(f"layout {self.name!r} has no keypoint {keypoint!r}")
+        named = [(_FIELDS[kind], group) for kind, _, group in groups]
+        named += [("derived", tuple(self.derived)), ("top", self.top), ("bottom", self.bottom)]
+        for field_name, keypoints in named:
+            for keypoint in keypoints:
+                if keypoint not in own:
+                    hint = did_you_mean(keypoint, self.keypoints)
+                    raise ValueError(
+                        f"layout {self.name!r} has no keypoint {keypoint!r}, which {field_name} "
+                        f"names{hint and '; ' + hint}"
+                    )
         for keypoint, parts in self.derived.items():
             if isinstance(parts, str) or not parts:
                 raise ValueError(

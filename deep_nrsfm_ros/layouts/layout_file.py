@@ -11,6 +11,7 @@ from typing import Any
 
 from deep_nrsfm_ros.layouts.joints import Joint, fitting_joints
 from deep_nrsfm_ros.layouts.layout import Edge, KeypointLayout, Tetrahedron
+from deep_nrsfm_ros.similar_names import did_you_mean
 from deep_nrsfm_ros.yaml_file import brief_repr, read_fields
 
 LAYOUT_SUFFIXES = (".yaml", ".yml")
@@ -53,9 +54,8 @@ class _Description:
         """Raise LayoutFileError for a field that does not exist or a required one that lacks."""
         unknown = [name for name in fields if name not in FIELDS]
         if unknown:
-            raise LayoutFileError(
-                f"has no field {brief_repr(unknown[0])}; the fields are {', '.join(FIELDS)}"
-            )
+            hint = did_you_mean(str(unknown[0]), FIELDS) or f"the fields are {', '.join(FIELDS)}"
+            raise LayoutFileError(f"has no field {brief_repr(unknown[0])}; {hint}")
         # A template leaves fields without a value; they count as absent.
         self._fields = {name: value for name, value in fields.items() if value is not None}
         for name in ("name", "keypoints"):

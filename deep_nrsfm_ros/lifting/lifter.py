@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deep_nrsfm_ros.batched import slices
+from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.kernel import supports
 from deep_nrsfm_ros.large_arrays import empty, release
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -29,10 +31,12 @@ from deep_nrsfm_ros.lifting.own_bones import (
 )
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.find_layout import find_layout
-from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
 
 _BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
 _RELEASED = 128  # blocks after which results that are in files are taken out of memory
+
+_Options = TypeVar("_Options", LiftingOptions, HistoryOptions)
 
 _MIRROR_IN_IMAGE = np.array([-1, 1], np.float32)
 _MIRROR_IN_CAMERA = np.array([-1, 1, 1], np.float32)  # x axis of the camera: to the right
@@ -46,8 +50,11 @@ class Lifted(NamedTuple):
     keypoints, or they lie on one line, which does not determine a camera.
 
     Attributes:
-        shapes: (n, p, 3) camera axes (x right, y down, z forward), in units of the reference
-            length; centred, or at the object's position where the camera's intrinsics are known.
+        shapes: (n, p, 3) camera axes (x right, y down, z forward); centred, or at the object's
+            position where the camera's intrinsics are known. The reference pair of the model's
+            layout is `reference_length` of its options long: of people, neck to mid-hip is 0.5 by
+            default, so shapes are in metres. Without a pair, the RMS radius is so long, 1 by
+            default.
         rotations: (n, 3, 3) from object to camera axes, p_camera = R p_object, det +1.
         scale: (n,) pixels per unit of `shapes`.
         translation: (n, 2) projection of the shape's origin in the image, in pixels.
@@ -83,7 +90,7 @@ class Lifter:
 
     def __init__(
         self,
-        model: Model,
+        model: Model | str | Path,
         options: LiftingOptions | None = None,
         *,
         layout: KeypointLayout | str | None = None,
@@ -92,7 +99,8 @@ class Lifter:
         """Prepare a backend for the model.
 
         Args:
-            model: weights, layout and error statistics.
+            model: weights, layout and error statistics, or the name or file of a model, as
+                `load_model` takes it.
             options: None: all defaults.
             layout: the detector's layout of q keypoints, as an object or by the name of a preset
                 or a layout file ("coco17"); its keypoints are mapped to the model's by name.
@@ -101,18 +109,24 @@ class Lifter:
                 defaults.
 
         Raises:
-            ValueError: the layout does not exist, or shares fewer than 4 keypoints with the
-                model's.
+            ValueError: the model or the layout does not exist, they share fewer than 4 keypoints,
+                or an option is out of its range.
+            TypeError: an argument is of another type.
         """
+        if isinstance(model, (str, Path)):
+            model = load_model(model)
+        if not isinstance(model, Model):
+            raise TypeError(
+                f"model is a {type(model).__name__}; give load_model('human'), or a name"
+            )
         self.model = model
-        self.options = options or LiftingOptions()
+        self.options = _checked("options", options, LiftingOptions)
+        history = _checked("history", history, HistoryOptions)
         if isinstance(layout, str):
             layout = find_layout("layout", layout)
         self.layout = layout or model.layout
         self._to_model = KeypointMap(self.layout, model.layout)
-        self.constants = _constants(
-            model, self.options, history or HistoryOptions(), self._to_model
-        )
+        self.constants = _constants(model, self.options, history, self._to_model)
         backend = CompiledBackend if supports(model.network) else NumpyBackend
         self.backend = backend(self.constants)
 
@@ -120,8 +134,10 @@ class Lifter:
         """Lift the keypoints of n objects, or of one.
 
         Args:
-            points: (n, q, 2) or (q, 2) keypoints in the layout of this lifter, in pixels or any
-                other unit, x right and y down. A keypoint at (0, 0) or with a NaN is missing.
+            points: (n, q, 2) or (q, 2) keypoints in the layout of this lifter, x right and y down,
+                in pixels or any other unit that is the same for x and y: multiply shares of width
+                and height, from 0 to 1, by the image's size. A keypoint at (0, 0) or with a NaN is
+                missing.
             confidence: (n, q) or (q,), from 0, which is missing, to 1; a boolean array of
                 visibility serves too. None: all keypoints have confidence 1.
 
@@ -156,7 +172,7 @@ class Lifter:
             identity: of the object.
 
         Returns:
-            The length of each bone in units of the reference length, by the names of its ends; a
+            The length of each bone in the unit of `Lifted.shapes`, by the names of its ends; a
             bone that was never seen is left out, and so is one of the right side, which has the
             length of the left one. And the seconds of sight behind the best known length; 0:
             nothing is learned.
@@ -213,6 +229,26 @@ class Lifter:
         if self.options.mirrored:
             lifted = _mirrored(lifted)
         return mark_not_lifted(lifted, not_lifted) if not_lifted.any() else lifted
+
+
+def _checked(argument: str, given: Any, cls: type[_Options]) -> _Options:
+    """Return options whose values are in their ranges; the defaults for None.
+
+    Args:
+        argument: name of the argument, for the error text.
+        given: an instance of `cls`, or None.
+        cls: the dataclass of the options.
+
+    Raises:
+        TypeError: the options are of another type.
+        ValueError: a value is out of range; the text names option, value and range.
+    """
+    if given is None:
+        return cls()
+    if not isinstance(given, cls):
+        raise TypeError(f"{argument} is a {type(given).__name__}; give {cls.__name__}(NAME=VALUE)")
+    check(given)
+    return given
 
 
 def _mirrored_context(context: Context) -> Context:

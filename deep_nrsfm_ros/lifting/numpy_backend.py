@@ -59,7 +59,8 @@ class LifterConstants(NamedTuple):
         error_std: (p,) standard deviation of the error of each point, in units of the network.
         noise: standard deviation of the keypoints, relative to the size of the object.
         refill: rounds of filling missing keypoints with those of the lifted shape.
-        reference_length: length of the reference pair in the output.
+        reference_length: length in the output of the reference pair, or of the RMS radius where
+            `reference` is None.
         reference: indices of the reference pair; None: the RMS radius is the reference.
         min_visible: objects with fewer detected keypoints are not lifted.
         derivations: (m, 2) keypoints that do not count as detected, as in `KeypointMap`.

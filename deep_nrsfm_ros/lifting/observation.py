@@ -175,9 +175,12 @@ def from_arrays(
     xy, q = np.asarray(points), len(layout)
     xy = xy[None] if xy.ndim == 2 else xy
     if xy.ndim != 3 or xy.shape[1:] != (q, 2) or xy.dtype.kind not in "fiu":
+        hint = ""
+        if xy.ndim == 3 and xy.shape[1:] == (q, 3):
+            hint = "; give confidence as the second argument: points[..., :2], points[..., 2]"
         raise ValueError(
             f"points are {np.shape(points)} of {xy.dtype}; keypoint layout {layout.name!r} needs "
-            f"numbers of shape (n, {q}, 2) or ({q}, 2)"
+            f"numbers of shape (n, {q}, 2) or ({q}, 2){hint}"
         )
     xy = xy.astype(np.float64)
     if confidence is None:
@@ -203,5 +206,5 @@ def check_keypoints(count: int, keypoints: int, field: str) -> None:
     if count != keypoints:
         raise MessageError(
             f"message has {count} keypoints ({field}); the keypoint layout has {keypoints}: "
-            "name the layout in which the detector gives them"
+            "name the layout in which the detector gives them (keypoint_layout)"
         )

@@ -11,7 +11,12 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.history import Memory
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
-from deep_nrsfm_ros.lifting.observation import MessageError, Observation, without_border
+from deep_nrsfm_ros.lifting.observation import (
+    MAX_COORDINATE,
+    MessageError,
+    Observation,
+    without_border,
+)
 from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.sanity import to_pixels
@@ -216,8 +221,9 @@ class Pipeline:
                 )
             raise MessageError(
                 f"message has at most {detected} detected keypoints of the model's "
-                f"{len(self.model.layout)} in an object, without those at the image's border, of "
-                "low confidence, or that follow from others; "
+                f"{len(self.model.layout)} in an object, without those at (0, 0), with a NaN or a "
+                f"coordinate of {MAX_COORDINATE:g} or more, at the image's border, of low "
+                "confidence, or that follow from others; "
                 f"min_visible is {self._min_visible}"
             )
         return lifted, identities

@@ -9,6 +9,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import LAYOUT_SUFFIXES, LayoutFileError, read_layout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS, preset
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, load_once
+from deep_nrsfm_ros.similar_names import did_you_mean
 
 NUMBERED = "numbered"
 """Stands for a layout of points without names, as many as the data has."""
@@ -38,7 +39,8 @@ def find_layout(option: str, name_or_path: str) -> KeypointLayout:
         return layout
     if path.suffix == MODEL_SUFFIX:
         return load_once(path).layout
+    presets = did_you_mean(name_or_path, LAYOUTS) or ", ".join(LAYOUTS)
     raise ValueError(
-        f"{option} is {name_or_path!r}; name a preset ({', '.join(LAYOUTS)}), "
+        f"{option} is {name_or_path!r}; name a preset ({presets}), "
         f"a layout file ({LAYOUT_SUFFIXES[0]}) or a model file ({MODEL_SUFFIX})"
     )

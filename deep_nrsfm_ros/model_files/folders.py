@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 PACKAGE = "deep_nrsfm_ros"
@@ -32,6 +33,13 @@ def model_folders(models_dir: Path) -> list[Path]:
     AMENT_PREFIX_PATH and of this Python environment, then models/ of a source tree.
     """
     return [models_dir, *_shared("models"), _SOURCE_TREE / "models"]
+
+
+def in_words(folders: Sequence[Path]) -> str:
+    """Return folders of models for a message; those of the package are "the package's models"."""
+    own = model_folders(Path())[1:]
+    words = ["the package's models" if folder in own else str(folder) for folder in folders]
+    return ", ".join(dict.fromkeys(words))
 
 
 def shipped_models() -> list[Path]:

@@ -21,7 +21,7 @@ from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.layouts.joints import joints_from_json
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
-from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
+from deep_nrsfm_ros.model_files.folders import default_models_dir, in_words, model_folders
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.network import Architecture, Network, weight_shapes
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -431,6 +431,4 @@ def find_model(name_or_path: str, folders: Sequence[Path]) -> Path:
         wrong = f"is a {kind}, not a model file ({MODEL_SUFFIX})"
         reason = f"model {name_or_path!r} {wrong if path.exists() else 'does not exist'}"
     names = sorted({f.stem for folder in folders for f in folder.glob(f"*{MODEL_SUFFIX}")})
-    raise ModelFileError(
-        f"{reason}; there are {', '.join(names) or 'none'} in {', '.join(map(str, folders))}"
-    )
+    raise ModelFileError(f"{reason}; there are {', '.join(names) or 'none'} in {in_words(folders)}")

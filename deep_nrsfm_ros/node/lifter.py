@@ -5,7 +5,8 @@ For every message on `keypoints` the node publishes, with the header of that mes
 
 - ~/points: n objects (rows) of p keypoints (columns): x right, y down, z forward, and confidence.
   Positions in the camera's optical frame if its CameraInfo is known, else centred on the keypoints
-  of each object; in units of the parameter reference_length; NaN where an object is not lifted.
+  of each object; the layout's reference pair has the length of the parameter reference_length;
+  NaN where an object is not lifted.
 - ~/camera_rotation: from the axes of the first object to those of the camera, or of target_frame;
   not published if the first object is not lifted. The axes are x front, y left, z up if the layout
   has a handedness.
@@ -51,7 +52,7 @@ from visualization_msgs.msg import MarkerArray
 from deep_nrsfm_ros.body.floor import FloorScale
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.data.curation import Curation
-from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap, TooFewSharedError
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Observation
@@ -258,7 +259,7 @@ class LifterNode(Node):
         """
         self._lifter_diagnostics = LifterDiagnostics()
         self.get_logger().info(
-            f"lifting with model {self._pipeline.model.name!r} "
+            f"lifting with model {self._pipeline.model.name!r}: "
             + (
                 "keypoints in a layout that the first messages show (keypoint_layout: auto)"
                 if self._stream.searching
@@ -710,7 +711,10 @@ class LifterNode(Node):
             else:
                 self._proposed = self._build_pipeline(changes)
         except Exception as problem:  # a bad parameter must not end the node
-            return SetParametersResult(successful=False, reason=_error_text(problem))
+            reason = _error_text(problem)
+            if isinstance(problem, TooFewSharedError):
+                reason += _one_at_a_time(changes)
+            return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, changes: list[Parameter]) -> None:
@@ -794,6 +798,16 @@ class LifterNode(Node):
 def _names_of(topic: str, identities: Sequence[str]) -> list[str]:
     """Return identities that are unique over all topics; "" stays."""
     return [identity and f"{topic} {identity}" for identity in identities]
+
+
+def _one_at_a_time(changes: Sequence[Parameter]) -> str:
+    """Return how model and layout can be exchanged if `changes` has but one of them, else ""."""
+    if {"model", "keypoint_layout"} <= {change.name for change in changes}:
+        return ""
+    return (
+        ". To exchange model and keypoint_layout, set keypoint_layout to 'auto' first, then model, "
+        "then keypoint_layout; or set both in one call (set_parameters_atomically)"
+    )
 
 
 def _error_text(problem: Exception) -> str:

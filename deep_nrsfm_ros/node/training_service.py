@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing, suppress
+from itertools import islice
 from pathlib import Path
 from queue import Empty, SimpleQueue
 
@@ -12,13 +14,74 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
+from deep_nrsfm_ros.data.bag_files import BagError, BagFile, open_bag, opens_quickly
+from deep_nrsfm_ros.data.bag_topics import keypoint_topics
+from deep_nrsfm_ros.lifting.observation import MessageError
+from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, status
+from deep_nrsfm_ros.training.config import PARAMETERS, DataConfig, TrainingConfig
 from deep_nrsfm_ros.training.job import JobStatus, TrainingJob
 from deep_nrsfm_ros.training.record import find_records, read_record
 from deep_nrsfm_ros.training.request import TrainingRequest, data_in_words
+from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
 
+_SAMPLE = 16
+"""Messages of a bag that are read before a training is accepted."""
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def check_keypoint_counts(config: TrainingConfig) -> None:
+    """Read the first messages of each bag, which takes milliseconds.
+
+    Bags that are too large to open at once, and files, are not looked at.
+
+    Raises:
+        ValueError: the messages have another number of keypoints than their layout in every bag,
+            so a training of them would fail as soon as they are read.
+    """
+    data, (source, _) = config.data, find_layouts(config, PARAMETERS)
+    if not source.keypoints or data.inputs:
+        return
+    reason = ""
+    for path in map(Path.expanduser, data.bags):
+        if not opens_quickly(path):
+            return
+        try:
+            with closing(open_bag(path)) as bag:
+                wrong = _wrong_count(bag, data, len(source))
+        except BagError:  # the training leaves it out
+            continue
+        if not wrong:
+            return
+        reason = reason or f"{path.name}: {wrong}"
+    if reason:
+        raise ValueError(
+            f"{reason}; set {PARAMETERS('keypoint_layout')}, which stands for {source.name!r} now"
+        )
+
+
+def _wrong_count(bag: BagFile, data: DataConfig, keypoints: int) -> str:
+    """Return the complaint about the first message that has another number of keypoints.
+
+    It is "" if one of the first messages can be read, or none has another number.
+    """
+    complaint = ""
+    mapping = read_field_mapping(data.mapping)
+    for topic, input_type, decode in keypoint_topics(bag, data.topic, mapping, keypoints):
+        reader = MessageReader(input_type, decode)
+        for raw in islice(bag.sample(topic), _SAMPLE):
+            try:
+                _, observation = reader(raw, keypoints, size=data.image_size)
+                if len(observation.confidence):
+                    return ""
+            except MessageError as error:
+                with suppress(Exception):
+                    if not complaint and reader.count(raw) not in (0, keypoints):
+                        complaint = str(error)
+            except Exception:  # damaged bytes fail in many ways; the training counts them
+                continue
+    return complaint
 
 
 class TrainingService:
@@ -86,6 +149,7 @@ class TrainingService:
                 )
             request = self._request()
             config, warning = request.accept()
+            check_keypoint_counts(config)
             self._job = TrainingJob(config, self._enqueue)
         except (ValueError, OSError) as problem:
             response.success, response.message = False, str(problem)

@@ -49,11 +49,33 @@ def test_ros2_run_shows_in_the_usage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unknown_program_is_refused_with_the_nearest(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for word, hint in {"trian": "did you mean train?", "zzz": "choose one of demo, lift,"}.items():
+    for word, hint in {
+        "trian": "did you mean 'train'?",
+        "zzz": "choose one of demo, lift,",
+    }.items():
         with pytest.raises(SystemExit) as end:
             cli.main([word, "--help"])
         assert end.value.code == 2
         assert f"there is no command {word!r}; {hint}" in capsys.readouterr().err
+
+
+def test_a_missing_program_is_named_as_the_help_names_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main([])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.endswith("arguments are required: COMMAND\n")
+
+
+@pytest.mark.parametrize(
+    "words", [["-p", "keypoint_layout:=coco17"], ["--ros-args", "-p", "a:=1", "--", "-p", "b:=2"]]
+)
+def test_arguments_that_ros_would_ignore_are_refused(words: list[str]) -> None:
+    done = run_forked(["-m", "deep_nrsfm_ros", "lifter", *words], NODE)
+    assert done.returncode == 2
+    assert f"failed: {' '.join(words[-2:])!r} has no effect" in done.stderr
+    assert "lifter --ros-args -p NAME:=VALUE" in done.stderr
 
 
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:

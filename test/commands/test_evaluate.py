@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from deep_nrsfm_ros.commands.evaluate import find_models, main
+from deep_nrsfm_ros.commands import train
+from deep_nrsfm_ros.commands.evaluate import arguments, find_models, main
 from deep_nrsfm_ros.model_files.model_file import ModelFileError
-from deep_nrsfm_ros.training.config import OutputConfig
 from test.commands.test_models import save
 
 
@@ -18,13 +18,25 @@ def test_models_are_found_where_trainings_write(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ROS_HOME", str(tmp_path / "ros"))
-    save(tmp_path / OutputConfig().folder / "by_command.safetensors")
-    save(tmp_path / "ros" / "deep_nrsfm_ros" / "models" / "by_node.safetensors")
+    default = arguments().parse_args(["mine", "--cmu", "cmu"]).models_dir
+    config = train.parse(train.parser().parse_args(["--cmu", "cmu"]), print)
+    assert config.output.folder == default == tmp_path / "ros" / "deep_nrsfm_ros" / "models"
+    save(default / "mine.safetensors")
     save(tmp_path / "runs" / "elsewhere.safetensors")
-    assert len(find_models(["by_command", "by_node", "human"], None)) == 3
+    assert len(find_models(["mine", "human"], default)) == 2
     assert len(find_models(["elsewhere", "human"], Path("runs"))) == 2
-    with pytest.raises(ModelFileError, match="by_command, by_node"):
-        find_models(["absent"], None)
+    with pytest.raises(ModelFileError, match="mine"):
+        find_models(["absent"], default)
+
+
+def test_without_truth_it_says_where_the_other_figures_are(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["mine"])
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and "give --cmu or --pose2sim" in said
+    assert "without labels" in said and "MODEL.html" in said and "`models`" in said
 
 
 def test_options_that_choose_trials_of_cmu_mean_nothing_for_pose2sim(

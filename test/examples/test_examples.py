@@ -77,6 +77,8 @@ def test_a_published_person_is_printed(tmp_path: Path) -> None:
             process.kill()
             process.wait()
     assert not any("Traceback" in path.read_text() for path in logs)
-    x, y, z, confidence = re.findall(r"-?\d+\.\d+", logs[2].read_text().splitlines()[0])
+    waiting, first, *_ = logs[2].read_text().splitlines()
+    assert waiting == "waiting for points of the lifter on /lifter/points"
+    x, y, z, confidence = re.findall(r"-?\d+\.\d+", first)
     assert np.linalg.norm(np.array([x, y, z], float)) < 2  # metres from the middle of the person
     assert 0 < float(confidence) < 1  # of whatever frame came first

@@ -111,6 +111,11 @@ def test_there_are_examples() -> None:
 
 BAD: dict[str, tuple[str | bytes, str]] = {
     "unknown field": (LEAST + "skeleton: []", "no field 'skeleton'; the fields are name, keyp"),
+    "like a field": (LEAST + "egdes: []", "no field 'egdes'; did you mean 'edges'?"),
+    "keypoint of an edge": (
+        DOOR.replace("  - [hinge_top, hinge", "  - [hinge_tpo, hinge", 1),
+        "has no keypoint 'hinge_tpo', which edges names; did you mean 'hinge_top' or",
+    ),
     "number as a field": (LEAST + "7: 8", "no field 7"),
     "field twice": (LEAST + "name: other", "the field 'name' 2 times"),
     "no name": ("keypoints: [a, b, c, d]", "lacks the field 'name'"),
@@ -218,7 +223,8 @@ def test_a_layout_is_found_by_preset_layout_file_and_model_file(
     ("word", "complaint"),
     [
         ("horse", r"--object is 'horse'; name a preset \(human17.*layout file \(\.yaml\)"),
-        ("", "--object is ''"),
+        ("COCO17", r"'COCO17'; name a preset \(did you mean 'coco17'\?\), a layout file"),
+        ("", r"--object is ''; name a preset \(human17"),
         ("absent.yaml", "layout file absent.yaml: cannot be read"),
         ("absent.safetensors", "cannot read model absent.safetensors"),
     ],

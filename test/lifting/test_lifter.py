@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ import pytest
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
-from deep_nrsfm_ros.lifting.options import LiftingOptions
-from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
+from deep_nrsfm_ros.model_files.model_file import Model, ModelFileError, save_model
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -248,6 +249,42 @@ def test_reference_length(length: float) -> None:
     nameless = random_model(layout=KeypointLayout.numbered(17))
     shapes = Lifter(nameless, options)(*pixels()).shapes
     np.testing.assert_allclose((shapes**2).sum(2).mean(1) ** 0.5, length, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (LiftingOptions(correction="foo"), "correction is 'foo'; choose one of bones, learned"),
+        (LiftingOptions(reference_length=-1), "reference_length is -1; it must be at least 0"),
+        (LiftingOptions(noise=float("nan")), "noise is nan; it must be at least 0 and at most 1"),
+        (LiftingOptions(noise="0.1"), "noise is '0.1'; it must be a number"),  # type: ignore
+        (LiftingOptions(refill=-3), "refill is -3; it must be at least 0 and at most 50"),
+        (HistoryOptions(shape_time=-1), "shape_time is -1; it must be at least 0"),
+    ],
+)
+def test_an_option_out_of_its_range_is_refused(options: Any, complaint: str) -> None:
+    remembers = isinstance(options, HistoryOptions)
+    given = {"history" if remembers else "options": options}
+    with pytest.raises(ValueError, match=f"^{complaint}"):
+        Lifter(random_model(), **given)
+
+
+def test_an_argument_of_another_type_is_refused() -> None:
+    model: Any = random_model()
+    with pytest.raises(TypeError, match=r"options is a dict; give LiftingOptions\(NAME=VALUE\)"):
+        Lifter(model, {"noise": 1})  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="history is a bool; give HistoryOptions"):
+        Lifter(model, history=True)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"model is a NoneType; give load_model\('human'\)"):
+        Lifter(None)  # type: ignore[arg-type]
+
+
+def test_a_model_may_be_given_by_its_name(tmp_path: Path) -> None:
+    save_model(tmp_path / "mine.safetensors", random_model())
+    assert Lifter(tmp_path / "mine.safetensors").model.name == "random"
+    assert Lifter("human", layout="coco17").model.name == "human"
+    with pytest.raises(ModelFileError, match="no model 'humna'; there are"):
+        Lifter("humna")
 
 
 def test_the_reference_length_is_that_of_the_object_unless_another_is_asked_for() -> None:

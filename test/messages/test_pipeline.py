@@ -13,7 +13,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
-from deep_nrsfm_ros.lifting.observation import MessageError, Observation
+from deep_nrsfm_ros.lifting.observation import MessageError, Observation, to_observation
 from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
@@ -60,6 +60,13 @@ def test_min_visible_counts_detected_keypoints(
     assert np.isnan(lifted.shapes).all() and not lifted.confidence.any()
     with pytest.raises(MessageError, match=f"at most {detected} detected .* min_visible is 4"):
         pipeline.lift(mapped, intrinsics, ("",), "topic", Moment(0.0))
+
+
+def test_keypoints_that_are_too_large_are_named_as_a_cause() -> None:
+    pipeline = Pipeline(HUMAN, None, InputOptions(), LiftingOptions(), SmoothingOptions())
+    huge = to_observation(np.full((1, len(HUMAN.layout), 3), 1e30))
+    with pytest.raises(MessageError, match=r"at most 0 detected .* coordinate of 1e\+09 or more"):
+        pipeline.lift(huge, None, ("",), "topic", Moment(0.0))
 
 
 def walked(history: HistoryOptions, **changes: Any) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
+from deep_nrsfm_ros.model_files.folders import default_models_dir, in_words, model_folders
 
 
 def test_the_users_folder_is_in_ros_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -30,6 +30,11 @@ def test_own_models_come_before_installed_ones_and_those_before_the_sources(
     assert rest[:2] == shares
     assert rest[2] == Path(sys.prefix) / "share/deep_nrsfm_ros/models"
     assert rest[-1].name == "models" and (rest[-1].parent / "deep_nrsfm_ros").is_dir()
+
+
+def test_a_message_names_the_models_of_the_package_once(tmp_path: Path) -> None:
+    assert in_words(model_folders(tmp_path)) == f"{tmp_path}, the package's models"
+    assert in_words([tmp_path]) == str(tmp_path)
 
 
 def test_the_node_does_not_import_torch() -> None:

@@ -269,7 +269,9 @@ def test_the_example_shows_an_elbow(client: Client, tmp_path: Path) -> None:
         finally:
             process.kill()
             process.wait()
-    assert re.match(r"object\d+/l_elbow: +-?\d", shown.read_text())
+    waiting, first, *_ = shown.read_text().splitlines()
+    assert waiting == "waiting for joints of the lifter on /lifter/joint_states"
+    assert re.match(r"object\d+/l_elbow: +-?\d", first)
 
 
 def test_the_list_of_bodies_is_that_of_hri_msgs() -> None:

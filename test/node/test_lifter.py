@@ -380,6 +380,20 @@ def test_a_model_is_changed_and_changed_back_by_one_parameter(client: Client) ->
         np.testing.assert_array_equal(unpack(client.exchange(publisher, human)), first)
 
 
+def test_a_refusal_of_model_or_layout_says_how_to_exchange_both(client: Client) -> None:
+    # `ros2 param set` sets one parameter at a time: neither comes first.
+    remedy = "set keypoint_layout to 'auto' first, then model"
+    assert client.set_parameters(keypoint_layout="coco17") == ""
+    assert remedy in client.set_parameters(model="joints")
+    assert remedy in client.set_parameters(keypoint_layout="hand21")
+    assert remedy not in client.set_parameters(model="joints", keypoint_layout="coco17")
+    assert client.set_parameters(keypoint_layout="auto") == ""
+    assert client.set_parameters(model="joints") == ""
+    assert client.set_parameters(keypoint_layout="cmu31") == ""
+    assert client.set_parameters(keypoint_layout="model") == ""
+    assert client.set_parameters(model="person") == ""
+
+
 def test_the_detectors_order_may_come_from_a_layout_file(
     start_lifter: StartLifter, connect: Connect, tmp_path: Path
 ) -> None:

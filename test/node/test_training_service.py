@@ -18,8 +18,10 @@ from std_msgs.msg import Float32MultiArray
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
+from deep_nrsfm_ros.node.training_service import check_keypoint_counts
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.training.config import DataConfig, TrainingConfig
 from test.node.conftest import Connect, LifterProcess, StartLifter
 
 P = 17
@@ -179,6 +181,21 @@ def test_the_real_training_turns_a_bag_into_the_model_in_use(
     client.wait_for_health(lambda _, v: v["model"] == "fresh")
     assert client.exchange(publisher, keypoints()).data != before
     assert "torch" not in Path(f"/proc/{lifter.process.pid}/maps").read_text()
+
+
+def test_bags_of_another_number_of_keypoints_are_refused_at_once(
+    lifter: LifterProcess, connect: Connect, models: Path, tmp_path: Path
+) -> None:
+    write_bag(tmp_path / "fingers", 20, 21)
+    client = connect()
+    client.set_parameters(train__bags=[str(tmp_path / "fingers")], train__name="finish")
+    refused = client.call("/lifter/train")
+    assert not refused.success
+    assert "fingers: message has 21 keypoints" in refused.message
+    assert "set train.keypoint_layout, which stands for 'human17' now" in refused.message
+    # A bag that fits is enough: the training leaves out the messages of the other, and counts them.
+    both = (tmp_path / "fingers", models / "joints")
+    check_keypoint_counts(TrainingConfig(DataConfig(both), object="human17"))
 
 
 PAW = KeypointLayout("paw", ("heel", "toe_1", "toe_2", "toe_3", "toe_4"))
