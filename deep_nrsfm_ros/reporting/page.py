@@ -19,7 +19,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.held_out import Split
 from deep_nrsfm_ros.data.lifted_sample import LiftedFrames, lift_sample
 from deep_nrsfm_ros.data.sufficiency import Sufficiency
-from deep_nrsfm_ros.model_files.known_model import knows
+from deep_nrsfm_ros.model_files.matching_model import knows
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
 from deep_nrsfm_ros.reporting.shapes import shape_space

@@ -22,8 +22,8 @@ from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
 from deep_nrsfm_ros.data.keypoint_files import recordings
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS
 from deep_nrsfm_ros.layouts.presets import HUMAN25
-from deep_nrsfm_ros.model_files.folders import model_folders
-from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
+from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
+from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
 from deep_nrsfm_ros.model_files.model_file import find_model, load_once
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -95,7 +95,7 @@ class OutputConfig:
         threads: threads of torch; 0 is one a core.
     """
 
-    folder: Path = Path("models")
+    folder: Path = field(default_factory=default_models_dir)
     name: str = "trained"
     threads: int = 0
 
@@ -166,7 +166,7 @@ class TrainingConfig:
         config = base.with_options(values)
         if (has_base and not start) or not (config.data.bags or config.data.inputs):
             return dataclasses.replace(config, start="") if start else config
-        known = str(known_model(config.object or HUMAN25.name) or "")
+        known = str(matching_model(config.object or HUMAN25.name) or "")
         config = dataclasses.replace(config, start="", rival=known)
         if known and not start and not network_options & values.keys():
             return config.with_start(Path(known))

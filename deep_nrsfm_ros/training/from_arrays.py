@@ -20,7 +20,7 @@ from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import from_arrays
 from deep_nrsfm_ros.model_files.find_layout import find_layout
-from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
+from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
 from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model, load_once
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
@@ -135,5 +135,5 @@ def _origin(start: Model | str, layout: KeypointLayout) -> Model | None:
 
 def _shipped(layout: KeypointLayout) -> Model | None:
     """Return the model of the package that has the keypoints of a layout, if there is one."""
-    known = known_model(layout)
+    known = matching_model(layout)
     return load_once(known) if known else None

@@ -16,7 +16,7 @@ from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.keypoint_files import is_bag
 from deep_nrsfm_ros.messages.options import MODEL_ORDER
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
-from deep_nrsfm_ros.model_files.known_model import FROM_NONE, known_model
+from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, check_name
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights, Recipe
@@ -176,7 +176,7 @@ def training_request(
         output=OutputConfig(sandbox.models_dir, options.name, options.threads),
         resume=options.resume,
     )
-    known = known_model(target, [lifter.model])
+    known = matching_model(target, [lifter.model])
     start = Path(options.from_) if options.from_ else known
     if start and options.from_ != FROM_NONE:
         config = config.with_start(start)

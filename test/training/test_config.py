@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from deep_nrsfm_ros.commands.train import parser
 from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.model_files.known_model import known_model
+from deep_nrsfm_ros.model_files.matching_model import matching_model
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -67,7 +67,7 @@ def test_every_option_comes_back_from_json() -> None:
 
 
 def test_a_training_of_people_starts_from_the_model_of_people_unless_told_otherwise() -> None:
-    bag, human = ("--bag", "a"), str(known_model("human25"))
+    bag, human = ("--bag", "a"), str(matching_model("human25"))
     assert Path(human).stem == "human"
     assert (parsed(*bag).start, parsed(*bag).rival) == (human, human)
     assert parsed(*bag, "--object", "coco17").start == human
@@ -117,7 +117,7 @@ def test_the_command_line_reaches_every_option_of_the_parts() -> None:
         curation=Curation(min_visible=5),
         limits=Limits(minutes=2.5, keep_best=False),
         output=OutputConfig(Path("out"), "mine", 3),
-        rival=str(known_model("human17")),
+        rival=str(matching_model("human17")),
         resume=True,
     )
     assert config.data.image_size == (640, 480) and DataConfig(image_width=3).image_size is None

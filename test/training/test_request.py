@@ -14,7 +14,7 @@ from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
-from deep_nrsfm_ros.model_files.known_model import known_model
+from deep_nrsfm_ros.model_files.matching_model import matching_model
 from deep_nrsfm_ros.model_files.model_file import Model, save_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
@@ -57,7 +57,7 @@ def test_every_parameter_reaches_the_configuration(tmp_path: Path) -> None:
     asked = request(
         tmp_path, bags=("one", "two"), name="mine", threads=3, resume=True, activate="never"
     )
-    human = known_model("human17")
+    human = matching_model("human17")
     assert human is not None
     expected = TrainingConfig(
         data=DataConfig(

@@ -24,7 +24,9 @@ def knows(model: KeypointLayout, layout: KeypointLayout) -> bool:
     return len(shared) >= max(4, _MIN_SHARED * min(len(model), len(layout)))
 
 
-def known_model(object_layout: KeypointLayout | str, preferred: Sequence[Path] = ()) -> Path | None:
+def matching_model(
+    object_layout: KeypointLayout | str, preferred: Sequence[Path] = ()
+) -> Path | None:
     """Return the file of a model that has the keypoints of an object, None if there is none.
 
     A model of the very keypoints, in their order, comes before one that shares most of them.

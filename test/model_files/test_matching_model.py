@@ -11,7 +11,7 @@ import pytest
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17, LAYOUTS
 from deep_nrsfm_ros.model_files import model_file
-from deep_nrsfm_ros.model_files.known_model import known_model, knows
+from deep_nrsfm_ros.model_files.matching_model import knows, matching_model
 from deep_nrsfm_ros.model_files.model_file import (
     Model,
     ModelFileError,
@@ -43,7 +43,7 @@ def test_a_file_is_read_once_until_it_changes(
 
     monkeypatch.setattr(model_file, "load_model", counted)
     assert load_once(path) is load_once(path) and len(read) == 1
-    assert known_model(DOG, [path]) == path and len(read) == 1
+    assert matching_model(DOG, [path]) == path and len(read) == 1
     save(path, HUMAN17)
     assert load_once(path).layout.keypoints == HUMAN17.keypoints and len(read) == 2
     with pytest.raises(ModelFileError, match="cannot read"):
@@ -54,29 +54,29 @@ def test_a_file_is_read_once_until_it_changes(
 def test_people_of_every_detector_have_human(name: str) -> None:
     if name not in LAYOUTS:
         pytest.skip(f"there is no layout {name}")
-    found = known_model(name)
+    found = matching_model(name)
     assert found is not None and found.stem == "human"
 
 
 @pytest.mark.parametrize("name", ["human17", "human25", "cmu31", "hand21"])
 def test_a_model_of_the_very_keypoints_comes_before_one_that_shares_most(name: str) -> None:
-    found = known_model(name)
+    found = matching_model(name)
     assert found is not None and load_model(found).layout.keypoints == LAYOUTS[name].keypoints
 
 
 @pytest.mark.parametrize("name", ["hand21", "ap10k17", "numbered", "no such layout"])
 def test_other_objects_have_no_model_of_people(name: str) -> None:
-    found = known_model(name)
+    found = matching_model(name)
     assert found is None or found.stem != "human"
 
 
 def test_the_present_model_comes_first_if_it_fits(tmp_path: Path) -> None:
     dog, mine = save(tmp_path / "dog.safetensors", DOG), save(tmp_path / "m.safetensors", HUMAN17)
-    assert known_model(DOG, [mine, dog]) == dog
-    assert known_model("human17", [dog, mine]) == mine
+    assert matching_model(DOG, [mine, dog]) == dog
+    assert matching_model("human17", [dog, mine]) == mine
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(b"\0" * 9)
-    assert known_model(DOG, [damaged, tmp_path / "lost.safetensors", dog]) == dog
+    assert matching_model(DOG, [damaged, tmp_path / "lost.safetensors", dog]) == dog
 
 
 def test_most_names_must_be_the_same() -> None:
