@@ -31,8 +31,8 @@ from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
 from deep_nrsfm_ros.training.progress import Progress
-from deep_nrsfm_ros.training.schedule import with_steps
 from deep_nrsfm_ros.training.setup import Setup
+from deep_nrsfm_ros.training.steps import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 SNAPSHOTS = 10

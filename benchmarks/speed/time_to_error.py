@@ -29,7 +29,7 @@ from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.loop import Callbacks, train
-from deep_nrsfm_ros.training.schedule import with_steps
+from deep_nrsfm_ros.training.steps import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 METRIC = "shape %"

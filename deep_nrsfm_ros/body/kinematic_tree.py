@@ -392,11 +392,6 @@ def _canonical_axes(kind: str, axes: Floats, first: Floats) -> tuple[Floats, Flo
     return Q, np.full(3, np.linalg.det(Q))
 
 
-def rotation_about(axes: Floats, angles: Floats) -> Floats:
-    """Return rotations (..., 3, 3) by angles (...) in radians about unit vectors (..., 3)."""
-    return rotation_from_vector(axes * angles[..., None])
-
-
 def _dot(a: Floats, b: Floats) -> Floats:
     """Return the dot product (...) of vectors (..., 3)."""
     product: Floats = np.einsum("...i,...i->...", a, b)

@@ -69,30 +69,21 @@ def is_mirrored(
     return bool(sum(np.median(vote) for _, vote in _counted(S, layout, visible)) < 0)
 
 
-def disagreement(
+def front_shares(
     S: Floats, layout: KeypointLayout, visible: NDArray[np.bool_] | None = None
-) -> str:
-    """Return a warning if the votes on the depth disagree, "" if they agree.
+) -> list[tuple[str, float]]:
+    """Return the front of each tetrahedron, with the share of the shapes in which it is there.
 
     On a sound model, each tetrahedron has the right side in most of the shapes. If one has not,
     depth is wrong in part, and mirroring the whole shape does not repair it.
 
     Args:
         S: (f, p, 3) shapes as a model lifts them, in any unit.
-        layout: the layout of the shapes; without a handedness there is no warning.
+        layout: the layout of the shapes; without a handedness there are no shares.
         visible: (f, p) visible keypoints; None: all. As for `is_mirrored`.
     """
     counted = _counted(S, layout, visible) if layout.handedness else []
-    shares = [(front, (vote > 0).mean()) for (*_, front), vote in counted]
-    if all(share >= 0.5 for _, share in shares):
-        return ""
-    listing = ", ".join(f"{front} in {100 * share:.0f} %" for front, share in shares)
-    return (
-        f"the keypoints disagree on where the front is, so that depth is wrong in part ({listing} "
-        "of the frames where it belongs); record the object from more sides, start from a model "
-        "of such an object (--from, train.from), or let the layout help (bone_length_weight, "
-        "handedness_weight)"
-    )
+    return [(front, float((vote > 0).mean())) for (*_, front), vote in counted]
 
 
 def object_frame(

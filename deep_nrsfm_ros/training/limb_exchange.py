@@ -8,14 +8,16 @@ frames may not show. They need no 3D label, since they are made of the network's
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.body.kinematic_tree import rotation_about
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.nrsfm.geometry import Floats, align, centre
+from deep_nrsfm_ros.nrsfm.geometry import Floats, align, centre, rotation_from_vector
+from deep_nrsfm_ros.nrsfm.network import Network
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Recipe
 
 _LIMBS = 3  # of each shape that are exchanged and turned, one after the other
 _ANGLE = 0.35  # standard deviation of a limb's rotation vector, per axis, in radians
@@ -97,9 +99,7 @@ class LimbExchange:
             weights = weights / weights.sum(1, keepdims=True)
             near_X, near_Y = ((weights * Z).sum(1, keepdims=True) for Z in (X, Y))
             Q = align(weights * (Y - near_Y), X - near_X).rotation
-            vector = _ANGLE * rng.standard_normal((count, 3))
-            angle = np.linalg.norm(vector, axis=1)
-            R = rotation_about(vector / np.maximum(angle, _TINY)[:, None], angle)
+            R = rotation_from_vector(_ANGLE * rng.standard_normal((count, 3)))
             joint = self.joints[edge][:, None, None]
             at_X, at_Y = (np.take_along_axis(Z, joint, 1) for Z in (X, Y))
             X = np.where(self.limbs[edge][..., None], at_X + (Y - at_Y) @ (Q @ R), X)
@@ -126,3 +126,42 @@ def _distances(edges: Sequence[tuple[int, int]], start: int, p: int) -> NDArray[
         near = {b for edge in edges for a, b in (edge, edge[::-1]) if a in found}
         found = {keypoint for keypoint in near if np.isinf(distance[keypoint])}
     return distance
+
+
+def with_limb_exchange(
+    recipe: Recipe, start: Network | None, limb_exchange: LimbExchange | None
+) -> Recipe:
+    """Return the recipe with the share of shapes with exchanged limbs in place of `AUTOMATIC`.
+
+    Frames of a training that starts from a model are often of one person or of few motions, from
+    which the network would learn that limbs move together.
+
+    Args:
+        recipe: whose `limb_exchange` may be `AUTOMATIC`.
+        start: the network that the training starts from; None: random weights.
+        limb_exchange: the limbs of the layout; None: it has none.
+
+    Raises:
+        ValueError: the recipe exchanges limbs, and the layout has none; or the share is no share.
+    """
+    share = recipe.limb_exchange
+    check_limb_exchange(share)
+    if share == AUTOMATIC:
+        share = float(start is not None and limb_exchange is not None)
+    if share and limb_exchange is None:
+        raise ValueError(
+            f"limb_exchange is {share:g}, but there are no limbs to exchange: no edge of the "
+            "layout divides it"
+        )
+    return dataclasses.replace(recipe, limb_exchange=share)
+
+
+def check_limb_exchange(share: float, name: str = "limb_exchange") -> None:
+    """Raise ValueError unless a share is `AUTOMATIC` or from 0 to 1.
+
+    Args:
+        share: `Recipe.limb_exchange`.
+        name: of the option, for the message.
+    """
+    if share != AUTOMATIC and not 0 <= share <= 1:
+        raise ValueError(f"{name} is {share:g}; it must be {AUTOMATIC} or from 0 to 1")

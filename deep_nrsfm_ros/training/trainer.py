@@ -26,7 +26,7 @@ from deep_nrsfm_ros.training.gradient_function import (
     weight_vector,
     with_weights,
 )
-from deep_nrsfm_ros.training.schedule import learning_rate
+from deep_nrsfm_ros.training.learning_rate import learning_rate
 from deep_nrsfm_ros.training.setup import DEFAULT_SETUP, Setup
 from deep_nrsfm_ros.training.soap import Soap
 

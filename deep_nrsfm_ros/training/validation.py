@@ -22,8 +22,7 @@ from deep_nrsfm_ros.model_files.model_file import check_name, load_once
 from deep_nrsfm_ros.training.config import DataConfig, OptionNames, TrainingConfig
 from deep_nrsfm_ros.training.disk import check_room
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
-from deep_nrsfm_ros.training.limb_exchange import LimbExchange
-from deep_nrsfm_ros.training.schedule import check_limb_exchange
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange, check_limb_exchange
 
 _NUMBERED_LAYOUT = KeypointLayout(NUMBERED, ())  # its points are counted when the bags are read
 

@@ -20,7 +20,7 @@ from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Preset
 from deep_nrsfm_ros.training import loop as training
 from deep_nrsfm_ros.training.finish import finish
-from deep_nrsfm_ros.training.schedule import FROM_RANDOM
+from deep_nrsfm_ros.training.steps import FROM_RANDOM
 from deep_nrsfm_ros.training.trainer import Trainer
 
 STEPS = 23  # snapshots do not divide it

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
-from deep_nrsfm_ros.nrsfm.handedness import disagreement, is_mirrored, object_frame, votes
+from deep_nrsfm_ros.nrsfm.handedness import front_shares, is_mirrored, object_frame, votes
 
 some = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -171,23 +171,21 @@ def test_the_first_of_several_gives_the_axes() -> None:
     np.testing.assert_array_equal(object_frame(S, HUMAN17), object_frame(S, first))
 
 
-def test_a_part_that_is_on_the_wrong_side_is_named_with_its_share() -> None:
+def test_the_share_of_each_front_is_that_of_the_frames_where_it_is_there() -> None:
     S = walkers(f=50)
-    assert disagreement(S, HUMAN17) == ""
-    few = np.concatenate([behind(S[:20], "nose"), S[20:]])
-    assert disagreement(few, HUMAN17) == ""
     most = np.concatenate([behind(S[:48], "nose"), S[48:]])
-    said = disagreement(most, HUMAN17)
-    assert "depth is wrong in part (nose in 4 %, left_knee in 100 %" in said
-    assert disagreement(most @ rotations(50, np.random.default_rng(0)), HUMAN17) == said
-    assert disagreement(most, KeypointLayout.numbered(len(HUMAN17))) == ""
+    shares = front_shares(most, HUMAN17)
+    assert [round(100 * share) for _, share in shares] == [4, 100, 100, 100, 100]
+    turned = front_shares(most @ rotations(50, np.random.default_rng(0)), HUMAN17)
+    assert turned == shares
+    assert front_shares(most, KeypointLayout.numbered(len(HUMAN17))) == []
 
 
-def test_a_part_that_nobody_saw_is_not_named() -> None:
+def test_a_part_that_nobody_saw_has_no_share() -> None:
     S = behind(walkers(), "nose")
     seen = np.ones(S.shape[:2], bool)
-    assert disagreement(S, HUMAN17, seen)
+    assert dict(front_shares(S, HUMAN17, seen))["nose"] == 0
     seen[:, HUMAN17.index("nose")] = False
-    assert disagreement(S, HUMAN17, seen) == ""
+    assert "nose" not in dict(front_shares(S, HUMAN17, seen))
     seen[0] = True  # one frame of thirty
-    assert disagreement(S, HUMAN17, seen) == ""
+    assert "nose" not in dict(front_shares(S, HUMAN17, seen))

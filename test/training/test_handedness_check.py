@@ -3,7 +3,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
+
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.training import handedness_check
 from deep_nrsfm_ros.training.handedness_check import handedness_warning
 from test.fixtures.random_model import random_frames, random_model
 
@@ -33,3 +38,15 @@ def test_what_no_model_lifts_is_not_doubted() -> None:
     nothing = random_frames(5, P)
     nothing.visible[:] = False
     assert handedness_warning(random_model(nothing.layout), nothing) == ""
+
+
+@pytest.mark.parametrize(
+    ("shares", "said"), [([0.5, 1], ""), ([0.04, 1], "(nose in 4 %, left_knee in 100 % of")]
+)
+def test_a_part_that_is_on_the_wrong_side_is_named_with_its_share(
+    shares: list[float], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fronts = list(zip(("nose", "left_knee"), shares, strict=True))
+    monkeypatch.setattr(handedness_check, "front_shares", lambda *_: fronts)
+    warning = handedness_check.disagreement(np.zeros((1, 17, 3)), HUMAN17)
+    assert (said in warning) and bool(said) == bool(warning)

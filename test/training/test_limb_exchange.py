@@ -19,11 +19,13 @@ from deep_nrsfm_ros.nrsfm.geometry import (
     rotation_from_camera,
     rotation_from_vector,
 )
+from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC, Recipe
 from deep_nrsfm_ros.training import limb_exchange
 from deep_nrsfm_ros.training.few_frames import FactorisedShapes
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.limb_exchange import LimbExchange
+from deep_nrsfm_ros.training.limb_exchange import LimbExchange, with_limb_exchange
 from deep_nrsfm_ros.training.loop import train
 from deep_nrsfm_ros.training.mirror import KnownShapesSource, MirrorCheck
 from deep_nrsfm_ros.training.setup import Setup
@@ -196,3 +198,35 @@ def test_a_training_that_exchanges_limbs_needs_some(figure: Any, trained: Traine
     with pytest.raises(ValueError, match="limb_exchange is 1, but there are no limbs to exchange"):
         train(figure.points, visible, trained.preset._replace(recipe=recipe))
     assert LimbExchange.of(figure.layout) is None
+
+
+START = initialise(Architecture(widths=(4,)), 5, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("asked", "from_model", "has_limbs", "taken"),
+    [
+        (AUTOMATIC, True, True, 1),
+        (AUTOMATIC, True, False, 0),
+        (AUTOMATIC, False, True, 0),
+        (0.5, False, True, 0.5),
+        (0, True, True, 0),
+    ],
+)
+def test_limbs_are_exchanged_by_themselves_only_where_a_model_is_the_start(
+    asked: float, from_model: bool, has_limbs: bool, taken: float
+) -> None:
+    limbs = LimbExchange(CMU31) if has_limbs else None
+    recipe = with_limb_exchange(Recipe(limb_exchange=asked), START if from_model else None, limbs)
+    assert recipe.limb_exchange == taken
+
+
+def test_limbs_that_a_layout_lacks_cannot_be_exchanged() -> None:
+    with pytest.raises(ValueError, match="limb_exchange is 1, but there are no limbs to exchange"):
+        with_limb_exchange(Recipe(limb_exchange=1), START, None)
+
+
+@pytest.mark.parametrize("share", [-0.5, -2, 1.5])
+def test_a_share_that_is_no_share_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match=f"limb_exchange is {share}; it must be -1 or from 0 to 1"):
+        with_limb_exchange(Recipe(limb_exchange=share), START, LimbExchange(CMU31))

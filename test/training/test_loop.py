@@ -23,11 +23,11 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.learning_rate import learning_rate
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.loop import Callbacks, train
 from deep_nrsfm_ros.training.mirror import TOLERATED, MirrorCheck
 from deep_nrsfm_ros.training.progress import Progress
-from deep_nrsfm_ros.training.schedule import learning_rate
 from deep_nrsfm_ros.training.trainer import Trainer
 from test.fixtures.training_options import by_dataclass
 

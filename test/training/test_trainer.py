@@ -11,7 +11,7 @@ import pytest
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
 from deep_nrsfm_ros.training.frames import FrameStore
-from deep_nrsfm_ros.training.schedule import learning_rate
+from deep_nrsfm_ros.training.learning_rate import learning_rate
 from deep_nrsfm_ros.training.trainer import second_moment
 
 
