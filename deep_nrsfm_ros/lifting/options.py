@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from deep_nrsfm_ros.body.person_height import trunk_length
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
-
-TRUNK_SHARE = 0.5 / 1.75
-"""Length of the trunk, from neck to mid-hip, relative to a person's height."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ class LiftingOptions:
         if self.reference_length:
             return self.reference_length
         if self.person_height and layout.reference == TRUNK:
-            return TRUNK_SHARE * self.person_height
+            return trunk_length(self.person_height)
         return layout.reference_length or 1.0
 
     def unused_height(self, layout: KeypointLayout) -> str:

@@ -31,6 +31,10 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset
 
 _FEWEST = 4  # keypoints, as for lifting: fewer than a tetrahedron has are no 3D shape
 
+_FRAMES_A_STEP = 3  # 64 a batch are 21 passes over the frames
+_MIN_STEPS = 300
+_WITHOUT_WHITENING = 10  # times as many steps, as new keypoints are learned from nothing
+
 
 def start_from(model: Model, layout: KeypointLayout) -> Network:
     """Return the network of `model` for the keypoints of `layout`, matched by name.
@@ -70,6 +74,28 @@ def start_from(model: Model, layout: KeypointLayout) -> Network:
         L=L,
         L_inverse=L_inverse,
     )
+
+
+def steps_from(start: Network, frames: int) -> int:
+    """Return the number of steps of a training that starts from a network.
+
+    A trained network has learned what shapes there are, so that about 21 passes over the new frames
+    suffice; with more it fits their noise. `benchmarks/real/fine_tuning.py` compares numbers.
+
+    Args:
+        start: as `start_from` returns it.
+        frames: of all processes.
+    """
+    steps = max(frames // _FRAMES_A_STEP, _MIN_STEPS)
+    return _WITHOUT_WHITENING * steps if lacks_whitening(start) else steps
+
+
+def lacks_whitening(start: Network) -> bool:
+    """Return whether a start, as `start_from` returns it, is not whitened.
+
+    It is not where its keypoints are not those of its model, or where the model has no whitening.
+    """
+    return np.array_equal(start.L, np.eye(start.p))
 
 
 def check_fixed_options(model: Model, preset: Preset, name_of: Callable[[str], str] = str) -> None:

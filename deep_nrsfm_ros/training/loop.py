@@ -26,12 +26,13 @@ from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
 from deep_nrsfm_ros.training.few_frames import FactorisedShapes, factorise
+from deep_nrsfm_ros.training.fine_tuning import lacks_whitening
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limb_exchange import with_limb_exchange
 from deep_nrsfm_ros.training.mirror import TOLERATED, KnownShapesSource, MirrorCheck, most_frames
 from deep_nrsfm_ros.training.progress import Clock, Progress
 from deep_nrsfm_ros.training.setup import DEFAULT_SETUP, Setup
-from deep_nrsfm_ros.training.steps import lacks_whitening, with_steps
+from deep_nrsfm_ros.training.steps import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
