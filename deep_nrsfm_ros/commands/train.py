@@ -145,8 +145,6 @@ def parse(arguments: argparse.Namespace, say: Callable[[str], None]) -> Training
         except ValueError as error:
             raise ValueError(f"--config {arguments.config}: {error}") from error
         return TrainingConfig.from_arguments(arguments, base)
-    if "folder" not in arguments:
-        arguments.folder = default_models_dir()
     if "resume" in arguments:
         return resume_arguments(arguments, say)
     return TrainingConfig.from_arguments(arguments)

@@ -85,12 +85,12 @@ def factorise(
         now = time.monotonic()
         if now - began > most_seconds:
             raise _StoppedError(
-                f"the factorisations are given up after {now - began:.0f} s, half of the time "
-                "limit; the network learns without them"
+                f"the factorisations are given up after {now - began:.0f} s, to leave time for the "
+                "network, which learns without them"
             )
         if now - reported > _REPORT_SECONDS:
             reported = now
-            on_message(f"factorises since {now - began:.0f} s")
+            on_message(f"still factorising after {now - began:.0f} s")
 
     try:
         found = consensus(points, before_each)
