@@ -138,6 +138,11 @@ def train(
     return _Loop(part, preset, setup, callbacks, checkpointing, saved).train()
 
 
+def _was_taught(saved: dict[str, Tensor]) -> bool:
+    """Return whether factorised shapes teach the training of a checkpoint."""
+    return bool(saved.get(_FACTORISED, 1.0))
+
+
 class _Loop:
     """One call of `train`: the trainer and, while seeds are screened, the best one so far.
 
@@ -164,8 +169,10 @@ class _Loop:
         self.callbacks, self.checkpointing, self.group = callbacks, checkpointing, setup.group
         self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
         factorisation = self.factorisation = self._factorisation(saved)
+        # A training that is stopped while it factorises once more keeps what its checkpoint says.
+        self.is_taught = factorisation is not None if saved is None else _was_taught(saved)
         # Seeds differ in which frames they mirror; factorised shapes leave them no choice.
-        self.screening = recipe.seeds > 1 and setup.start is None and factorisation is None
+        self.screening = recipe.seeds > 1 and setup.start is None and not self.is_taught
         self.first_seed = recipe.seed * (recipe.seeds if self.screening else 1)
         self.trainer = self._trainer(self.first_seed)
         self.leader: Trainer | None = None
@@ -185,7 +192,7 @@ class _Loop:
 
         A training that continues has them again if it had them before, however long they take.
         """
-        had_none = saved is not None and not saved.get(_FACTORISED, torch.ones(()))
+        had_none = saved is not None and not _was_taught(saved)
         if had_none or self.setup.start is not None or self.group.size > 1:
             return None
         calls, limit = self.callbacks, self.clock.limit
@@ -287,7 +294,7 @@ class _Loop:
         """Return all that a training needs to continue, as named tensors."""
         tensors = self.trainer.state() | self.best.state() | self.known_shapes.state()
         tensors["seconds"] = torch.tensor(self.clock.seconds(), dtype=torch.float64)
-        tensors[_FACTORISED] = torch.tensor(float(self.factorisation is not None))
+        tensors[_FACTORISED] = torch.tensor(float(self.is_taught))
         if self.screening:
             tensors["screening"] = torch.tensor(self.leader_error, dtype=torch.float64)
         if self.leader:

@@ -176,3 +176,23 @@ def test_a_training_continues_without_factorisations_if_it_had_none(
     )
     assert trainer.factorisation is None
     assert trainer.step == 10
+
+
+def test_a_stop_while_a_resumed_training_factorises_does_not_end_the_teaching(
+    figure: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    points, file = figure.points[:FRAMES], tmp_path / "checkpoint.safetensors"
+    found: list[Consensus | None] = [agreed(points), None, agreed(points)]
+    monkeypatch.setattr(loop, "factorise", lambda *_, **__: found.pop(0))
+    steps = []
+    for before_stop in (5, 0, 5):
+        stops = iter([False] * before_stop + [True] * 99)
+        trainer = loop.train(
+            points,
+            np.ones(points.shape[:2], bool),
+            preset(seed=1),
+            callbacks=loop.Callbacks(should_stop=stops.__next__),
+            checkpointing=Checkpointing(file),
+        )
+        steps.append((trainer.step, trainer.factorisation is not None))
+    assert steps == [(5, True), (5, False), (10, True)]
