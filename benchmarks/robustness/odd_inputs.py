@@ -126,7 +126,7 @@ def by_train(path: Path, case: Case) -> Answer:
         if warning := validate(config, COMMAND_LINE):
             warnings.append(warning)
         reporter = Recorder(False, lambda: False)
-        dataset = read_data(config, reporter)
+        dataset, _ = read_data(config, reporter)
         layout = HUMAN17
         dataset = check_dataset(dataset, layout, data.image_size, reporter)
     except ValueError as error:

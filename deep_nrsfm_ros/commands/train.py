@@ -49,7 +49,9 @@ def parser() -> argparse.ArgumentParser:
     )
     data.add_argument(
         "--keypoint-layout",
-        help="order of the keypoints in bags and files (default: that of the object)",
+        help="order of the keypoints in bags and files (default: the one that they name; else, for "
+        "people and wherever the training starts from a model, the one that fits best; else that "
+        "of the object)",
     )
     data.add_argument(
         "--min-confidence",

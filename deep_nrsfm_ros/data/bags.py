@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,7 +46,7 @@ STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
 NO_SCORES = "gives no object a score (a field mapping can name it): leave out min_score"
 """Why `min_score` cannot act on a bag."""
 
-_SAMPLE = 256  # messages of a bag that `keypoint_count` looks at
+_SAMPLE = 256  # messages with objects of a topic that `keypoint_count` looks at
 
 
 class TooManyFramesError(BagError):
@@ -174,9 +173,9 @@ _NOTHING = Observation(np.empty((0, 0, 2), np.float32), np.empty((0, 0), np.floa
 def keypoint_count(paths: Sequence[Path], options: ReadOptions = DEFAULT_READ_OPTIONS) -> int:
     """Return the number of keypoints of the objects in bags, for an object without a layout.
 
-    It looks at the first 256 messages of each bag and takes the most frequent number, since a
-    detector may write another number when it detects nothing. For detectors that omit missing
-    keypoints it takes the largest number.
+    It looks at the first 256 messages with objects of each bag and takes the most frequent number,
+    since a detector may write another number when it detects nothing. For detectors that omit
+    missing keypoints it takes the largest number.
 
     Args:
         paths: bag folders, or single .db3 or .mcap files.
@@ -197,7 +196,10 @@ def keypoint_count(paths: Sequence[Path], options: ReadOptions = DEFAULT_READ_OP
                 continue
             for topic, input_type, decode in topics:
                 may_omit |= may_omit_keypoints(input_type)
-                for raw in islice(bag.messages(topic), _SAMPLE):
+                counted = 0
+                for raw in bag.sample(topic):
+                    if counted == _SAMPLE:
+                        break
                     try:
                         message = decode(raw)
                         count = count_keypoints(message, input_type)
@@ -205,11 +207,12 @@ def keypoint_count(paths: Sequence[Path], options: ReadOptions = DEFAULT_READ_OP
                             # Only a readable message counts: damaged ones have any number.
                             read_observation(message, input_type, count, size=(1, 1))
                             counts[count] += 1
+                            counted += 1
                     except Exception as error:  # as in read_bags
                         reason = reason or _reason(error)
     if not counts:
         names = ", ".join(path.name for path in map(Path, paths))
-        nobody = f"its first {_SAMPLE} messages have no object"
+        nobody = "none of its messages has an object"
         raise BagError(
             f"no message in {names} tells how many keypoints there are; {reason or nobody}"
         )

@@ -8,7 +8,7 @@ import gzip
 import io
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -16,8 +16,8 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from deep_nrsfm_ros.batched import Progress
-from deep_nrsfm_ros.data.bag_files import SUFFIXES, open_bag
+from deep_nrsfm_ros.batched import Progress, evenly_spaced, no_progress
+from deep_nrsfm_ros.data.bag_files import SUFFIXES, Topic, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.bags import NO_SCORES, keypoint_count
 from deep_nrsfm_ros.data.detections import Detections, gather
@@ -51,7 +51,9 @@ __all__ = [
     "read_bag",
     "read_keypoints",
     "recordings",
+    "sample_bag",
     "stamp_of",
+    "with_topic",
 ]
 
 
@@ -325,6 +327,7 @@ def _read_frames(
 
 
 _BLOCK = 4096  # objects that are compared at once
+_SAMPLE = 256  # messages of a topic that `sample_bag` reads at least
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 """Images beside the files of their keypoints are no keypoints, and usual."""
@@ -458,6 +461,62 @@ def read_bag(
     detections = gather(ordered, on_one_clock[order], keypoints, camera)
     warnings += clock_warnings
     return dataclasses.replace(detections, layout=layout, warnings=tuple(warnings))
+
+
+def with_topic(path: Path, options: ReadOptions, keypoints: int) -> ReadOptions:
+    """Return the options with the topic to read from a bag.
+
+    Args:
+        path: the bag.
+        options: their topic and mapping are used.
+        keypoints: where several topics may be meant, the only one with so many keypoints is.
+
+    Raises:
+        BagError: the bag cannot be read, has no such topic, or several.
+    """
+    if options.topic:
+        return options
+    with closing(open_bag(path)) as bag:
+        (found,) = keypoint_topics(bag, "", options.mapping, keypoints)
+    return dataclasses.replace(options, topic=found.topic.name)
+
+
+def sample_bag(path: Path, options: ReadOptions, on_progress: Progress = no_progress) -> Detections:
+    """Return the detections in evenly spaced messages of a bag, to see what it holds.
+
+    They have no stamps. Their `layout` is that of `read_bag`.
+
+    Args:
+        path: bag folder, or a single file.
+        options: as of `read_bag`.
+        on_progress: called after every 256 messages.
+
+    Raises:
+        BagError: as in `read_bag`.
+    """
+    layout = options.layout or options.fallback or _implied_by_type(path, options)
+    keypoints = len(layout) if layout else keypoint_count([path], options)
+    observations = []
+    with closing(open_bag(path)) as bag:
+
+        def messages(topic: Topic) -> Iterator[bytes]:
+            for count, raw in enumerate(bag.sample(topic)):
+                if count % 256 == 0:
+                    on_progress(0, max(topic.total, 1))
+                yield raw
+
+        for topic, input_type, decode in keypoint_topics(
+            bag, options.topic, options.mapping, keypoints
+        ):
+            reader = MessageReader(input_type, decode)
+            for raw in evenly_spaced(messages(topic), _SAMPLE):
+                with suppress(Exception):  # damaged bytes fail in many ways; the others do
+                    _, observation = reader(
+                        raw, keypoints, options.min_confidence, options.image_size
+                    )
+                    observations.append(observation.above(options.min_score))
+    sample = gather(observations, range(len(observations)), keypoints)
+    return _finish(dataclasses.replace(sample, layout=layout), options)
 
 
 def _implied_by_type(path: Path, options: ReadOptions) -> KeypointLayout | None:

@@ -43,22 +43,26 @@ class ResolvedLayout(NamedTuple):
     ambiguity: Finding | None = None
 
 
-def resolve_layout(detections: Detections, model: Model) -> ResolvedLayout:
+def resolve_layout(
+    detections: Detections, model: Model, preferred: KeypointLayout | None = None
+) -> ResolvedLayout:
     """Return the layout in which the keypoints fit best.
 
-    The model's own layout is taken unless another one fits clearly better. Of several that fit
+    The preferred layout is taken unless another one fits clearly better. Of several that fit
     equally well, the one that is usual in the input's format is taken.
 
     Args:
         detections: keypoints of which nothing says the layout.
         model: lifts them.
+        preferred: None = the model's own.
 
     Raises:
         ValueError: no layout of that number of keypoints can be lifted by the model.
     """
-    fits = fit_layouts(detections.points, detections.confidence, model)
+    preferred = preferred or model.layout
+    fits = fit_layouts(detections.points, detections.confidence, model, [preferred])
     q = detections.confidence.shape[1]
-    chosen = choose_layout(fits, model.layout)
+    chosen = choose_layout(fits, preferred)
     if chosen:
         usual = detections.usual_layout if is_person(model.layout) else None
         same = (fit for fit in fits if fit.layout is usual and _is_tie(fit, chosen))
@@ -68,10 +72,10 @@ def resolve_layout(detections: Detections, model: Model) -> ResolvedLayout:
         by_format = "usual in files like COCO's, and " * (chosen.layout is usual)
         reason = poor + by_format + _ranking(chosen, fits, model)
         return ResolvedLayout(chosen.layout, reason, rivals)
-    for layout in candidate_layouts(q, model):
+    for layout in candidate_layouts(q, model, [preferred]):
         return ResolvedLayout(layout, f"{q} keypoints; no object has enough of them to try it")
-    if q == len(model.layout):
-        return ResolvedLayout(model.layout, f"the order of the model, {q} keypoints")
+    if q == len(preferred):
+        return ResolvedLayout(preferred, f"the order of {preferred.name}, {q} keypoints")
     raise ValueError(
         f"the objects have {q} keypoints; no layout of {q} keypoints is known that model "
         f"{model.name!r} ({len(model.layout)} keypoints) can lift: name one with --keypoint-layout"

@@ -40,7 +40,7 @@ class DataConfig:
         inputs: files or folders of keypoints of any kind that `lift` reads, beside the bags.
         topic: keypoint topic in the bags, `*` allowed; "" is the only one.
         keypoint_layout: order of the keypoints in bags and files, as `find_layout` takes it; "" is
-            the layout of the model.
+            what they say themselves, or else what fits (see `layout_choice`).
         min_confidence: keypoints of less confidence count as missing, 0 to 1.
         mapping: field mapping (.yaml) for messages of other types; "" is none.
         missing_value, min_score, category: as in `ReadOptions`, for bags and files.

@@ -23,11 +23,11 @@ from deep_nrsfm_ros.lifting.sanity import (
     to_pixels,
 )
 from deep_nrsfm_ros.model_files.model_file import load_model
+from deep_nrsfm_ros.training.layout_choice import PEOPLE
 from deep_nrsfm_ros.training.reporter import Reporter
 
 _PERSON = {"left_hip", "left_ankle", "left_shoulder"}  # keypoints of every layout of people
 _MOST_CHECKED = 100_000  # frames
-_PEOPLE = "human"  # the model that comes with the package
 
 
 def check_dataset(
@@ -58,7 +58,7 @@ def _findings(dataset: Dataset, source: KeypointLayout, image_size: Size | None)
     findings = check(dataset.points, confidence, None, image_size)
     if not set(dataset.layout.keypoints) >= _PERSON:
         return findings
-    model = load_model(_PEOPLE)
+    model = load_model(PEOPLE)
     chosen = np.linspace(0, len(dataset) - 1, min(len(dataset), MAX_OBJECTS)).astype(int)
     lifter = Lifter(model, LiftingOptions(correction="none", test_time_rotations=1))
     mapped = KeypointMap(dataset.layout, model.layout)(dataset.points[chosen], confidence[chosen])

@@ -6,14 +6,14 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.bags import TooManyFramesError, keypoint_count, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
-from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints
+from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints, sample_bag, with_topic
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.share import Share
@@ -24,6 +24,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
 from deep_nrsfm_ros.training.config import COMMAND_LINE, DataConfig, TrainingConfig
 from deep_nrsfm_ros.training.distributed import own_share
+from deep_nrsfm_ros.training.layout_choice import LayoutChoice, detector_layout, layout_choice
 from deep_nrsfm_ros.training.reporter import Reporter
 from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
 
@@ -46,17 +47,43 @@ class Prepared:
         return self.curated.dataset
 
 
-def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
-    """Return the dataset that the configuration names, and report what was lost on the way.
+class Part(NamedTuple):
+    """The objects of bags or of a file.
+
+    Attributes:
+        dataset: in the layout of the model.
+        layout: of the keypoints, as the detector gave them.
+    """
+
+    dataset: Dataset
+    layout: KeypointLayout
+
+
+class ReadData(NamedTuple):
+    """All data of a training.
+
+    Attributes:
+        dataset: in the layout of the model.
+        detector_layout: value of the lifter's `keypoint_layout` for the detector that gave the
+            keypoints; "" where that is the layout of the model, or unknown.
+    """
+
+    dataset: Dataset
+    detector_layout: str
+
+
+def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
+    """Return the data that the configuration names, and report what was lost on the way.
 
     Each of several processes reads its own share of bags and files; all read the motion capture.
+    Where nothing says the keypoint layout of a bag or a file, it is chosen (`layout_choice`).
 
     Raises ValueError where there is no such data, or none that can be read.
     """
     data = config.data
     source, target = find_layouts(config, COMMAND_LINE)
     if data.cmu:
-        return read_split(_selection(data, data.cmu), target, reporter.reading)
+        return ReadData(read_split(_selection(data, data.cmu), target, reporter.reading), "")
     options = ReadOptions(
         topic=data.topic,
         min_confidence=data.min_confidence,
@@ -69,24 +96,22 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> Dataset:
     )
     if config.object == NUMBERED:
         source = target = _numbered(data, options)
-    parts = []
+    choice, keypoint_map = layout_choice(config), KeypointMap(source, target)
+    parts: list[Part] = []
     if data.bags:
-        try:
-            parts.append(_read_bags(data, KeypointMap(source, target), options, reporter))
-        except BagError as error:
-            if isinstance(error, TooManyFramesError) or not data.inputs:
-                raise
-            reporter.warn(f"left out: {error}")
+        parts += _read_bags(data, keypoint_map, options, reporter, choice)
     if data.inputs:
-        parts += _read_inputs(data, KeypointMap(source, target), options, reporter, bool(parts))
-    dataset = concatenate(parts)
+        parts += _read_inputs(data, keypoint_map, options, reporter, choice, bool(parts))
+    if choice:
+        choice.report(reporter)
+    dataset = concatenate([part.dataset for part in parts])
     if len(dataset) > -(-config.limits.max_frames // own_share().size):
         total = len(dataset) * own_share().size
         raise ValueError(
             f"bags and files have {total} frames; at most {config.limits.max_frames} are "
             "read (max_frames); name fewer files, or allow more"
         )
-    return dataset
+    return ReadData(dataset, detector_layout(config, [part.layout for part in parts]))
 
 
 def read_people(
@@ -118,17 +143,47 @@ def _numbered(data: DataConfig, options: ReadOptions) -> KeypointLayout:
 
 
 def _read_bags(
-    data: DataConfig, keypoint_map: KeypointMap, options: ReadOptions, reporter: Reporter
-) -> Dataset:
-    """Return all objects in the bags as one dataset, and report what could not be read."""
-    layouts = keypoint_map.source, keypoint_map.target
-    reading = read_bags(data.bags, *layouts, options, reporter.reading, own_share())
-    for warning in reading.warnings:
-        reporter.warn(warning)
-    if reading.unreadable:
-        count = f"{reading.unreadable} of {reading.messages}"
-        reporter.warn(f"{count} messages could not be read: {reading.reason}")
-    return reading.dataset
+    data: DataConfig,
+    keypoint_map: KeypointMap,
+    options: ReadOptions,
+    reporter: Reporter,
+    choice: LayoutChoice | None,
+) -> list[Part]:
+    """Return the objects in the bags of each layout, and report what could not be read.
+
+    A bag that cannot be read is left out with a warning, unless no data is left.
+    """
+    target, failures, parts = keypoint_map.target, list[ValueError](), list[Part]()
+    groups: dict[tuple[str, ...], tuple[KeypointLayout, list[Path]]] = {}
+    for bag in map(Path.expanduser, data.bags):
+        layout = keypoint_map.source
+        try:
+            if choice:
+                own = with_topic(bag, options, len(target))
+                layout = choice.choose(sample_bag(bag, own, reporter.reading), bag)
+        except ValueError as error:
+            failures.append(error)
+        else:
+            groups.setdefault(layout.keypoints, (layout, []))[1].append(bag)
+    for layout, bags in groups.values():
+        try:
+            reading = read_bags(bags, layout, target, options, reporter.reading, own_share())
+        except TooManyFramesError:
+            raise
+        except ValueError as error:
+            failures.append(error)
+            continue
+        for warning in reading.warnings:
+            reporter.warn(warning)
+        if reading.unreadable:
+            count = f"{reading.unreadable} of {reading.messages}"
+            reporter.warn(f"{count} messages could not be read: {reading.reason}")
+        parts.append(Part(reading.dataset, layout))
+    if not parts and not data.inputs:
+        raise failures[0]
+    for failure in failures:
+        reporter.warn(f"left out: {failure}")
+    return parts
 
 
 def _read_inputs(
@@ -136,9 +191,10 @@ def _read_inputs(
     keypoint_map: KeypointMap,
     options: ReadOptions,
     reporter: Reporter,
+    choice: LayoutChoice | None,
     may_be_none: bool,
-) -> list[Dataset]:
-    """Return the objects in each file as a dataset, those of one identity one after the other.
+) -> list[Part]:
+    """Return the objects in each file, those of one identity one after the other.
 
     So near-duplicates of one person follow one another, as the curation expects. A file that
     cannot be read is left out with a warning, unless no data is left. Where there are several
@@ -151,12 +207,18 @@ def _read_inputs(
     if len(paths) >= share.size:
         paths, share = paths[share.index :: share.size], Share()
     named = keypoint_map.source if data.keypoint_layout and is_only_source else None
-    options = dataclasses.replace(options, layout=named, fallback=keypoint_map.source)
-    parts, failures = [], []
+    fallback = None if choice else keypoint_map.source
+    options = dataclasses.replace(options, layout=named, fallback=fallback)
+    parts, failures = list[Part](), list[ValueError]()
     for path in paths:
         try:
-            detections = read_keypoints(path, _options_for(path, options), reporter.reading)
+            own = _options_for(path, options)
+            if choice and path.exists() and is_bag(path):
+                own = with_topic(path, own, len(keypoint_map.target))
+            detections = read_keypoints(path, own, reporter.reading)
             layout = detections.layout or keypoint_map.source
+            if choice:
+                layout = choice.choose(detections, path)
             to_target = KeypointMap(layout, keypoint_map.target)
             if not len(detections) or not detections.confidence.any():
                 raise ValueError(f"{path}: it has no object with keypoints")
@@ -171,7 +233,8 @@ def _read_inputs(
         starts = np.flatnonzero(np.append(True, identities[1:] != identities[:-1]))
         points, confidence = to_target(detections.points[order], detections.confidence[order])
         visible, source = confidence > 0, f"file {path.name}"
-        parts.append(Dataset(points, visible, keypoint_map.target, source, sequence_starts=starts))
+        dataset = Dataset(points, visible, keypoint_map.target, source, sequence_starts=starts)
+        parts.append(Part(dataset, layout))
     if not parts and not may_be_none:
         raise failures[0]
     for failure in failures:

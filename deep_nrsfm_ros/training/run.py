@@ -43,7 +43,8 @@ class TrainingResult(NamedTuple):
         prepared: the data it was learned from.
         state: "finished" or "cancelled".
         message: one line for people about the end.
-        detector_layout: layout of the keypoints in the data, where it is not that of the model.
+        detector_layout: value of the lifter's `keypoint_layout` for the detector of the data; ""
+            where that is the layout of the model, or the data is of several.
         mapping: field mapping of the messages in the data; "" for none.
         judgement: whether the model should replace the one at hand; None: it was cut off.
         frames: those of the training and those held out; None: nothing is held out.
@@ -80,14 +81,15 @@ def run(
         CancelledError: the training was stopped before anything was learned.
     """
     validate(config, COMMAND_LINE)
-    dataset = read_data(config, reporter)
+    dataset, detector_layout = read_data(config, reporter)
     if not config.data.cmu:
         source, _ = find_layouts(config, COMMAND_LINE)
         dataset = check_dataset(dataset, source, config.data.image_size, reporter)
     prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
     try:
         with _record(config) as checkpoint:
-            return _train_and_save(config, prepared, checkpoint, reporter, should_stop)
+            result = _train_and_save(config, prepared, checkpoint, reporter, should_stop)
+            return result and result._replace(detector_layout=detector_layout)
     except SafetensorError as error:  # neither OSError nor ValueError, though the disk is full
         raise ValueError(unwritable(config.output.folder, error)) from error
 
@@ -136,15 +138,12 @@ def _train_and_save(
         path = path.with_name(f"{model.name}{MODEL_SUFFIX}")
     save_model(path, model)
     ending = _ending(trainer, path, model, checkpoint)
-    named = find_layouts(config, COMMAND_LINE)[0].name
-    detector_layout = config.data.keypoint_layout if named != dataset.layout.name else ""
     return TrainingResult(
         *(model, path, prepared, *ending),
-        detector_layout,
-        config.data.mapping,
-        judgement,
-        None if frames.held_out is frames.training else frames,
-        rival,
+        mapping=config.data.mapping,
+        judgement=judgement,
+        frames=None if frames.held_out is frames.training else frames,
+        rival=rival,
     )
 
 

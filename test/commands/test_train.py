@@ -358,7 +358,7 @@ def test_the_ground_truth_is_not_read(
     found = []
     for shapes in (None, np.full((60, 17, 3), np.nan, np.float32)):
         dataset = Dataset(points, confidence > 0, COCO17, "made up", shapes)
-        monkeypatch.setattr(run, "read_data", lambda config, reporter, e=dataset: e)
+        monkeypatch.setattr(run, "read_data", lambda config, reporter, e=dataset: (e, ""))
         assert in_process(*arguments, "--steps", "5") == 0
         found.append(load_model(models / "mine.safetensors"))
     assert found[0].quality == found[1].quality

@@ -80,12 +80,12 @@ def write_files(folder: Path) -> None:
 
 def read(*words: str) -> Dataset:
     """Return the data that a command line names."""
-    return read_data(TrainingConfig.from_arguments(parser().parse_args(words)), REPORTER)
+    return read_data(TrainingConfig.from_arguments(parser().parse_args(words)), REPORTER).dataset
 
 
 def test_files_are_trained_on_as_bags_are(tmp_path: Path) -> None:
     write_files(tmp_path)
-    points, layout = pixels(6), ("--object", "human17")
+    points, layout = pixels(6), ("--object", "human17", "--keypoint-layout", "human17")
     for name in ("a.npz", "openpose", "bag"):
         np.testing.assert_array_equal(read("--input", f"{tmp_path}/{name}", *layout).points, points)
     by_identity = read("--input", f"{tmp_path}/coco.json", *layout)
@@ -103,7 +103,8 @@ def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
     write_files(tmp_path)
     (tmp_path / "notes.txt").write_text("no recording")
     (tmp_path / "pictures").mkdir()
-    everything = read("--input", str(tmp_path), "--object", "human17")
+    layout = ("--object", "human17", "--keypoint-layout", "human17")
+    everything = read("--input", str(tmp_path), *layout)
     points = pixels(6)
     expected = [points, points, points[[1, 3, 5, 0, 2, 4]], points]
     np.testing.assert_allclose(everything.points, np.concatenate(expected), rtol=1e-6)
