@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print where the nose of each lifted person is: a subscriber to copy."""
 
-from contextlib import suppress
+import signal
+
+stop: list[int] = []  # gets the signal of Ctrl-C, also during the other imports
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda number, _: stop.append(number))
+
 
 import numpy as np
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
 from deep_nrsfm_ros import load_model
@@ -22,9 +27,10 @@ def show(message: PointCloud2) -> None:
         print(f"{x:.3f} {y:.3f} {z:.3f}, confidence {confidence:.2f}", flush=True)
 
 
-rclpy.init()
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # its own ones break a call
 node = Node("reader")
 node.create_subscription(PointCloud2, "lifter/points", show, qos_profile_sensor_data)
 print("waiting for points of the lifter on /lifter/points", flush=True)
-with suppress(KeyboardInterrupt, ExternalShutdownException):
-    rclpy.spin(node)
+while not stop:
+    rclpy.spin_once(node, timeout_sec=0.1)
+rclpy.shutdown()

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publish keypoints of one person to the lifter, 30 times a second: put your detector in here."""
 
-from contextlib import suppress
+import signal
+
+stop: list[int] = []  # gets the signal of Ctrl-C, also during the other imports
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda number, _: stop.append(number))
+
 from itertools import cycle
 
 import numpy as np
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2, PointField
 
 from deep_nrsfm_ros.data.clip import read_clip
@@ -28,9 +33,10 @@ def send() -> None:
     publisher.publish(message)
 
 
-rclpy.init()
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # its own ones break a call
 node = Node("detector")
 publisher = node.create_publisher(PointCloud2, "keypoints", 10)
 node.create_timer(1 / 30, send)
-with suppress(KeyboardInterrupt, ExternalShutdownException):
-    rclpy.spin(node)
+while not stop:
+    rclpy.spin_once(node, timeout_sec=0.1)
+rclpy.shutdown()

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from deep_nrsfm_ros.commands.demo.domain import take_domain
 
@@ -46,6 +47,61 @@ def test_the_notebook_lifts_draws_and_trains() -> None:
             exec("".join(cell["source"]), variables)
     assert variables["lifted"].shapes.shape == (100, 25, 3)
     assert variables["mine"].name == "mine"
+
+
+INTERRUPTED = """
+import builtins, os, runpy, signal, sys, time
+moment, script = sys.argv[1:]
+original = builtins.__import__
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.5)  # until all handlers have run
+
+def import_slowly(name, *args, **others):
+    if name == "rclpy" and moment == "imports" and not sent:
+        sent.append(name)
+        interrupt()
+    return original(name, *args, **others)
+
+def publish(self, message):
+    interrupt()
+    publish_really(self, message)
+
+sent = []
+builtins.__import__ = import_slowly
+if moment == "publish":
+    from rclpy.publisher import Publisher
+    publish_really, Publisher.publish = Publisher.publish, publish
+runpy.run_path(script, run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(
+    ("moment", "name"),
+    [
+        ("imports", "publish_keypoints"),
+        ("imports", "print_points"),
+        ("imports", "elbow_angle"),
+        ("publish", "publish_keypoints"),
+    ],
+)
+def test_an_interrupt_at_any_moment_ends_an_example_without_an_error(
+    moment: str, name: str
+) -> None:
+    live = environment() | {
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(take_domain()),
+    }
+    command = [sys.executable, "-W", "ignore", "-c", INTERRUPTED, moment]
+    ended = subprocess.run(
+        [*command, str(EXAMPLES / f"{name}.py")],
+        env=live,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_a_published_person_is_printed(tmp_path: Path) -> None:
