@@ -30,7 +30,7 @@ from deep_nrsfm_ros.data.recording import Recording, lift_recording
 from deep_nrsfm_ros.data.resolve_layout import check_names, resolve_layout
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.lifter import Lifter, check_min_visible
 from deep_nrsfm_ros.lifting.options import GravityOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import Finding, Size, is_person
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
@@ -145,6 +145,7 @@ def check_options(args: argparse.Namespace, model: Model) -> None:
         )
     if args.rectified and not args.intrinsics:
         raise ValueError("--rectified has no effect without --intrinsics: it chooses P there")
+    check_min_visible("--min-visible", lifting.min_visible, model)
     if "noise" in args and lifting.correction == "none":
         raise ValueError("--noise has no effect with --correction none: leave one out")
     if reason := lifting.unused_height(model.layout):

@@ -110,7 +110,7 @@ class Lifter:
 
         Raises:
             ValueError: the model or the layout does not exist, they share fewer than 4 keypoints,
-                or an option is out of its range.
+                or an option is out of its range or asks for more keypoints than the model has.
             TypeError: an argument is of another type.
         """
         if isinstance(model, (str, Path)):
@@ -121,6 +121,7 @@ class Lifter:
             )
         self.model = model
         self.options = _checked("options", options, LiftingOptions)
+        check_min_visible("min_visible", self.options.min_visible, model)
         history = _checked("history", history, HistoryOptions)
         if isinstance(layout, str):
             layout = find_layout("layout", layout)
@@ -249,6 +250,28 @@ def _checked(argument: str, given: Any, cls: type[_Options]) -> _Options:
         raise TypeError(f"{argument} is a {type(given).__name__}; give {cls.__name__}(NAME=VALUE)")
     check(given)
     return given
+
+
+def check_min_visible(name: str, min_visible: int, model: Model) -> None:
+    """Raise ValueError if no object can have as many detected keypoints as an option asks for.
+
+    The default is allowed for every model.
+
+    Args:
+        name: of the option, for the error text.
+        min_visible: as in `LiftingOptions`.
+        model: lifts the objects.
+    """
+    p = len(model.layout)
+    own = KeypointMap(model.layout, model.layout)
+    most = int(own.detected_count(np.ones((1, p), bool))[0])
+    if min_visible <= max(most, LiftingOptions.min_visible):
+        return
+    following = f", of which {p - most} follow from others and do not count" * (most < p)
+    raise ValueError(
+        f"{name} is {min_visible}, but model {model.name!r} has {p} keypoints{following}: no "
+        f"object would be lifted; set it to at most {most}, 4 is typical"
+    )
 
 
 def _mirrored_context(context: Context) -> Context:

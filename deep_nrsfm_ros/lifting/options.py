@@ -63,7 +63,7 @@ class LiftingOptions:
         4,
         "fewest detected keypoints with which an object is lifted; a keypoint that follows from "
         "others does not count, as a neck between two visible shoulders, nor does one whose "
-        "confidence is far below that of the others; 4 typical",
+        "confidence is far below that of the others; at most as many as the model has, 4 typical",
         low=3,
         high=1000,
     )

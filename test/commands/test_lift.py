@@ -253,6 +253,7 @@ SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
         ({"names": ONE_SIDE}, (), 3, "8 right_ keypoints of model 'human' and no left_ one"),
         ({"names": np.char.add("p", np.arange(17).astype(str))}, (), 2, "are named p0, p1, p2, p3"),
         ({}, ("--image-width", "640"), 2, "--image-height is 0: the size of the image needs both"),
+        ({}, ("--min-visible", "40"), 2, "--min-visible is 40, but model 'human' has 25 keypoi"),
         ({}, ("--rectified",), 2, "--rectified has no effect without --intrinsics"),
         ({}, ("--correction", "none", "--noise", "0.1"), 2, "--noise has no effect"),
         (

@@ -194,6 +194,16 @@ def test_refilling_brings_the_missing_points_closer(figure_model: Model, figure:
     assert errors[2].proper < 0.8 * errors[0].proper
 
 
+def test_more_visible_points_than_a_model_has_are_refused() -> None:
+    model = random_model()
+    with pytest.raises(ValueError, match=r"min_visible is 40, .* 17 keypoints, .*at most 15"):
+        Lifter(model, LiftingOptions(min_visible=40))
+    with pytest.raises(ValueError, match="min_visible is 16"):  # neck and mid-hip follow
+        Lifter(model, LiftingOptions(min_visible=16))
+    points, confidence = pixels()
+    assert np.isfinite(Lifter(model, LiftingOptions(min_visible=15))(points, confidence)[0]).all()
+
+
 @pytest.mark.parametrize("min_visible", [3, 4, 7])
 def test_too_few_visible_points_are_not_lifted_and_disturb_nobody(min_visible: int) -> None:
     points, confidence = pixels(missing=0.3)

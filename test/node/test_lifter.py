@@ -346,6 +346,8 @@ def test_parameters_change_what_the_next_message_gets(
     assert "read-only" in client.set_parameters(models_dir="/tmp")
     assert "read-only" in client.set_parameters(input_type=POLYGON)
     assert "at most 1" in client.set_parameters(min_confidence=2)
+    refusal = client.set_parameters(min_visible=40)
+    assert "min_visible is 40, but model" in refusal and "set it to at most 15" in refusal
     refusal = client.set_parameters(gravity__up=[0.0, float("nan"), 0.0])
     assert "gravity.up is [0.0, nan, 0.0]; it must be three finite numbers" in refusal
     assert unpack(client.exchange(publisher, human)).shape == (1, P, 4)
@@ -482,4 +484,13 @@ def test_signals_end_it_cleanly(
     client.exchange(client.publisher(PointCloud2), cloud(pixels(1)))
     lifter.process.send_signal(number)  # a launcher and the terminal both send one
     assert lifter.stop(number, "twice while lifting") == 0, lifter.log
+    assert "Traceback" not in lifter.log
+
+
+def test_it_does_not_start_with_more_visible_keypoints_than_the_model_has(
+    start_lifter: StartLifter,
+) -> None:
+    lifter = start_lifter(listens=False, min_visible=40)
+    assert lifter.process.wait(60) == 1
+    assert "cannot start: min_visible is 40, but model" in lifter.log
     assert "Traceback" not in lifter.log
