@@ -28,6 +28,12 @@ _CERTAIN, _MISSING = np.float32(1), np.float32(0)
 Identities = tuple[str | None, ...]
 """Identity of each object; None for an object without one, () if no object has one."""
 
+NAME_THE_LAYOUT = (
+    "name the layout in which the detector gives them (parameter keypoint_layout, option "
+    "--keypoint-layout)"
+)
+"""The remedy for another number of keypoints than the layout has, for error texts."""
+
 
 class MessageError(ValueError):
     """A message that cannot be used; the text says what was expected and what was received."""
@@ -206,5 +212,5 @@ def check_keypoints(count: int, keypoints: int, field: str) -> None:
     if count != keypoints:
         raise MessageError(
             f"message has {count} keypoints ({field}); the keypoint layout has {keypoints}: "
-            "name the layout in which the detector gives them (keypoint_layout)"
+            + NAME_THE_LAYOUT
         )

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.lifting.observation import (
+    NAME_THE_LAYOUT,
     MessageError,
     Observation,
     check_keypoints,
@@ -130,8 +131,8 @@ def count_keypoints(message: Any, input_type: InputType) -> int:
     if not numbers or len(counts) == 1:
         return counts[0]
     raise MessageError(
-        f"data has {numbers} numbers and no layout; give it one, so that (x, y) can be told from "
-        "(x, y, confidence)"
+        f"data has {numbers} numbers and no dimensions; give it them (layout.dim), keypoints x 2 "
+        "or 3, so that (x, y) can be told from (x, y, confidence)"
     )
 
 
@@ -200,8 +201,8 @@ def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:
     if len(shape) < 2:
         if len(data) not in (2 * keypoints, 3 * keypoints):
             raise MessageError(
-                f"data has {len(data)} numbers and no layout; {keypoints} keypoints need "
-                f"{2 * keypoints} (x, y) or {3 * keypoints} (x, y, confidence)"
+                f"data has {len(data)} numbers and no dimensions (layout.dim); {keypoints} "
+                f"keypoints need {2 * keypoints} (x, y) or {3 * keypoints} (x, y, confidence)"
                 + _remedy(len(data), keypoints)
             )
         shape = [keypoints, len(data) // keypoints]
@@ -219,8 +220,11 @@ def _multi_array(message: Any, keypoints: int) -> NDArray[np.floating]:
 def _remedy(numbers: int, keypoints: int) -> str:
     """Return what to do about another count of numbers than the layout has, for error texts."""
     if numbers and (numbers % (2 * keypoints) == 0 or numbers % (3 * keypoints) == 0):
-        return ": give the data of several objects dimensions, objects x keypoints x 2 or 3"
-    return ": name the layout in which the detector gives them"
+        return (
+            ": give the data of several objects dimensions (layout.dim), objects x keypoints x 2 "
+            "or 3"
+        )
+    return f": {NAME_THE_LAYOUT}"
 
 
 def _polygon(message: Any, keypoints: int) -> NDArray[np.floating]:

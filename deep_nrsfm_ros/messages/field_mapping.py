@@ -17,7 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.lifting.observation import Identities, MessageError, check_keypoints
+from deep_nrsfm_ros.lifting.observation import (
+    NAME_THE_LAYOUT,
+    Identities,
+    MessageError,
+    check_keypoints,
+)
 from deep_nrsfm_ros.messages.field_path import FieldPath, describe, fields_of, is_sequence
 
 PIXELS, NORMALISED = "pixels", "normalised"
@@ -364,7 +369,7 @@ class FieldMapping:
             check_keypoints(len(row), keypoints, self._source)
         remedy = f"write {self._source}[:{filled}] in the mapping, or set count"
         if filled != keypoints:
-            remedy += ", and name the layout in which the detector gives them"
+            remedy += f", and {NAME_THE_LAYOUT}"
         raise MessageError(
             f"message has {len(row)} places for keypoints ({self._source}), of which the first "
             f"{filled} are filled; the keypoint layout has {keypoints}: {remedy}"

@@ -361,7 +361,7 @@ def test_arrays_tell_how_many_keypoints_they_have(
 @pytest.mark.parametrize("numbers", [7, 12])
 def test_plain_numbers_that_fit_twice_or_never_tell_nothing(numbers: int) -> None:
     message = Float32MultiArray(data=array("f", range(numbers)))
-    with pytest.raises(MessageError, match=f"{numbers} numbers and no layout; give it one"):
+    with pytest.raises(MessageError, match=f"{numbers} numbers and no dimensions; give it them"):
         count_keypoints(message, MULTI_ARRAY)
 
 
@@ -378,8 +378,8 @@ def test_the_layout_is_not_blamed_for_what_is_turned_or_in_one_row() -> None:
         read_observation(message, POINT_CLOUD, 5)
     for sizes, count, reason in (
         ((2, 5), 10, "2 x 5, send them as 5 x 2"),
-        ((), 30, "give the data of several objects dimensions"),
-        ((), 34, "name the layout in which the detector gives them"),
+        ((), 30, r"give the data of several objects dimensions \(layout.dim\)"),
+        ((), 34, "name the layout .*parameter keypoint_layout, option --keypoint-layout"),
     ):
         dim = [SimpleNamespace(size=size) for size in sizes]
         layout = SimpleNamespace(data_offset=0, dim=dim)
