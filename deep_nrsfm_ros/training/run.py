@@ -81,11 +81,16 @@ def run(
         CancelledError: the training was stopped before anything was learned.
     """
     validate(config, COMMAND_LINE)
-    dataset, detector_layout = read_data(config, reporter)
-    if not config.data.cmu:
-        source, _ = find_layouts(config, COMMAND_LINE)
-        dataset = check_dataset(dataset, source, config.data.image_size, reporter)
-    prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
+    try:
+        dataset, detector_layout = read_data(config, reporter)
+        if not config.data.cmu:
+            source, _ = find_layouts(config, COMMAND_LINE)
+            dataset = check_dataset(dataset, source, config.data.image_size, reporter)
+        prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
+    except (ValueError, OSError) as error:
+        if should_stop():  # whoever stopped it meanwhile does not ask what the data is like
+            raise CancelledError from error
+        raise
     try:
         with _record(config) as checkpoint:
             result = _train_and_save(config, prepared, checkpoint, reporter, should_stop)

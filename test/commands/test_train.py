@@ -208,6 +208,33 @@ def test_the_curation_can_be_stopped(
     assert not list(models.glob("*"))
 
 
+@pytest.mark.parametrize("unusable", ["dark file", "dark bag", "unreadable bag"])
+def test_data_that_nobody_can_train_on_does_not_turn_a_stop_into_a_failure(
+    unusable: str,
+    tmp_path: Path,
+    models: Path,
+    in_process: RunTraining,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    points, confidence = people()
+    path = tmp_path / "data.npz" if unusable == "dark file" else tmp_path / "data"
+    layout = "body25" if unusable == "unreadable bag" else "coco17"
+    if unusable == "dark file":  # no progress is reported while it is read
+        np.savez(path, points=points, confidence=0 * confidence)
+    else:
+        write_bag(path, "/keypoints", frames(points, confidence * (layout == "body25")))
+    option = "--input" if unusable == "dark file" else "--bag"
+    words = (option, str(path), "--keypoint-layout", layout, "--output", str(models))
+    assert in_process(*words, *QUICK, "--json-progress") == 2
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["state"] == "failed"
+    monkeypatch.setattr(train, "stop_on_signals", lambda: lambda: True)
+    assert in_process(*words, *QUICK, "--json-progress") == 0
+    (*_, end) = map(json.loads, capsys.readouterr().out.splitlines())
+    assert end["state"] == "cancelled" and "nothing had been learned" in end["message"]
+    assert not list(models.glob("*"))
+
+
 def test_without_resume_it_begins_anew(
     arguments: list[str],
     models: Path,
