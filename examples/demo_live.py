@@ -34,7 +34,7 @@ TOPIC = "/keypoints"
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog="demo_live", description=__doc__)
+    parser = argparse.ArgumentParser(prog="demo_live", description=__doc__, allow_abbrev=False)
     parser.add_argument("--cache", type=Path, default=Path(".cache"), help="folder of downloads")
     parser.add_argument("--output", type=Path, default=Path("demo_output/live"), help="results")
     parser.add_argument("--model", default="human", help="name or path of the model")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from deep_nrsfm_ros import __version__
-from deep_nrsfm_ros.commands.program import called_as
+from deep_nrsfm_ros.commands.program import Parser, called_as
 from deep_nrsfm_ros.model_files.folders import PACKAGE
 from deep_nrsfm_ros.similar_names import did_you_mean
 
@@ -31,7 +31,7 @@ _WIDTH = max(map(len, PROGRAMS)) + 2
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of what stands before the arguments of a program."""
     listed = "\n".join(f"  {name:{_WIDTH}}{line}" for name, line in PROGRAMS.items())
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=_name(),
         usage="%(prog)s [-h] [--version] COMMAND ...",
         description="2D keypoints in, 3D shape and camera out, learned from 2D alone.",

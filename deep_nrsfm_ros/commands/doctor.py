@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.extras import how_to_install, is_installed
 from deep_nrsfm_ros.training.limits import Limits
@@ -220,7 +220,7 @@ def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     from deep_nrsfm_ros.model_files.folders import default_models_dir
 
-    parser = argparse.ArgumentParser(prog=program_name("doctor"), description=__doc__)
+    parser = Parser(prog=program_name("doctor"), description=__doc__)
     parser.add_argument("--model", default=SHIPPED, help="model to lift with (default: human)")
     parser.add_argument(
         "--models-dir", type=Path, default=default_models_dir(), help="folder of your own models"

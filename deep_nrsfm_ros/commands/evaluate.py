@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.mocap import HEIGHT_18, TrialSelection, read_split
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
@@ -56,9 +56,7 @@ _DEFAULTS: dict[str, Any] = {"subjects": ["01"], "split": "train", "stride": 1, 
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog=program_name("evaluate"), description=f"{__doc__} {LABEL_FREE}"
-    )
+    parser = Parser(prog=program_name("evaluate"), description=f"{__doc__} {LABEL_FREE}")
     parser.add_argument("models", nargs="+", help="model files, or names of models")
     parser.add_argument(
         "--models-dir",

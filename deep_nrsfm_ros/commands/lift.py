@@ -18,7 +18,7 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from deep_nrsfm_ros.commands.lift_summary import Summary, summarise
-from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.configuration import add_arguments, override
 from deep_nrsfm_ros.data.camera_file import read_camera_file, read_image_size
 from deep_nrsfm_ros.data.detections import Detections
@@ -58,7 +58,7 @@ class Camera(NamedTuple):
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=program_name("lift"),
         usage="%(prog)s [options] INPUT --output OUTPUT (--help lists the options)",
         description=__doc__,

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 
@@ -34,9 +34,7 @@ class Listed(NamedTuple):
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog=program_name("models"), description=f"{__doc__} {EXPLANATION}."
-    )
+    parser = Parser(prog=program_name("models"), description=f"{__doc__} {EXPLANATION}.")
     parser.add_argument(
         "--models-dir",
         type=Path,

@@ -1,17 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all programs have in common: how they end early, and their name in usages."""
+"""What all programs have in common: their parser, how they end early, their name in usages."""
 
 from __future__ import annotations
 
+import argparse
 import functools
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, NoReturn
+
+from deep_nrsfm_ros.similar_names import did_you_mean
 
 Main = Callable[[Sequence[str] | None], None]
 
 _called_as = ""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that takes options by their whole names only, and names those that may be meant.
+
+    Completed by argparse, `--mirror` would be `--mirrored` until there is another such option.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        """Take the keyword arguments of `argparse.ArgumentParser`."""
+        super().__init__(allow_abbrev=False, **settings)
+
+    def error(self, message: str) -> NoReturn:
+        """Print an error and exit with code 2."""
+        if unknown := re.match(r"unrecognized arguments:.*?(--[\w-]+)", message, re.DOTALL):
+            known = [option for option in self._option_string_actions if option[:2] == "--"]
+            begun = [option for option in known if option.startswith(unknown[1])]
+            hint = did_you_mean(unknown[1], known)
+            if begun:  # as argparse would complete it
+                hint = f"did you mean {' or '.join(map(repr, begun))}?"
+            message += f"; {hint}" if hint else ""
+        super().error(message)
 
 
 def program(main: Main) -> Callable[..., None]:

@@ -20,7 +20,7 @@ from deep_nrsfm_ros.commands.lift import (
     summary_of,
     warn,
 )
-from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.configuration import options, override
 from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.detections import Detections
@@ -50,7 +50,7 @@ _DIAGNOSTICS_WAIT = 5.0  # seconds; a lifter sends them once a second
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog=program_name("replay"), description=__doc__)
+    parser = Parser(prog=program_name("replay"), description=__doc__)
     parser.add_argument(
         "input",
         type=Path,

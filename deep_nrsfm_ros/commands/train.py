@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.configuration import add_arguments
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.keypoint_files import KINDS
@@ -33,7 +33,7 @@ from deep_nrsfm_ros.training.run import TrainingResult, run
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line: an option that is not given leaves no attribute."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog=program_name("train"), description=__doc__, argument_default=argparse.SUPPRESS
     )
     data = parser.add_argument_group("Data (bags and files, or motion capture)")

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
+from deep_nrsfm_ros.commands import doctor, evaluate, lift, models, replay, train
+from deep_nrsfm_ros.commands.demo import first_look
 from deep_nrsfm_ros.commands.program import program
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
@@ -52,3 +55,29 @@ def test_ctrl_c_ends_a_program_with_a_word(capsys: pytest.CaptureFixture[str]) -
         main([])
     assert end.value.code == 130
     assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize(
+    ("parser", "words", "hint"),
+    [
+        (lift.arguments, "a.npy --output b.npz --mirror", "did you mean '--mirrored'?"),
+        (lift.arguments, "a.npy --output b.npz --intrinsic=c.yaml", "'--intrinsics'?"),
+        (lift.arguments, "a --output b --key coco17", "did you mean '--keypoint-layout'?"),
+        (replay.arguments, "a.npy --ht", "did you mean '--html'?"),
+        (train.parser, "--keypoint-layuot coco17", "did you mean '--keypoint-layout'?"),
+        (models.arguments, "--models-folder x", "did you mean '--models-dir'?"),
+        (doctor.arguments, "--time 3", "did you mean '--timeout'?"),
+        (evaluate.arguments, "human --subject 01", "did you mean '--subjects'?"),
+        (first_look.arguments, "--nothing-like-it", "unrecognized arguments: --nothing-like-it"),
+    ],
+)
+def test_an_option_is_taken_by_its_whole_name_only(
+    parser: Callable[[], argparse.ArgumentParser],
+    words: str,
+    hint: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        parser().parse_args(words.split())
+    (line,) = capsys.readouterr().err.splitlines()[-1:]
+    assert "unrecognized arguments: --" in line and line.endswith(hint)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.commands.program import program, program_name
+from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.data.clip import Clip, read_clip
 from deep_nrsfm_ros.data.detections import gather, stamps_at
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, View
@@ -43,7 +43,7 @@ _NOTES = (
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(prog=program_name("demo"), description=__doc__)
+    parser = Parser(prog=program_name("demo"), description=__doc__)
     parser.add_argument(
         "--output", type=Path, default=Path("demo_output"), help="folder of the results"
     )
