@@ -216,8 +216,10 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
         raise ValueError(_no_object(args.input, len(detections.stamps)))
     chosen = detections.largest() if args.objects == "largest" else detections
     if detections.layout:
-        found = (*detections.findings, *check_names(detections.layout, model))
-        return Objects(chosen, detections.layout, found)
+        names = check_names(detections.layout, model.layout, f"model {model.name!r}")
+        for warning in names.warnings:
+            warn(warning)
+        return Objects(chosen, detections.layout, (*detections.findings, *names.findings))
     layout, reason, ambiguity = resolve_layout(chosen, model)
     note(f"keypoint layout {layout.name}: {reason}")
     found = (*detections.findings, *([ambiguity] if ambiguity else []))

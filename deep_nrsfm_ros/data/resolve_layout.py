@@ -11,6 +11,7 @@ from deep_nrsfm_ros.data.formats.names import (
     NAMED_BY_INPUT,
     are_mostly_known,
     misspelt,
+    unknown_names,
 )
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -82,51 +83,73 @@ def resolve_layout(
     )
 
 
-def check_names(layout: KeypointLayout, model: Model) -> list[Finding]:
-    """Return what looks wrong in the names that an input gives its keypoints.
+class NameCheck(NamedTuple):
+    """What is to be said of the names that an input gives its keypoints.
+
+    Attributes:
+        findings: what looks wrong.
+        warnings: sentences about what may be meant so.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def check_names(layout: KeypointLayout, target: KeypointLayout, owner: str) -> NameCheck:
+    """Return what is to be said of the names that an input gives its keypoints.
 
     Args:
         layout: of the input.
-        model: lifts its keypoints.
+        target: layout to which the keypoints are mapped.
+        owner: what has that layout, for the texts: "model 'human'".
 
     Raises:
-        ValueError: the model has too few keypoints of these names.
+        ValueError: the target has too few keypoints of these names.
     """
     if layout.name != NAMED_BY_INPUT:
-        return []
-    names, wanted = layout.keypoints, model.layout.keypoints
+        return NameCheck()
+    names, wanted = layout.keypoints, target.keypoints
     close = misspelt(names, wanted)
     guesses = ", ".join(f"{name} ({other}?)" for name, other in list(close.items())[:_SHOWN])
     guesses += ", ..." * (len(close) > _SHOWN)
     try:
-        filled = KeypointMap(layout, model.layout).filled
+        filled = KeypointMap(layout, target).filled
     except ValueError:
         raise ValueError(
-            f"its keypoints are named {_shown(names)}, and those of model {model.name!r} "
+            f"its keypoints are named {_shown(names)}, and those of {owner} "
             f"{_shown(wanted)}: rename them{f', such as {guesses}' if guesses else ''}, or name "
             "the layout in whose order they are with --keypoint-layout"
         ) from None
-    findings = []
+    findings, warnings = list[Finding](), list[str]()
     if close and are_mostly_known(names, wanted):
         findings.append(
             Finding(
                 "misspelt",
-                f"{len(close)} of {len(names)} names of keypoints are unknown, and model "
-                f"{model.name!r} lacks those that are nearly the same: {guesses}; correct them",
+                f"{len(close)} of {len(names)} names of keypoints are unknown, and {owner} lacks "
+                f"those that are nearly the same: {guesses}; correct them",
             )
         )
+    unknown = unknown_names(names, wanted)
     for side, other in (("left", "right"), ("right", "left")):
         count = sum(name.startswith(f"{side}_") for name in wanted)
         seen = sum(name.startswith(f"{other}_") for name in filled)
-        if count >= _LIMBS <= seen and not any(name.startswith(f"{side}_") for name in filled):
-            findings.append(
-                Finding(
-                    "one-side",
-                    f"the input names {seen} {other}_ keypoints of model {model.name!r} and no "
-                    f"{side}_ one: that side is guessed; check the names",
-                )
+        if count < _LIMBS or seen < _LIMBS or any(name.startswith(f"{side}_") for name in filled):
+            continue
+        if len(unknown) < _LIMBS:
+            warnings.append(
+                f"the input names {seen} {other}_ keypoints of {owner} and no {side}_ one: that "
+                "side is guessed"
             )
-    return findings
+            continue
+        findings.append(
+            Finding(
+                "one-side",
+                f"the input names {seen} {other}_ keypoints of {owner} and no {side}_ one, but "
+                f"{len(unknown)} unknown ones ({_shown(unknown)}): that side is guessed; rename "
+                "those that belong to it",
+            )
+        )
+    return NameCheck(tuple(findings), tuple(warnings))
 
 
 def _shown(names: Sequence[str]) -> str:

@@ -16,6 +16,7 @@ from deep_nrsfm_ros.data.dataset import Dataset, concatenate
 from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints, sample_bag, with_topic
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.read_options import ReadOptions
+from deep_nrsfm_ros.data.resolve_layout import NameCheck, check_names
 from deep_nrsfm_ros.data.share import Share
 from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
 from deep_nrsfm_ros.data.virtual_people import read_virtual_people
@@ -219,13 +220,14 @@ def _read_inputs(
             layout = detections.layout or keypoint_map.source
             if choice:
                 layout = choice.choose(detections, path)
-            to_target = KeypointMap(layout, keypoint_map.target)
+            names, to_target = _match_names(path, layout, keypoint_map.target)
             if not len(detections) or not detections.confidence.any():
                 raise ValueError(f"{path}: it has no object with keypoints")
         except ValueError as error:  # of one file: the others may do
             failures.append(error)
             continue
-        for warning in (*detections.warnings, *map(str, detections.findings)):
+        found = (*detections.findings, *names.findings)
+        for warning in (*detections.warnings, *names.warnings, *map(str, found)):
             reporter.warn(f"{path.name}: {warning}")
         order = np.lexsort((detections.frame, detections.identities))
         order = order[share.rows(len(order))]
@@ -240,6 +242,16 @@ def _read_inputs(
     for failure in failures:
         reporter.warn(f"left out: {failure}")
     return parts
+
+
+def _match_names(
+    path: Path, layout: KeypointLayout, target: KeypointLayout
+) -> tuple[NameCheck, KeypointMap]:
+    """Return what is to be said of the names in a file, and the map to the layout of the model."""
+    try:
+        return check_names(layout, target, f"object {target.name!r}"), KeypointMap(layout, target)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _options_for(path: Path, options: ReadOptions) -> ReadOptions:

@@ -234,6 +234,7 @@ def test_the_size_of_the_image_acts_on_every_input(
 POINTS, CONFIDENCE = in_layout(COCO17)
 NAMES = np.array(COCO17.keypoints)
 ONE_SIDE = np.array([name.replace("left", "loose") for name in COCO17.keypoints])
+LEFT = np.array([not name.startswith("right") for name in COCO17.keypoints])
 SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
 
 
@@ -250,7 +251,13 @@ SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
         ({"points": POINTS[:0], "confidence": CONFIDENCE[:0]}, (), 2, "has no object"),
         ({"names": np.char.replace(NAMES, "knee", "knie")}, (), 3, "left_knie (left_knee?), right"),
         ({"names": np.char.replace(NAMES, "ear", "hearing")}, (), 0, ""),
-        ({"names": ONE_SIDE}, (), 3, "8 right_ keypoints of model 'human' and no left_ one"),
+        ({"names": ONE_SIDE}, (), 3, "no left_ one, but 8 unknown ones (loose_eye, loose_ear, "),
+        (
+            {"points": POINTS[:, LEFT], "confidence": CONFIDENCE[:, LEFT], "names": NAMES[LEFT]},
+            (),
+            0,
+            "the input names 8 left_ keypoints of model 'human' and no right_ one: that side is",
+        ),
         ({"names": np.char.add("p", np.arange(17).astype(str))}, (), 2, "are named p0, p1, p2, p3"),
         ({}, ("--image-width", "640"), 2, "--image-height is 0: the size of the image needs both"),
         ({}, ("--min-visible", "40"), 2, "--min-visible is 40, but model 'human' has 25 keypoi"),

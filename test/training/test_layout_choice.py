@@ -184,3 +184,28 @@ def test_every_layout_of_people_is_found(tmp_path: Path) -> None:
         found = read("--input", write(tmp_path / f"{name}.npz", LAYOUTS[name]))
         np.testing.assert_allclose(found.dataset.points, expected(LAYOUTS[name]), rtol=1e-5)
         assert found.detector_layout == ("" if name == "human25" else name)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("knee", "knie", "lacks those that are nearly the same: left_knie (left_knee?), right_kn"),
+        ("left", "loose", "8 right_ keypoints of object 'human25' and no left_ one, but 8 unknown"),
+        ("", "", ""),
+    ],
+)
+def test_names_that_look_wrong_are_said(
+    old: str, new: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [name.replace(old, new) for name in COCO17.keypoints]
+    np.savez(tmp_path / "a.npz", points=in_layout(COCO17)[0], names=np.array(names))
+    read("--input", tmp_path / "a.npz")
+    warned = capsys.readouterr().err
+    assert said in warned and warned.startswith("warning: a.npz: ") == bool(said)
+
+
+def test_names_of_another_object_are_an_error_that_names_the_file(tmp_path: Path) -> None:
+    names = [f"p{i}" for i in range(17)]
+    np.savez(tmp_path / "a.npz", points=in_layout(COCO17)[0], names=np.array(names))
+    with pytest.raises(ValueError, match=r"a\.npz: its keypoints are named p0, p1, .*rename them"):
+        read("--input", tmp_path / "a.npz")

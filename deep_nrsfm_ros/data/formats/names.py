@@ -115,9 +115,14 @@ def misspelt(names: Collection[str], wanted: Sequence[str]) -> dict[str, str]:
     return found
 
 
+def unknown_names(names: Collection[str], wanted: Sequence[str]) -> list[str]:
+    """Return the names that are neither wanted ones nor those of a preset."""
+    return [name for name in names if name not in wanted and name not in _known()]
+
+
 def are_mostly_known(names: Collection[str], wanted: Sequence[str]) -> bool:
     """Return whether at least half of some names are wanted ones, or those of a preset."""
-    return 2 * sum(name in wanted or name in _known() for name in names) >= len(names)
+    return 2 * len(unknown_names(names, wanted)) <= len(names)
 
 
 @cache
