@@ -192,15 +192,28 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
         for text in warnings:
             reporter.warn(text)
         values["warning"] = "; ".join(warnings)
-    message = result.message
+    lines = [result.message]
     if judgement := result.judgement:
         values["judgement"] = "doubtful" if judgement.doubtful else "better"
-        message += f"; {judgement}"
+        lines = [str(judgement), f"model {result.message}"]
         if judgement.doubtful:
-            reporter.warn(str(judgement))
+            reporter.warnings.append(str(judgement))  # for the page; the last line says it as well
     page = write_page(result, reporter)
-    message += f"; report {page}" if page else ""
+    lines += [f"report {page}"] if page else []
+    if not reporter.as_json and result.state == "finished":  # else the lifter says it
+        lines.append(_how_to_use(result.path))
+    message = ("; " if reporter.as_json else "\n  ").join(lines)
     reporter.end(result.state, message, model=str(result.path), report=page, **values)
+
+
+def _how_to_use(path: Path) -> str:
+    """Return how a model is put in use."""
+    known = path.parent.resolve() == default_models_dir().resolve()
+    name = path.stem if known else str(path)
+    return (
+        f"not in use before you choose it: lift FILE --model {name}, or in a lifter: "
+        f"ros2 param set /lifter model {path.stem}"
+    )
 
 
 def write_page(result: TrainingResult, reporter: Reporter) -> str:

@@ -101,7 +101,7 @@ _SHOWN = {
     "bone_variation": "bone lengths vary by {}",
     "wrong_sides": "frames that look mirrored {}",
 }
-BETTER, AS_GOOD, ALONE, DOUBTFUL = "better", "as good", "alone", "doubtful"
+BETTER, AS_GOOD, ALONE, DOUBTFUL = "better", "as_good", "alone", "doubtful"
 """Verdicts; alone: no other model has these keypoints."""
 MIN_SEEN_SHARE = 0.25
 """Share of an object's keypoints that a frame must show to tell its side: of 4 of 25 keypoints the

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -118,6 +117,8 @@ def _train_and_save(
     _describe(prepared, reporter, start)
     share = config.curation.held_out if rival else 0.0
     frames = split(prepared.dataset, share)
+    if frames.held_out is not frames.training:
+        reporter.say(_shared_out(len(prepared.dataset), frames))
     trainer = _train(config, frames.training, checkpoint, reporter, should_stop)
     if trainer.group.rank:
         return None
@@ -166,6 +167,16 @@ def _describe(prepared: Prepared, reporter: Reporter, start: Model | None) -> No
     if missing := [name for name, times in times_visible if not times]:
         reporter.warn(f"no frame shows {', '.join(missing)}: the model will only guess them")
     reporter.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
+
+
+def _shared_out(total: int, frames: Split) -> str:
+    """Return how many frames are trained on, held out and in neither part."""
+    training, held_out = len(frames.training), len(frames.held_out)
+    return (
+        f"{training} of the {total} frames are trained on; {held_out} later ones are held out to "
+        f"judge the model, and {total - training - held_out} between them are left out "
+        "(--held-out, train.held_out)"
+    )
 
 
 def _train(
@@ -218,7 +229,7 @@ def _ending(trainer: Trainer, path: Path, model: Model, checkpoint: Path) -> tup
         message = f"{path} holds what was learned so far"
         return "cancelled", message + (", --resume goes on" if checkpoint.exists() else "")
     checkpoint.unlink(missing_ok=True)
-    message, steps = f"{path} {json.dumps(model.quality)}", trainer.preset.recipe.steps
+    message, steps = str(path), trainer.preset.recipe.steps
     if trainer.step < steps:
         message += f"; after {trainer.step} of {steps} steps {trainer.end_reason}"
     return "finished", message

@@ -145,6 +145,23 @@ def test_from_bag_to_model(
     assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
 
 
+def test_people_read_verdict_file_and_how_to_use_it_in_short_lines(
+    tmp_path: Path, models: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, confidence = people(400)
+    np.save(tmp_path / "people.npy", np.dstack((points, confidence)))
+    words = ("--input", str(tmp_path / "people.npy"), "--keypoint-layout", "coco17")
+    assert in_process(*words, "--output", str(models), *QUICK, "--steps", "5") == 0
+    said = capsys.readouterr()
+    shared_out = next(line for line in said.err.splitlines() if "are trained on;" in line)
+    assert "later ones are held out to judge the model" in shared_out
+    verdict, file, report, use = said.out.strip().splitlines()
+    assert verdict.startswith("finished: the new model is doubtful: ") and len(verdict) < 700
+    assert file == f"  model {models / 'mine.safetensors'}" and report.startswith("  report ")
+    assert "not in use before you choose it: lift FILE --model" in use and "/lifter model" in use
+    assert "{" not in said.out and "the new model is doubtful" not in said.err
+
+
 @pytest.mark.parametrize("how", ["SIGTERM", "end of standard input"])
 def test_cancelling_keeps_what_was_learned(
     arguments: list[str], models: Path, start: Callable[..., subprocess.Popen[str]], how: str

@@ -86,10 +86,10 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
     for rival in (good, bad):
         judgement = judge(frames, good, rival)
         assert not judgement.doubtful and judgement.rival == rival.name
-        verdict = "as good" if rival is good else "better"
+        verdict = "as_good" if rival is good else "better"
         assert judgement.record()["verdict"] == judgement.verdict == verdict
-        than = "as" if rival is good else "than"
-        assert str(judgement).startswith(f"the new model is {verdict} {than} model {rival.name!r}")
+        than = "as good as" if rival is good else "better than"
+        assert str(judgement).startswith(f"the new model is {than} model {rival.name!r}")
         assert "on 60 held-out frames, later ones that it was not trained on" in str(judgement)
         assert f"({rival.name}: " in str(judgement) and len(str(judgement)) < 450
         assert not judgement.record()["doubtful"]
