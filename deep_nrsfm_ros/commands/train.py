@@ -203,6 +203,8 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
     if not reporter.as_json and result.state == "finished":  # else the lifter says it
         lines.append(_how_to_use(result.path))
     message = ("; " if reporter.as_json else "\n  ").join(lines)
+    if not reporter.as_json:
+        message = message.replace(". Judged ", "\n  judged ")
     reporter.end(result.state, message, model=str(result.path), report=page, **values)
 
 

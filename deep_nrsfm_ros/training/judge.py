@@ -212,6 +212,8 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
     figures = f"{_on(frames)}: {_shown(new, old, name)}"
     if not model.layout.handedness and old is None:
         figures += f", which says nothing of depth. {MIRRORED_AS_A_WHOLE}"
+    elif model.layout.warning and old is None:
+        figures += f". But {model.layout.warning}"
     figures += _guessed(model)
     reason = ""
     if worse := worse_figures(new, old):
@@ -222,13 +224,13 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
         if old is None and worse == ["front_disagreement"]:
             fronts = comparison.fronts(model)
             reason = f"{reasons}{_fronts_in_words(fronts)}. Judged{beside} {figures}"
-    summary = f"the new model {_IN_SENTENCES[verdict].format(name)}. Judged {figures}"
+    summary = f"the new model {_IN_SENTENCES[verdict].format(name, *_gains(new, old))}"
+    summary += f". Judged {figures}"
     return Judgement(reason, summary, new, name, old, verdict)
 
 
 _IN_SENTENCES = {
-    BETTER: "is better than model {!r}: it fits more closely or mirrors fewer frames, and neither "
-    "is worse",
+    BETTER: "is better than model {!r}: it fits {}, and mirrors {} frames",
     AS_GOOD: "is as good as model {!r}: both fit alike, and it mirrors no more frames",
     ALONE: "has no other to compare with: nothing shows that it mirrors frames",
     DOUBTFUL: "is doubtful",
@@ -244,10 +246,18 @@ def _verdict(new: Figures, old: Figures | None) -> str:
     """Return the verdict on a model that the rule does not doubt."""
     if old is None:
         return ALONE
-    fits = SAME_MISFIT * new.misfit < old.misfit
-    is_less_mirrored = old.wrong_sides > new.wrong_sides + MORE_WRONG_SIDES
-    is_opposed = _or_zero(new.opposed) > MOST_OPPOSED  # and undoubted: the other one mirrors frames
-    return BETTER if fits or is_less_mirrored or is_opposed else AS_GOOD
+    return AS_GOOD if _gains(new, old) == ("alike", "no more") else BETTER
+
+
+def _gains(new: Figures, old: Figures | None) -> tuple[str, str]:
+    """Return how a model that is not doubted fits, and how many frames it mirrors."""
+    old = old or new
+    closer = SAME_MISFIT * new.misfit < old.misfit
+    looser = new.misfit > SAME_MISFIT * old.misfit  # allowed beside a model that mirrors frames
+    is_opposed = _or_zero(new.opposed) > MOST_OPPOSED
+    fewer = is_opposed or old.wrong_sides > new.wrong_sides + MORE_WRONG_SIDES
+    fit = "more closely" if closer else "less closely" if looser else "alike"
+    return fit, "fewer" if fewer else "no more"
 
 
 def _on(frames: Split) -> str:

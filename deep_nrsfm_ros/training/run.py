@@ -161,7 +161,8 @@ def _describe(prepared: Prepared, reporter: Reporter, start: Model | None) -> No
         if start
         else "starts from random weights"
     )
-    if dataset.layout.warning and not start:  # a start passes its handedness on
+    # A start passes its handedness on to a layout without one.
+    if dataset.layout.warning and (dataset.layout.handedness or not start):
         reporter.warn(dataset.layout.warning)
     times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
     if missing := [name for name, times in times_visible if not times]:
