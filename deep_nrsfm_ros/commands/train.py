@@ -15,6 +15,7 @@ from pathlib import Path
 from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.configuration import add_arguments
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.data.hands import SIDES
 from deep_nrsfm_ros.data.keypoint_files import KINDS
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
@@ -64,6 +65,13 @@ def parser() -> argparse.ArgumentParser:
     for side in ("width", "height"):
         text = f"{side} of the image in pixels, for keypoints given as shares of it"
         data.add_argument(f"--image-{side}", type=int, help=text)
+    data.add_argument(
+        "--hands",
+        choices=SIDES,
+        help="what the recorded hands are, for a model of right hands: right, left (mirrored "
+        "before the training), or palms (each hand shows its palm: those that look like left ones "
+        "are mirrored) (default: unknown; both sides mixed make a model doubtful)",
+    )
     data.add_argument("--cmu", type=Path, help="folder of the CMU database (NN/NN.asf, *.amc)")
     data.add_argument("--subjects", nargs="*", help="CMU subjects (default: 01)")
     data.add_argument(

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
+from deep_nrsfm_ros.data.hands import MIXED, mixed_sides
 from deep_nrsfm_ros.data.held_out import Split
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout, Tetrahedron
@@ -224,6 +225,8 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
         if old is None and worse == ["front_disagreement"]:
             fronts = comparison.fronts(model)
             reason = f"{reasons}{_fronts_in_words(fronts)}. Judged{beside} {figures}"
+    if not reason and (sides := mixed_sides(frames.training, MIXED)):
+        verdict, reason = DOUBTFUL, f"{sides}. Judged {figures}"
     summary = f"the new model {_IN_SENTENCES[verdict].format(name, *_gains(new, old))}"
     summary += f". Judged {figures}"
     return Judgement(reason, summary, new, name, old, verdict)

@@ -14,6 +14,7 @@ import numpy as np
 from safetensors import SafetensorError
 
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.hands import as_right_hands
 from deep_nrsfm_ros.data.held_out import Split, split
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
@@ -85,6 +86,8 @@ def run(
         if not config.data.cmu:
             source, _ = find_layouts(config, COMMAND_LINE)
             dataset = check_dataset(dataset, source, config.data.image_size, reporter)
+        if config.data.hands:
+            dataset = as_right_hands(dataset, config.data.hands)
         prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
     except (ValueError, OSError) as error:
         if should_stop():  # whoever stopped it meanwhile does not ask what the data is like

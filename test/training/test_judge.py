@@ -280,3 +280,14 @@ def test_a_front_that_only_the_fours_of_the_layout_doubt_is_theirs(
     reason = judge(Split(*parts), good, None).reason
     assert f"{names[3]} lies behind {names[0]}, {names[1]} and {names[2]} in 17 %" in reason
     assert "four may not always hold" in reason and "more views" not in reason
+
+
+def test_hands_of_both_sides_are_doubtful(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deep_nrsfm_ros.training import judge as module
+
+    monkeypatch.setattr(module, "mixed_sides", lambda data, least: f"mixed above {least}")
+    judgement = judge(frames, good, good)
+    assert judgement.doubtful and judgement.reason.startswith("mixed above 0.3. Judged")
+    assert judgement.verdict == "doubtful"
