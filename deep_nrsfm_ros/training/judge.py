@@ -212,21 +212,22 @@ def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
     verdict = _verdict(new, old)
     figures = f"{_on(frames)}: {_shown(new, old, name)}"
     if not model.layout.handedness and old is None:
-        figures += f", which says nothing of depth. {MIRRORED_AS_A_WHOLE}"
+        figures += f", which says nothing of depth. {MIRRORED_AS_A_WHOLE.format(model.name)}"
     elif model.layout.warning and old is None:
         figures += f". But {model.layout.warning}"
     figures += _guessed(model)
+    beside = f" beside model {name!r}" if name else ""
     reason = ""
     if worse := worse_figures(new, old):
-        verdict = DOUBTFUL
-        reasons = "; ".join(_in_words(each, new, old, name) for each in worse)
-        beside = f" beside model {name!r}" if name else ""
-        reason = f"{reasons}; {_advice(model, name)} would help. Judged{beside} {figures}"
+        reason = "; ".join(_in_words(each, new, old, name) for each in worse)
         if old is None and worse == ["front_disagreement"]:
-            fronts = comparison.fronts(model)
-            reason = f"{reasons}{_fronts_in_words(fronts)}. Judged{beside} {figures}"
-    if not reason and (sides := mixed_sides(frames.training, MIXED)):
-        verdict, reason = DOUBTFUL, f"{sides}. Judged {figures}"
+            reason += _fronts_in_words(comparison.fronts(model))
+        else:
+            reason += f"; {_advice(model, name)} would help"
+    if sides := mixed_sides(frames.training, MIXED):  # more frames would not help
+        reason = sides
+    if reason:
+        verdict, reason = DOUBTFUL, f"{reason}. Judged{beside} {figures}"
     summary = f"the new model {_IN_SENTENCES[verdict].format(name, *_gains(new, old))}"
     summary += f". Judged {figures}"
     return Judgement(reason, summary, new, name, old, verdict)
@@ -240,7 +241,7 @@ _IN_SENTENCES = {
 }
 MIRRORED_AS_A_WHOLE = (
     "The layout names no handedness, so the whole may be a mirror image: look at it from the side "
-    "(replay FILE --model NAME --html look.html), or name a handedness and train again"
+    "(replay FILE --model {} --html look.html), or name a handedness and train again"
 )
 """What is said of a model whose depth nothing decides."""
 

@@ -241,7 +241,7 @@ def test_the_whole_may_be_mirrored_where_a_layout_names_no_handedness(
     model = dataclasses.replace(good, layout=nameless)
     text = str(judge(Split(*parts), model, None))
     assert "which says nothing of depth" in text and "may be a mirror image" in text
-    assert "--html" in text and "handedness" in text
+    assert "replay FILE --model good --html look.html" in text and "handedness" in text
     assert "mirror image" not in str(judge(Split(*parts), model, good))  # its start knows the side
 
 
