@@ -169,7 +169,9 @@ def _describe(prepared: Prepared, reporter: Reporter, start: Model | None) -> No
         reporter.warn(dataset.layout.warning)
     times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
     if missing := [name for name, times in times_visible if not times]:
-        reporter.warn(f"no frame shows {', '.join(missing)}: the model will only guess them")
+        as_start = f", as {start.name!r} does" if start else ""
+        names = ", ".join(missing)
+        reporter.warn(f"no frame shows {names}: the model will only guess them{as_start}")
     reporter.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
 
 
