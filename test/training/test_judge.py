@@ -252,7 +252,7 @@ def test_a_handedness_against_the_names_is_said_again_at_the_end(
     frames: Split, good: Model
 ) -> None:
     names = ("right_wing", "left_wing", *good.layout.keypoints[2:])
-    four = ("right_wing", "left_wing", *names[2:4])
+    four = ("right_wing", "left_wing", names[2], names[3])
     layout = dataclasses.replace(
         good.layout, name="bird", keypoints=names, edges=(), handedness=(four,), reference=None
     )
