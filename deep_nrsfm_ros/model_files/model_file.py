@@ -67,7 +67,8 @@ class Model:
         object_frame: (3, 3) orthonormal A from the network's axes to the object's (S A, A^T M).
             det -1 undoes a mirrored depth. The axes are x front, y left, z up where the layout
             has a handedness.
-        provenance: data, recipe, seed, date and versions.
+        provenance: data, recipe, seed, date and versions. `judgement` is what the judge said at the
+            end of the training: `doubtful`, a bool, `reason`, a sentence, and the figures.
         quality: label-free figures, such as `reprojection_error` and `cycle_error`.
         error_covariance: (3p, 3p) covariance of the network's errors, in its own axes (see
             `lifting/correction.py`); the identity if it was not measured.

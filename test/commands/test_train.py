@@ -495,8 +495,8 @@ def test_a_good_model_of_the_name_is_compared_with_and_not_lost(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "paw.yaml").write_text(PAW)
-    words = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"), *QUICK)
-    words = (*words, "--output", str(models), "--few-frames", "0", "--seeds", "1")
+    data = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"))
+    words = (*data, *QUICK, "--output", str(models), "--few-frames", "0", "--seeds", "1")
     path = models / "mine.safetensors"
     assert in_process(*words, "--steps", "150") == 0
     good = mark_as_good(path)
