@@ -133,7 +133,7 @@ def keep_record(
 
     The record outlives the block if there is a checkpoint at its end, and a process that is killed.
     Unless the configuration says to resume, an unfinished training of the same name becomes that of
-    NAME_unfinished, which can be resumed until a training of NAME has come to its end.
+    NAME_unfinished, which can be resumed until one of NAME ends with a model that is not doubtful.
 
     Args:
         config: the configuration.
@@ -186,8 +186,9 @@ def _set_aside(folder: Path, name: str) -> str:
         shutil.copyfile(record_file(folder, name), record_file(folder, aside))
     checkpoint_file(folder, name).replace(checkpoint_file(folder, aside))
     return (
-        f"the training of {name!r} begins anew. The unfinished one is kept as {aside!r} until a "
-        f"training of {name!r} has finished: --resume --name {aside} goes on with it"
+        f"the training of {name!r} begins anew. The unfinished one is kept as {aside!r} until one "
+        f"of {name!r} ends with a model that is not doubtful: --resume --name {aside} goes on with "
+        "it"
     )
 
 

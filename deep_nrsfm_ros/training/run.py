@@ -155,7 +155,7 @@ def _train_and_save(
     if rival and rival.name == path.stem:
         rival = dataclasses.replace(rival, name=f"{rival.name}{BEFORE}")
     state, message = _ending(trainer, path, model, checkpoint)
-    if trainer.end_reason:
+    if judgement and not judgement.doubtful:
         give_up_unfinished(config.output.folder, config.output.name)
     return TrainingResult(
         *(model, path, prepared, state, message + note),

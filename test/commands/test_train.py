@@ -270,7 +270,8 @@ def test_without_resume_it_begins_anew(
     assert in_process(*arguments, "--steps", "3", "--widths", "6", "3") == 0
     model = load_model(models / "mine.safetensors")
     assert model.provenance["step"] == 3 and model.network.architecture.widths == (6, 3)
-    assert not find_records(models)  # it has ended: the earlier one is given up
+    assert load_model(models / "mine.safetensors").provenance["judgement"]["doubtful"]
+    assert read_record(models, "mine_unfinished")  # it may be the better one
 
 
 def test_time_ends_a_training(
@@ -509,14 +510,17 @@ def test_a_good_model_of_the_name_is_compared_with_and_not_lost(
     doubtful = load_model(models / "mine_doubtful.safetensors")
     assert doubtful.provenance["judgement"]["rival"] == "mine"
 
-    with monkeypatch.context() as cancelled:
-        cancelled.setattr(train, "stop_on_signals", stop_after(5))
-        assert in_process(*words, "--steps", "150") == 130
+    for steps in (4, 5):
+        with monkeypatch.context() as cancelled:
+            cancelled.setattr(train, "stop_on_signals", stop_after(steps))
+            assert in_process(*words, "--steps", "150") == 130
+    assert {record.name for record in find_records(models)} == {"mine", "mine_unfinished"}
     said = capsys.readouterr().out
     assert f"{models / 'mine_unfinished.safetensors'} holds what was learned so far" in said
     assert "; model 'mine' stays as it was" in said and path.read_bytes() == good
 
     assert in_process(*words, "--resume") == 0  # the same once more: as good
+    assert not find_records(models)  # the earlier one is given up
     said = capsys.readouterr().out
     assert "the new model is better than model 'mine'" in said
     assert "the model 'mine' that was there is kept as 'mine_before'" in said
