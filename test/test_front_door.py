@@ -132,7 +132,9 @@ def test_a_model_is_loaded_by_name_by_path_and_from_a_folder(human: Model, tmp_p
         load_model("nobody")
 
 
-def test_an_array_becomes_a_model_that_lifts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_array_becomes_a_model_that_lifts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     disagreed = Consensus(np.zeros((0, 8, 3)), np.zeros((0, 3, 3)), np.ones(0), 1.0, 2)
     monkeypatch.setattr(few_frames, "MIN_STEPS", 1)
     monkeypatch.setattr(few_frames, "consensus", lambda W, _: disagreed)
@@ -154,7 +156,8 @@ def test_an_array_becomes_a_model_that_lifts(monkeypatch: pytest.MonkeyPatch) ->
             on_progress=progress.append,
             on_message=messages.append,
         )
-    assert ["factorisations" in message for message in messages] == [True]
+    assert ["factorisations" in message for message in messages] == [True, False]
+    assert messages[-1] == model.provenance["judgement"]["reason"]
     assert model.name == "thing" and model.layout == layout and progress
     assert "rival" not in model.provenance["judgement"]  # no model has such an object
     assert np.isfinite(Lifter(model)(points[:3]).shapes).all()
@@ -162,6 +165,27 @@ def test_an_array_becomes_a_model_that_lifts(monkeypatch: pytest.MonkeyPatch) ->
     visible[:, 5:] = False
     with pytest.raises(ValueError, match="cannot be learned"):
         train(points[:5], visible[:5], layout=layout)
+    (tmp_path / "thing.yaml").write_text("{name: thing, keypoints: [a, b, c, d, e, f, g, h]}")
+    few = Recipe(steps=1, seeds=1, few_frames=0)
+    for same in (list("abcdefgh"), tmp_path / "thing.yaml"):
+        with pytest.warns(UserWarning, match="'thing' names no handedness"):
+            again = train(points, layout=same, name="thing", recipe=few)
+        assert again.layout == layout
+    with pytest.raises(TypeError, match="layout is a int; give a KeypointLayout, .* names"):
+        train(points, layout=8)  # type: ignore[arg-type]
+
+
+def test_a_detector_is_named_by_its_keypoints_or_a_path(human: Model, tmp_path: Path) -> None:
+    names = ["left_hip", "right_hip", "left_knee", "right_knee", "neck"]
+    (tmp_path / "legs.yaml").write_text(f"{{name: legs, keypoints: {names}}}")
+    points = np.random.default_rng(0).uniform(0, 100, (2, 5, 2))
+    by_list = Lifter(human, layout=names)(points)
+    by_path = Lifter(human, layout=tmp_path / "legs.yaml")(points)
+    np.testing.assert_array_equal(by_list.shapes, by_path.shapes)
+    save_model(str(tmp_path / "mine.safetensors"), human)
+    assert load_model("mine", str(tmp_path)).name == "mine"
+    with pytest.raises(TypeError, match="layout is a int"):
+        Lifter(human, layout=5)  # type: ignore[arg-type]
 
 
 def test_a_model_of_people_is_judged_beside_the_one_at_hand(human: Model) -> None:

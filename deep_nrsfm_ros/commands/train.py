@@ -30,6 +30,9 @@ from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentRep
 from deep_nrsfm_ros.training.resume import resume_arguments
 from deep_nrsfm_ros.training.run import TrainingResult, run
 
+CANCELLED = 128 + signal.SIGINT
+"""Exit code of a training that was stopped, by whatever signal."""
+
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line: an option that is not given leaves no attribute."""
@@ -92,7 +95,9 @@ def parser() -> argparse.ArgumentParser:
         help="the model's layout: a preset, a layout file (.yaml), a model file, or 'numbered' "
         "for points without names (default: that of --from, or human25)",
     )
-    result.add_argument("--name", help="name of the model (default: trained)")
+    result.add_argument(
+        "--name", help="name of the model, not one of the package's (default: trained)"
+    )
     result.add_argument(
         "--output",
         dest="folder",
@@ -233,7 +238,7 @@ def write_page(result: TrainingResult, reporter: Reporter) -> str:
 
 @program
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command; exit code 2 says that the input was at fault."""
+    """Run the command; exit code 2: the input was at fault, 130: it was stopped before its end."""
     arguments = parser().parse_args(argv)
     should_stop = stop_on_signals()
     if arguments.json_progress:
@@ -242,8 +247,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         if result := run(parse(arguments, reporter.say), reporter, should_stop):
             report_end(result, reporter)
+            if result.state == "cancelled":
+                sys.exit(CANCELLED)
     except CancelledError:
         reporter.end("cancelled", "nothing had been learned; nothing was written")
+        sys.exit(CANCELLED)
     except (ValueError, OSError) as error:
         reporter.end("failed", str(error))
         sys.exit(2)

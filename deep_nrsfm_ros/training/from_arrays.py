@@ -7,6 +7,7 @@ import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import from_arrays
-from deep_nrsfm_ros.model_files.find_layout import find_layout
+from deep_nrsfm_ros.model_files.find_layout import layout_of
 from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
 from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model, load_once
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
@@ -34,9 +35,9 @@ def train(
     points: ArrayLike,
     confidence: ArrayLike | None = None,
     *,
-    layout: KeypointLayout | str,
+    layout: KeypointLayout | str | Path | Sequence[str],
     name: str = "trained",
-    start: Model | str = "",
+    start: Model | str | Path = "",
     recipe: Recipe | None = None,
     sequence_starts: Sequence[int] = (),
     on_progress: Callable[[Progress], None] = lambda progress: None,
@@ -48,16 +49,17 @@ def train(
     and outliers are left out. Warnings about the data and the result are Python warnings.
 
     Where the object has a model, the new one is compared with it without labels, on the last tenth
-    of each sequence, which the training does not use: `provenance["judgement"]` of the result has
-    the figures, and a doubtful model gives a warning with the reason and what would help.
+    of each sequence, which the training does not use. `provenance["judgement"]` of the result has
+    `doubtful` (a bool), `reason` (the sentence on it) and the figures of both; `on_message` gets
+    the sentence, and a doubtful model gives a warning.
 
     Args:
         points: (f, p, 2) keypoints of f frames, in any unit, x right and y down. A keypoint at
             (0, 0) or with a NaN is missing.
         confidence: (f, p) from 0, which is missing, to 1, or booleans of visibility. None: all
             keypoints are visible.
-        layout: keypoint layout of the points, as an object or by the name of a preset or a layout
-            file ("coco17"); it is the model's too.
+        layout: keypoint layout of the points, as an object, by the name of a preset or a layout
+            file ("coco17"), or a list of the keypoints' names; it is the model's too.
         name: name of the model.
         start: model to start from, its name or its file. "" is a model that comes with the package
             and has most keypoints of the layout, if there is one; "none" is random weights.
@@ -70,7 +72,8 @@ def train(
             (0,): one recording. (): unknown, each quarter of the frames counts as a sequence.
         on_progress: called every few seconds from the first step on, and at the end.
         on_message: called with a sentence when work of up to minutes begins before the first step,
-            such as the factorisations of at most `Recipe.few_frames` frames; `print` shows it.
+            such as the factorisations of at most `Recipe.few_frames` frames, and at the end with
+            what the judge says; `print` shows it.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -85,8 +88,7 @@ def train(
     from deep_nrsfm_ros.training.setup import Setup
 
     check_name("name", name)
-    if isinstance(layout, str):
-        layout = find_layout("layout", layout)
+    layout = layout_of("layout", layout, name)
     seen = from_arrays(points, confidence, layout)
     starts = np.array(sequence_starts, np.int64)
     visible = seen.confidence > 0
@@ -115,6 +117,7 @@ def train(
     if origin:
         model = inherit(model, origin)
     judgement = judge(frames, model, rival)
+    on_message(str(judgement))
     if judgement.doubtful:
         warnings.warn(str(judgement), stacklevel=2)
     date = time.strftime("%Y-%m-%d", time.gmtime())
@@ -122,7 +125,7 @@ def train(
     return model
 
 
-def _origin(start: Model | str, layout: KeypointLayout) -> Model | None:
+def _origin(start: Model | str | Path, layout: KeypointLayout) -> Model | None:
     """Return the model to start from; None for random weights."""
     if isinstance(start, Model):
         return start

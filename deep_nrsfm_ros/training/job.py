@@ -159,7 +159,7 @@ class TrainingJob:
         """Return the last progress of a process that ended with `code`."""
         last = self._last_status
         values = last.values if last else {}
-        if last and last.ended and (code == 0 or last.state == "failed"):
+        if last and last.ended and (code == 0 or last.state != "finished"):
             return last
         if self._cancelled:
             return JobStatus("cancelled", "stopped before there was a model to keep", values)

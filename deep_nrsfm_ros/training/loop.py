@@ -51,7 +51,8 @@ class Callbacks:
         on_progress: called every few seconds, and at the end, by the first process.
         should_stop: called before each step (every 16 steps in a group of processes); True ends
             the training.
-        on_message: called with a sentence when work of up to minutes begins before the first step.
+        on_message: called with a sentence when work of up to minutes begins before the first step,
+            and with the step at which a training goes on.
     """
 
     on_step: Callable[[Trainer], None] = lambda trainer: None
@@ -322,6 +323,10 @@ class _Loop:
             self.leader = self._trainer(self.first_seed)
             self.leader.restore(leader)
             self.leader_error = float(tensors["screening"])
+        where = f"step {self.trainer.step} of {self.preset.recipe.steps}"
+        if self.screening:
+            where += f", where seed {self.trainer.seed} is screened"
+        self.callbacks.on_message(f"goes on at {where}")
 
 
 def _frames_with_extent(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> FrameStore:

@@ -48,7 +48,7 @@ def main() -> None:
     if behaviour == "wait":
         stop.wait()
         say("cancelled", message="kept the best of 1 step", model="best.safetensors")
-        return
+        sys.exit(130)
     model = "new.safetensors"
     if config["data"]["bags"]:
         folder = Path(config["output"]["folder"])

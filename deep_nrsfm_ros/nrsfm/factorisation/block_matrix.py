@@ -145,10 +145,23 @@ def least_nuclear_norm(
     for _ in range(iterations):
         before_each()
         matrix = (S + U).reshape(f, -1)
-        left, s, right = np.linalg.svd(matrix, full_matrices=False)
+        left, s, right = _svd(matrix)
         floor = WEIGHT_FLOOR * s[0]
         weight = floor / (s + floor) if weighted else 1.0
         X = ((left * np.maximum(s - weight * shrinkage, 0)) @ right).reshape(S.shape)
         S = held(X - U)
         U = U + S - X
     return S
+
+
+def _svd(matrix: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the thin singular value decomposition of a matrix.
+
+    LAPACK's (gesdd) converges for nearly every matrix, but not for all; it takes another way
+    through the transposed one.
+    """
+    try:
+        left, s, right = np.linalg.svd(matrix, full_matrices=False)
+    except np.linalg.LinAlgError:
+        right, s, left = (A.T for A in np.linalg.svd(matrix.T, full_matrices=False))
+    return left, s, right
