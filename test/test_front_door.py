@@ -137,7 +137,7 @@ def test_an_array_becomes_a_model_that_lifts(
 ) -> None:
     disagreed = Consensus(np.zeros((0, 8, 3)), np.zeros((0, 3, 3)), np.ones(0), 1.0, 2)
     monkeypatch.setattr(few_frames, "MIN_STEPS", 1)
-    monkeypatch.setattr(few_frames, "consensus", lambda W, _: disagreed)
+    monkeypatch.setattr(few_frames, "consensus", lambda *_: disagreed)
     rng = np.random.default_rng(0)
     shapes = rng.standard_normal((1, 8, 3)) + 0.3 * rng.standard_normal((400, 1, 1)) * (
         rng.standard_normal((1, 8, 3))

@@ -278,6 +278,8 @@ def _in_words(name: str, new: Figures, old: Figures | None) -> str:
 def _advice(model: Model, rival: str) -> str:
     """Return what would help a doubtful model."""
     advice = ["more views", "more frames"]
+    if minutes := model.provenance.get("factorisation_needs_minutes"):
+        advice.insert(0, f"more time (--minutes {minutes:g}, train.minutes, or no limit)")
     if "from" in model.provenance:
         advice.append("fewer steps")
     else:

@@ -71,6 +71,17 @@ def test_a_bad_model_is_doubted_and_told_what_would_help(
     assert record["figures"]["residual"] > record["rival_figures"]["residual"]
 
 
+def test_time_would_help_a_model_whose_factorisations_were_cut_short(
+    frames: Split, good: Model, bad: Model
+) -> None:
+    hurried = dataclasses.replace(
+        bad, provenance=bad.provenance | {"factorisation_needs_minutes": 2.5}
+    )
+    advice = "more time (--minutes 2.5, train.minutes, or no limit), more views"
+    assert advice in judge(frames, hurried, good).reason
+    assert "more time" not in judge(frames, bad, good).reason
+
+
 def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
     frames: Split, good: Model, bad: Model
 ) -> None:

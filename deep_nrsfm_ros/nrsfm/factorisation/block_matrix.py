@@ -18,8 +18,13 @@ WEIGHT_FLOOR = 0.1
 """Floor of the weights 1 / (sigma + floor), relative to the largest singular value; of 0.5, 0.2,
 0.1, 0.05 and 0.02 the best on a batch of CMU 01 and one of 127, by the truth."""
 
+NORM_ITERATIONS = 150
+"""Iterations in which the shapes of lowest nuclear norm are found."""
 
-def block_matrix(W: Floats, K: int, *, weighted: bool = False, iterations: int = 150) -> Floats:
+
+def block_matrix(
+    W: Floats, K: int, *, weighted: bool = False, iterations: int = NORM_ITERATIONS
+) -> Floats:
     """Return the shapes of lowest nuclear norm among those that the images allow.
 
     Dai, Li and He, "A simple prior-free method for non-rigid structure from motion
@@ -122,7 +127,7 @@ def _skew(Pi: Floats, G: Floats) -> tuple[Floats, Floats]:
 def least_nuclear_norm(
     W: Floats,
     R: Floats,
-    iterations: int = 150,
+    iterations: int = NORM_ITERATIONS,
     *,
     weighted: bool = False,
     before_each: Callable[[], None] = lambda: None,
