@@ -19,7 +19,7 @@ from deep_nrsfm_ros.data.held_out import Split, split
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
-from deep_nrsfm_ros.training.data_check import check_dataset
+from deep_nrsfm_ros.training.data_check import never_seen
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
@@ -27,7 +27,7 @@ from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data, read_people
 from deep_nrsfm_ros.training.record import checkpoint_file, keep_record
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
-from deep_nrsfm_ros.training.validation import find_layouts, validate
+from deep_nrsfm_ros.training.validation import validate
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.training.judge import Judgement
@@ -82,10 +82,7 @@ def run(
     """
     validate(config, COMMAND_LINE)
     try:
-        dataset, detector_layout = read_data(config, reporter)
-        if not config.data.cmu:
-            source, _ = find_layouts(config, COMMAND_LINE)
-            dataset = check_dataset(dataset, source, config.data.image_size, reporter)
+        dataset, detector_layout, faults = read_data(config, reporter)
         prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
     except (ValueError, OSError) as error:
         if should_stop():  # whoever stopped it meanwhile does not ask what the data is like
@@ -93,7 +90,7 @@ def run(
         raise
     try:
         with _record(config) as checkpoint:
-            result = _train_and_save(config, prepared, checkpoint, reporter, should_stop)
+            result = _train_and_save(config, prepared, faults, checkpoint, reporter, should_stop)
             return result and result._replace(detector_layout=detector_layout)
     except SafetensorError as error:  # neither OSError nor ValueError, though the disk is full
         raise ValueError(unwritable(config.output.folder, error)) from error
@@ -109,6 +106,7 @@ def _record(config: TrainingConfig) -> AbstractContextManager[Path]:
 def _train_and_save(
     config: TrainingConfig,
     prepared: Prepared,
+    faults: tuple[str, ...],
     checkpoint: Path,
     reporter: Reporter,
     should_stop: Callable[[], bool],
@@ -134,7 +132,7 @@ def _train_and_save(
     model = dataclasses.replace(model, provenance=model.provenance | {"date": date})
     if start:
         model = inherit(model, start)
-    judgement = judge(frames, model, rival) if trainer.end_reason else None
+    judgement = judge(frames, model, rival, faults) if trainer.end_reason else None
     if judgement:
         model.provenance["judgement"] = judgement.record()
     path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"
@@ -162,9 +160,8 @@ def _describe(prepared: Prepared, reporter: Reporter, start: Model | None) -> No
     )
     if dataset.layout.warning and not start:  # a start passes its handedness on
         reporter.warn(dataset.layout.warning)
-    times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
-    if missing := [name for name, times in times_visible if not times]:
-        reporter.warn(f"no frame shows {', '.join(missing)}: the model will only guess them")
+    if unseen := never_seen(dataset):
+        reporter.warn(unseen)
     reporter.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
 
 
