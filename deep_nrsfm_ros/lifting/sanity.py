@@ -38,9 +38,10 @@ _TINY = 3.0  # pixels; no detector finds keypoints of smaller objects
 _HIGH = 2.0  # COCO's mark of a visible keypoint; OpenPose and MMPose go a little above 1
 _MANY_HIGH = 0.05  # fraction of confidences above it that is another scale
 _SCALES = (10, 100, 255, 1000)  # largest values of usual scales
-_UPRIGHT = 0.7  # cosine between the up axis of a person and an axis of the image
+_UPRIGHT = 0.7  # cosine between the up axis of a person, in the image, and an axis of the image
 _NEARLY_ALL = 0.9  # fraction of people that makes an orientation suspicious
-_LYING = 0.5  # |cosine| between the up axis and the image's x, which a standing person is below
+_LYING = 0.6  # |cosine| between the up axis and the image's x, which a standing person is below
+_IN_IMAGE = 0.3  # length in the image of an up axis of length 1 from which on its direction counts
 _FACE = ("nose", "left_eye", "right_eye")
 _SEEN = 0.5  # confidence of a face that is seen
 _TURNED = 0.3  # cosine between the front of a person and the camera's axis: less is a profile
@@ -287,7 +288,7 @@ def orientation(rotations: Floats) -> list[Finding]:
         rotations: (n, 3, 3) from object axes (x front, y left, z up) to camera axes (y down); NaN
             where not lifted.
     """
-    x, y = rotations[~np.isnan(rotations[:, 0, 0]), :2, 2].T
+    x, y = _up_in_image(rotations).T
     if not len(x):
         return []
     if (upside_down := (y > 0).mean()) > _NEARLY_ALL and np.median(y) > _UPRIGHT:
@@ -308,6 +309,15 @@ def orientation(rotations: Floats) -> list[Finding]:
             )
         ]
     return []
+
+
+def _up_in_image(rotations: Floats) -> Floats:
+    """Return the direction (m, 2) of the up axes in the image, of those that have one there."""
+    up = rotations[:, :2, 2]
+    length = np.linalg.norm(up, axis=1)
+    has_direction = length > _IN_IMAGE  # False where not lifted
+    directions: Floats = up[has_direction] / length[has_direction, None]
+    return directions
 
 
 def facing(
@@ -334,8 +344,9 @@ def facing(
     if seen.sum() < _MIN_FACES or (away := (front[seen] > 0).mean()) <= _NEARLY_ALL:
         return []
     people = f"{away:.0%} of the {seen.sum()} people whose face is seen"
-    x, y = (float(value) for value in np.median(rotations[seen, :2, 2], axis=0))
-    if abs(x) > max(_LYING, abs(y)):
+    up = _up_in_image(rotations[seen])
+    x, y = (float(value) for value in np.median(up, axis=0)) if len(up) else (0.0, -1.0)
+    if abs(x) > _UPRIGHT:
         return [
             Finding(
                 "handedness",

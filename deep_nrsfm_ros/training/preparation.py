@@ -24,7 +24,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.sanity import Finding, to_pixels
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
-from deep_nrsfm_ros.training.config import COMMAND_LINE, DataConfig, TrainingConfig
+from deep_nrsfm_ros.training.config import COMMAND_LINE, PARAMETERS, DataConfig, TrainingConfig
 from deep_nrsfm_ros.training.data_check import (
     WRONG_LAYOUT,
     SourceFinding,
@@ -34,9 +34,16 @@ from deep_nrsfm_ros.training.data_check import (
     serious,
 )
 from deep_nrsfm_ros.training.distributed import own_share
-from deep_nrsfm_ros.training.layout_choice import LayoutChoice, detector_layout, layout_choice
+from deep_nrsfm_ros.training.layout_choice import (
+    LayoutChoice,
+    detector_layout,
+    in_words,
+    layout_choice,
+)
 from deep_nrsfm_ros.training.reporter import Reporter
 from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
+
+_OPTION = f"({COMMAND_LINE('keypoint_layout')}, {PARAMETERS('keypoint_layout')})"
 
 
 @dataclass(frozen=True)
@@ -244,7 +251,7 @@ def _read_inputs(
     named = keypoint_map.source if data.keypoint_layout and is_only_source else None
     fallback = None if choice else keypoint_map.source
     options = dataclasses.replace(options, layout=named, fallback=fallback)
-    parts, failures = list[Part](), list[ValueError]()
+    parts, failures, copies = list[Part](), list[ValueError](), list[str]()
     for path in paths:
         try:
             own = _options_for(path, options)
@@ -282,13 +289,13 @@ def _read_inputs(
         points, confidence = to_target(detections.points[order], detections.confidence[order])
         visible, source = confidence > 0, f"file {path.name}"
         dataset = Dataset(points, visible, keypoint_map.target, source, sequence_starts=starts)
-        if copies := [p.dataset.source for p in parts if is_copy(dataset, p.dataset)]:
-            reporter.warn(
-                f"{path.name} has the same keypoints as {copies[0]}: leave one of them out"
-            )
+        if same := [part.dataset.source for part in parts if is_copy(dataset, part.dataset)]:
+            copies.append(f"{path.name} (of {same[0].removeprefix('file ')})")
         parts.append(Part(dataset, layout))
     if not parts and not may_be_none:
         raise failures[0]
+    if copies:
+        reporter.warn(f"the same keypoints twice: {in_words(copies)}; leave the copies out")
     for failure in failures:
         reporter.warn(f"left out: {failure}")
     return parts
@@ -327,7 +334,7 @@ def _check_bag(
 def _wrong_layout(path: Path, findings: list[Finding]) -> ValueError | None:
     """Return the error of a bag or file that is clearly in another layout; None if it is not."""
     wrong = next((finding for finding in findings if finding.code == WRONG_LAYOUT), None)
-    return ValueError(f"{path}: {wrong} ({COMMAND_LINE('keypoint_layout')})") if wrong else None
+    return ValueError(f"{path}: {wrong} {_OPTION}") if wrong else None
 
 
 def _match_names(

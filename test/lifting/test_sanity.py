@@ -200,7 +200,7 @@ def test_people_upside_down_and_on_their_side() -> None:
     assert not orientation(some)
     lean = np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]) @ upright * [[1], [-1], [1]]
     some = np.tile(lean, (N, 1, 1))
-    some[::4, :2, 2] = 0.75, 0.6  # a person leans in the image of a rolled camera
+    some[::4, :2, 2] = 0.6, 0.45  # a person leans in the image of a rolled camera
     assert "100% of the people are upside down" in orientation(some)[0].message
     assert is_person(HUMAN17) and not is_person(KeypointLayout.numbered(17))
 

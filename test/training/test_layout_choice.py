@@ -113,7 +113,7 @@ def test_a_layout_that_is_clearly_wrong_is_refused(
     assert in_process(*words, *place) == 2
     said = capsys.readouterr().err
     assert f"failed: {wrong}: poor fit as human25: is it body25? It fits 0.08 instead of " in said
-    assert "set the keypoint layout to body25 (--keypoint-layout)" in said
+    assert "set the keypoint layout to body25 (--keypoint-layout, train.keypoint_layout)" in said
     assert not list(tmp_path.glob("*mine*"))
 
 
@@ -164,9 +164,8 @@ def test_a_file_that_is_read_twice_is_named(
     write(tmp_path / "a.npz", COCO17)
     write(tmp_path / "b.npy", COCO17)
     read("--input", tmp_path, "--object", "coco17")
-    assert "b.npy has the same keypoints as file a.npz: leave one of them out" in (
-        capsys.readouterr().err
-    )
+    said = capsys.readouterr().err
+    assert "warning: the same keypoints twice: b.npy (of a.npz); leave the copies out" in said
 
 
 def test_the_page_names_the_layout_for_the_lifter(
