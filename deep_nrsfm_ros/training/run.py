@@ -20,7 +20,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
-from deep_nrsfm_ros.training.data_check import check_dataset
+from deep_nrsfm_ros.training.data_check import never_seen
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
@@ -36,7 +36,7 @@ from deep_nrsfm_ros.training.same_name import (
     name_beside,
     old_model,
 )
-from deep_nrsfm_ros.training.validation import find_layouts, validate
+from deep_nrsfm_ros.training.validation import validate
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.training.judge import Judgement
@@ -91,10 +91,7 @@ def run(
     """
     validate(config, COMMAND_LINE)
     try:
-        dataset, detector_layout = read_data(config, reporter)
-        if not config.data.cmu:
-            source, _ = find_layouts(config, COMMAND_LINE)
-            dataset = check_dataset(dataset, source, config.data.image_size, reporter)
+        dataset, detector_layout, faults = read_data(config, reporter)
         prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
     except (ValueError, OSError) as error:
         if should_stop():  # whoever stopped it meanwhile does not ask what the data is like
@@ -102,7 +99,7 @@ def run(
         raise
     try:
         with _record(config, reporter) as checkpoint:
-            result = _train_and_save(config, prepared, checkpoint, reporter, should_stop)
+            result = _train_and_save(config, prepared, faults, checkpoint, reporter, should_stop)
             return result and result._replace(detector_layout=detector_layout)
     except SafetensorError as error:  # neither OSError nor ValueError, though the disk is full
         raise ValueError(unwritable(config.output.folder, error)) from error
@@ -118,6 +115,7 @@ def _record(config: TrainingConfig, reporter: Reporter) -> AbstractContextManage
 def _train_and_save(
     config: TrainingConfig,
     prepared: Prepared,
+    faults: tuple[str, ...],
     checkpoint: Path,
     reporter: Reporter,
     should_stop: Callable[[], bool],
@@ -147,7 +145,7 @@ def _train_and_save(
         model = inherit(model, start)
     judgement, rival = None, rivals[0] if rivals else None
     if trainer.end_reason:
-        judgement, rival = _judge(frames, model, rivals)
+        judgement, rival = _judge(frames, model, rivals, faults)
         model.provenance["judgement"] = judgement.record()
     else:
         model.provenance[CUT_OFF] = True
@@ -191,21 +189,24 @@ def _is_file_of(old: OldModel, file: str) -> bool:
     return bool(file) and old.path.resolve() == Path(file).resolve()
 
 
-def _judge(frames: Split, model: Model, rivals: list[Model]) -> tuple[Judgement, Model | None]:
+def _judge(
+    frames: Split, model: Model, rivals: list[Model], faults: tuple[str, ...]
+) -> tuple[Judgement, Model | None]:
     """Return a judgement that doubts the model if there is one, else the first one, and its rival.
 
     Args:
         frames: those of the training and those held out.
         model: the new one.
         rivals: see `_rivals`.
+        faults: of the data, in words.
     """
     from deep_nrsfm_ros.training.judge import judge
 
-    judgement = judge(frames, model, rivals[0] if rivals else None)
+    judgement = judge(frames, model, rivals[0] if rivals else None, faults)
     for other in rivals[1:]:
         if judgement.doubtful:
             break
-        second = judge(frames, model, other)
+        second = judge(frames, model, other, faults)
         if second.doubtful:
             return second, other
     return judgement, rivals[0] if rivals else None
@@ -248,9 +249,8 @@ def _describe(
         )
     if dataset.layout.warning and not start:  # a start passes its handedness on
         reporter.warn(dataset.layout.warning)
-    times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
-    if missing := [name for name, times in times_visible if not times]:
-        reporter.warn(f"no frame shows {', '.join(missing)}: the model will only guess them")
+    if unseen := never_seen(dataset):
+        reporter.warn(unseen)
     reporter.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
 import re
 import signal
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.data.walking_person import in_layout
 from deep_nrsfm_ros.commands import train
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -32,7 +34,8 @@ from test.fixtures.forked_python import TRAINING, ForkedPython
 from test.fixtures.training_program import RunTraining
 
 DEADLINE = 90.0
-QUICK = ("--widths", "8", "4", "--batch", "8", "--threads", "1", "--name", "mine")
+FORCE = "--force"  # the people made up here fit no model of people
+QUICK = ("--widths", "8", "4", "--batch", "8", "--threads", "1", "--name", "mine", FORCE)
 SUFFIXES = (".html", ".safetensors")
 ENDLESS = ("--steps", "1000000")
 
@@ -420,7 +423,7 @@ def test_the_ground_truth_is_not_read(
     found = []
     for shapes in (None, np.full((60, 17, 3), np.nan, np.float32)):
         dataset = Dataset(points, confidence > 0, COCO17, "made up", shapes)
-        monkeypatch.setattr(run, "read_data", lambda config, reporter, e=dataset: (e, ""))
+        monkeypatch.setattr(run, "read_data", lambda config, reporter, e=dataset: (e, "", ()))
         assert in_process(*arguments, "--steps", "5") == 0
         found.append(load_model(models / "mine.safetensors"))
     assert found[0].quality == found[1].quality
@@ -567,7 +570,7 @@ def test_it_goes_on_from_another_model(
     assert time.strptime(first.provenance["date"], "%Y-%m-%d")
     # Weights that hardly move show where they come from.
     still = ("--bag", str(bag), "--keypoint-layout", "coco17", "--from", "mine", "--threads", "1")
-    slow = ("--steps", "1", "--learning-rate", "1e-7", "--output", str(models))
+    slow = ("--steps", "1", "--learning-rate", "1e-7", "--output", str(models), FORCE)
     assert in_process(*still, *slow, "--name", "same") == 0
     same = load_model(models / "same.safetensors")
     assert same.layout == first.layout == HUMAN25
@@ -592,7 +595,7 @@ def test_it_does_not_resume_what_started_elsewhere(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert in_process(*arguments, "--steps", "3") == 0
-    start = (*arguments[: -len(QUICK)], "--name", "next", "--steps", "12", "--batch", "8")
+    start = (*arguments[: -len(QUICK)], "--name", "next", "--steps", "12", "--batch", "8", FORCE)
     with monkeypatch.context() as cancelled:
         cancelled.setattr(train, "stop_on_signals", stop_after(4))
         assert in_process(*start, "--from", "mine") == 130
@@ -669,6 +672,30 @@ def test_a_report_that_cannot_be_written_costs_no_model(
     assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
 
 
+def test_a_model_of_data_that_looks_wrong_is_doubtful(
+    models: Path, in_process: RunTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, confidence = in_layout(COCO17)
+    percent = np.concatenate([points, 100 * confidence[..., None]], -1)
+    np.save(tmp_path / "a.npy", percent)
+    words = ("--input", str(tmp_path / "a.npy"), "--keypoint-layout", "coco17", "--threads", "1")
+    few = ("--steps", "3", "--learning-rate", "1e-7", "--name", "mine", "--output", str(models))
+    assert in_process(*words, *few, "--json-progress") == 3
+    end = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert end["state"] == "finished" and end["judgement"] == "doubtful"
+    fault = "a.npy: confidence up to "
+    assert f"the new model is doubtful: its data looks wrong: {fault}" in end["message"]
+    assert "divide it by 100. Mend it and train again" in end["message"]
+    judgement = load_model(models / "mine.safetensors").provenance["judgement"]
+    assert judgement["doubtful"] and judgement["faults"][0].startswith(fault)
+    page = html.unescape((models / "mine.html").read_text())
+    assert judgement["reason"] in page and "<td>mine</td><td>doubtful</td>" in page
+    assert in_process(*words, *few, FORCE) == 0
+    np.save(tmp_path / "a.npy", percent / [1, 1, 100])
+    assert in_process(*words, *few) == 0
+    assert "looks wrong" not in capsys.readouterr().err.split("curating")[-1]
+
+
 def test_a_configuration_file_gives_the_options_that_are_not_given(
     arguments: list[str],
     models: Path,
@@ -679,7 +706,7 @@ def test_a_configuration_file_gives_the_options_that_are_not_given(
     config = TrainingConfig.from_arguments(train.parser().parse_args([*arguments, "--batch", "5"]))
     file = tmp_path / "config.json"
     file.write_text(config.to_json())
-    assert in_process("--config", str(file), "--steps", "3") == 0
+    assert in_process("--config", str(file), "--steps", "3", FORCE) == 0
     recipe = load_model(models / "mine.safetensors").provenance["recipe"]
     assert (recipe["steps"], recipe["batch"]) == (3, 5)
     file.write_text('{"data": {"bag": []}}')

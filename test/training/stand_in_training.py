@@ -59,6 +59,8 @@ def main() -> None:
         )
     judgement = "doubtful" if behaviour == "doubtful" else "better"
     say("finished", message="done", model=model, step=2, steps=2, judgement=judgement)
+    if behaviour == "doubtful":
+        sys.exit(3)  # its data looked wrong
 
 
 if __name__ == "__main__":
