@@ -17,20 +17,31 @@ from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFile
 from deep_nrsfm_ros.training.same_name import CUT_OFF
 
 COLUMNS = ("model", "object", "keypoints", "judged", "date")
-BETTER, DOUBTFUL, NOT_JUDGED = "better", "doubtful", "-"
+BETTER, AS_GOOD, ALONE, DOUBTFUL, NOT_JUDGED = "better", "as_good", "alone", "doubtful", "-"
 EXPLANATION = (
-    "judged: whether the model was better than the one at hand at its training, without labels; "
-    "- = not compared. Models of one object are in this order: better, not compared, doubtful. "
+    "judged: whether the model was better than the one at hand at its training, or as good, "
+    "without labels; alone = no other model had its keypoints; - = not judged. Models of one "
+    "object are in this order: better, as good, alone, not judged, doubtful. Your newest model "
+    "has file, data, reason and errors below it; --details shows them for all. "
     "Errors on the data of a training compare models of these data alone. A date with ~ is that of "
     "the file, since the model does not record the day of its training"
 )
 
 
 class Listed(NamedTuple):
-    """A model file in the list: a row of `COLUMNS`, and notes for the lines below it."""
+    """A model file in the list.
+
+    Attributes:
+        row: cells of `COLUMNS`.
+        notes: lines below it that are always shown: what is wrong with the file.
+        details: further lines, shown for the newest model or where they are asked for.
+        time: when the file was written, in s; 0: it is not in the user's own folder.
+    """
 
     row: tuple[str, ...]
     notes: tuple[str, ...]
+    details: tuple[str, ...] = ()
+    time: float = 0.0
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -42,6 +53,11 @@ def arguments() -> argparse.ArgumentParser:
         default=default_models_dir(),
         help="folder of your own models, as the lifter's parameter models_dir; they hide those "
         "that come with the package and have the same name (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--details",
+        action="store_true",
+        help="show file, data, reason and errors of every model, not of the newest alone",
     )
     return parser
 
@@ -68,24 +84,29 @@ def list_models(folders: Sequence[Path]) -> list[Listed]:
             listed.append(Listed((path.stem, "unusable"), (str(error), *note)))
             continue
         row = (path.stem, model.layout.name, str(len(model.layout)), _verdict(model))
-        notes = (str(path), _origin(model), *_judgement(model), *_quality(model), *note)
-        listed.append(Listed((*row, _date(model, path)), notes))
+        details = (str(path), _origin(model), *_judgement(model), *_quality(model))
+        written = path.stat().st_mtime if path.parent == folders[0] else 0.0
+        listed.append(Listed((*row, _date(model, path)), note, details, written))
     return sorted(listed, key=_rank)
 
 
 def _rank(listed: Listed) -> tuple[bool, str, int]:
     """Return the place of a model in the list."""
     usable = len(listed.row) == len(COLUMNS)
-    verdicts = (BETTER, NOT_JUDGED, DOUBTFUL)
+    verdicts = (BETTER, AS_GOOD, ALONE, NOT_JUDGED, DOUBTFUL)
     return not usable, listed.row[1], verdicts.index(listed.row[3]) if usable else 0
 
 
 def _verdict(model: Model) -> str:
     """Return what the judge of the training says of a model."""
     judgement = model.provenance.get("judgement")
-    if not isinstance(judgement, dict) or not ("rival" in judgement or judgement.get("doubtful")):
+    if not isinstance(judgement, dict):
         return NOT_JUDGED
-    return DOUBTFUL if judgement.get("doubtful") else BETTER
+    if judgement.get("doubtful"):
+        return DOUBTFUL
+    if "rival" not in judgement:
+        return ALONE
+    return AS_GOOD if judgement.get("verdict") == AS_GOOD else BETTER
 
 
 def _quality(model: Model) -> tuple[str, ...]:
@@ -123,7 +144,7 @@ def _origin(model: Model) -> str:
 
 
 def _judgement(model: Model) -> tuple[str, ...]:
-    """Return a note with the judgement, if the model was compared with another or is doubtful."""
+    """Return a note with the judgement, if there is one."""
     if _verdict(model) == NOT_JUDGED:
         return ()
     return (str(model.provenance["judgement"].get("reason")),)
@@ -132,15 +153,22 @@ def _judgement(model: Model) -> tuple[str, ...]:
 _COUNTS = {"frames": "frames", "step": "steps"}
 
 
-def show(listed: Sequence[Listed]) -> str:
-    """Return the models as a table for people, each with its notes below it."""
+def show(listed: Sequence[Listed], *, details: bool = True) -> str:
+    """Return the models as a table for people, each with its notes below it.
+
+    Args:
+        listed: the models.
+        details: whether each has its details too; otherwise the newest one alone has.
+    """
+    newest = max((model.time for model in listed), default=0.0)
     rows = [COLUMNS, *(model.row for model in listed)]
     widths = [max(len(row[i]) for row in rows if len(row) > i) for i in range(len(COLUMNS))]
     lines = []
-    for row, notes in [(COLUMNS, ()), *listed]:
+    for row, notes, more, written in [Listed(COLUMNS, ()), *listed]:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=False))
         lines.append("  ".join(cells).rstrip())
-        for note in notes:
+        has_details = details or (written > 0 and written == newest)
+        for note in (*(more if has_details else ()), *notes):
             lines += textwrap.wrap(
                 note,
                 100,
@@ -161,7 +189,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not listed:
         print(f"failed: no models in {', '.join(map(str, folders))}", file=sys.stderr)
         sys.exit(2)
-    print(show(listed), textwrap.fill(EXPLANATION, 100), sep="\n\n")
+    print(show(listed, details=args.details), textwrap.fill(EXPLANATION, 100), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from pathlib import Path
 from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.configuration import add_arguments
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.data.hands import SIDES
 from deep_nrsfm_ros.data.keypoint_files import KINDS
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
@@ -72,6 +73,13 @@ def parser() -> argparse.ArgumentParser:
     for side in ("width", "height"):
         text = f"{side} of the image in pixels, for keypoints given as shares of it"
         data.add_argument(f"--image-{side}", type=int, help=text)
+    data.add_argument(
+        "--hands",
+        choices=SIDES,
+        help="what the recorded hands are, for a model of right hands: right, left (mirrored "
+        "before the training), or palms (each hand shows its palm: those that look like left ones "
+        "are mirrored) (default: unknown; both sides mixed make a model doubtful)",
+    )
     data.add_argument("--cmu", type=Path, help="folder of the CMU database (NN/NN.asf, *.amc)")
     data.add_argument("--subjects", nargs="*", help="CMU subjects (default: 01)")
     data.add_argument(
@@ -208,15 +216,30 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
         for text in warnings:
             reporter.warn(text)
         values["warning"] = "; ".join(warnings)
-    message = result.message
+    lines = [result.message]
     if judgement := result.judgement:
         values["judgement"] = "doubtful" if judgement.doubtful else "better"
-        message += f"; {judgement}"
+        lines = [str(judgement), f"model {result.message}"]
         if judgement.doubtful:
-            reporter.warn(str(judgement))
+            reporter.warnings.append(str(judgement))  # for the page; the last line says it as well
     page = write_page(result, reporter)
-    message += f"; report {page}" if page else ""
+    lines += [f"report {page}"] if page else []
+    if not reporter.as_json and result.state == "finished":  # else the lifter says it
+        lines.append(_how_to_use(result.path))
+    message = ("; " if reporter.as_json else "\n  ").join(lines)
+    if not reporter.as_json:
+        message = message.replace(". Judged ", "\n  judged ")
     reporter.end(result.state, message, model=str(result.path), report=page, **values)
+
+
+def _how_to_use(path: Path) -> str:
+    """Return how a model is put in use."""
+    known = path.parent.resolve() == default_models_dir().resolve()
+    name = path.stem if known else str(path)
+    return (
+        f"not in use before you choose it: lift FILE --model {name}, or in a lifter: "
+        f"ros2 param set /lifter model {path.stem}"
+    )
 
 
 def write_page(result: TrainingResult, reporter: Reporter) -> str:

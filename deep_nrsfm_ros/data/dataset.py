@@ -33,6 +33,7 @@ class Dataset:
             reads it, training never does.
         sequence_starts: (s,) int64, ascending from 0, first frames of the sequences: recordings,
             views or identities, the frames of each in the order of their time. Empty: unknown.
+        is_one_side: whether hands are said to be right ones, or were made so; see `data.hands`.
     """
 
     points: NDArray[np.float32]
@@ -41,6 +42,7 @@ class Dataset:
     source: str
     shapes: NDArray[np.float32] | None = None
     sequence_starts: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    is_one_side: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError if the shapes of the arrays do not match each other or the layout."""
@@ -75,7 +77,9 @@ class Dataset:
         if len(starts):
             sequence = np.searchsorted(starts, np.arange(len(self))[frames], "right")
             starts = np.flatnonzero(np.diff(sequence, prepend=-1))
-        return Dataset(points, visible, self.layout, self.source, shapes, starts)
+        return Dataset(
+            points, visible, self.layout, self.source, shapes, starts, is_one_side=self.is_one_side
+        )
 
 
 def concatenate(datasets: list[Dataset]) -> Dataset:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.hands import mixed_sides
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible, on_one_line, polar, rms_radius
 
 Floats = NDArray[np.float64]
@@ -116,6 +117,8 @@ def assess_sufficiency(dataset: Dataset, *, has_start: bool = False) -> Sufficie
     figures = (frames, keypoints, tuple(values.tolist()), span, deformation)
     refusal = _flatness(values)
     warnings = () if refusal else _warnings(frames, span, deformation, has_start)
+    if sides := mixed_sides(dataset):
+        warnings = (*warnings, sides)
     return Sufficiency(*figures, refusal, warnings)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -17,6 +18,7 @@ Edge = tuple[str, str]
 Tetrahedron = tuple[str, str, str, str]
 TRUNK = ("neck", "mid_hip")
 """Reference pair of people."""
+_SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
 _FIELDS = {
     "edge": "edges",
     "rigid pair": "rigid",
@@ -134,6 +136,14 @@ class KeypointLayout:
     @property
     def warning(self) -> str:
         """A warning for whoever trains on this layout; "" if there is none."""
+        for left, right, *_ in self.handedness[:1]:  # another four may be upside down, as a knee's
+            if _side(left) == "right" and _side(right) == "left":
+                return (
+                    f"layout {self.name!r}: its handedness has left: {left} and right: {right}, "
+                    "against their names. Left and right are the object's own, as seen from "
+                    "behind: exchange the two, or all comes out mirrored. It is right only where "
+                    "the keypoints are named as a camera in front sees them"
+                )
         if self.handedness:
             return ""
         return (
@@ -183,3 +193,10 @@ class KeypointLayout:
     def numbered(cls, p: int) -> KeypointLayout:
         """Return a layout of p points named point_0, point_1, ..., for an object without names."""
         return cls(name=f"points{p}", keypoints=tuple(f"point_{i}" for i in range(p)))
+
+
+def _side(keypoint: str) -> str:
+    """Return "left" or "right" where the name of a keypoint has it as a word or letter, else ""."""
+    words = re.split(r"[\W_]+|(?<=[a-z])(?=[A-Z])", keypoint)
+    found = {_SIDES[word.lower()] for word in words if word.lower() in _SIDES}
+    return found.pop() if len(found) == 1 else ""

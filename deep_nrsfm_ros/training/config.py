@@ -45,6 +45,7 @@ class DataConfig:
         mapping: field mapping (.yaml) for messages of other types; "" is none.
         missing_value, min_score, category: as in `ReadOptions`, for bags and files.
         image_width, image_height: pixels, for keypoints given as shares of the image; 0 unknown.
+        hands: what is known of recorded hands, one of `data.hands.SIDES`; "" is nothing.
         cmu: folder of the CMU motion capture (NN/NN.asf, NN/*.amc); None for keypoints.
         subjects: folders of the CMU subjects.
         all_trials: take all trials of a subject, not only the paper's first floor(0.8 N).
@@ -66,6 +67,7 @@ class DataConfig:
     category: str = DEFAULT_READ_OPTIONS.category
     image_width: int = 0
     image_height: int = 0
+    hands: str = ""
     cmu: Path | None = None
     subjects: tuple[str, ...] = ("01",)
     all_trials: bool = False

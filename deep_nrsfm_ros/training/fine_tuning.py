@@ -29,6 +29,9 @@ from deep_nrsfm_ros.nrsfm.geometry import Array
 from deep_nrsfm_ros.nrsfm.network import Network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 
+RARELY_SHOWN = "rarely_shown"
+"""Key of a provenance: keypoints that less than half of the frames show."""
+
 _FEWEST = 4  # keypoints, as for lifting: fewer than a tetrahedron has are no 3D shape
 
 _FRAMES_A_STEP = 3  # 64 a batch are 21 passes over the frames
@@ -127,7 +130,9 @@ def inherit(trained: Model, start: Model) -> Model:
     Where the layout names no handedness, the object frame is that of `start` too: the network keeps
     the axes of its start and the sign of depth. So are the bones where `start` has learned them
     from many people, as a training on one person from few sides does not see their lengths
-    (docs/devlog/training.md has the errors with either). The error covariance is the new network's.
+    (docs/devlog/training.md has the errors with either). The error covariance is the new network's,
+    unless frames rarely show some keypoints: those of an upper body, filled in, make whole people
+    worse, and the covariance of `start` does not.
     """
     origin = {"model": start.name, "data": start.provenance.get("data", "unknown")}
     if trained.provenance["recipe"]["steps"] == 0:  # the network is that of the start
@@ -135,6 +140,14 @@ def inherit(trained: Model, start: Model) -> Model:
     model = dataclasses.replace(trained, provenance=trained.provenance | {"from": origin})
     if not trained.layout.handedness:
         model = dataclasses.replace(model, object_frame=start.object_frame)
+    if _has_better_covariance(start, trained):
+        model.provenance["from"]["error_covariance"] = "kept"
+        model = dataclasses.replace(
+            model,
+            error_covariance=start.error_covariance,
+            hidden_keypoints=start.hidden_keypoints,
+            hidden_covariance=start.hidden_covariance,
+        )
     if _has_better_bones(start, trained):
         model.provenance["from"]["bones"] = "kept"
         model = dataclasses.replace(
@@ -149,3 +162,14 @@ def _has_better_bones(start: Model, trained: Model) -> bool:
     same = same and trained.layout.bone_indices() == start.layout.bone_indices()
     anew = trained.provenance["recipe"]["steps"] == 0  # what such a training is for
     return same and not anew and start.bone_correlation.size > trained.bone_correlation.size
+
+
+def _has_better_covariance(start: Model, trained: Model) -> bool:
+    """Return whether `start` knows the errors of keypoints that the frames rarely show.
+
+    They are the new network's too, as far as its weights are those of the start.
+    """
+    said = trained.provenance
+    same = trained.layout.keypoints == start.layout.keypoints and start.error_covariance.size > 0
+    has_share = said["recipe"]["start_share"] > 0 and said["recipe"]["steps"] != 0
+    return same and has_share and RARELY_SHOWN in said and "last_step" not in said

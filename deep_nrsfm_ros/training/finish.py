@@ -28,8 +28,10 @@ from deep_nrsfm_ros.nrsfm.geometry import Floats, centre
 from deep_nrsfm_ros.nrsfm.handedness import object_frame
 from deep_nrsfm_ros.nrsfm.network import Network, coherence, complete, reconstruct
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
+from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
 from deep_nrsfm_ros.training.trainer import Trainer
 
+_SHOWN = 0.5  # share of the frames; of keypoints shown in fewer, most errors are of filled-in ones
 _MOST_FRAMES = 2048  # on which the object frame, the error covariance and the bones are measured
 
 
@@ -74,6 +76,9 @@ def finish(
     S, _, _ = _lift(net, trainer.preset.normaliser)(W)
     statistics = _error_statistics(trainer, net, layout, W, last_step_data)
     provenance = _provenance(trainer, source)
+    shares = mask[..., 0].mean(0)
+    if rare := [k for k, share in zip(layout.keypoints, shares, strict=True) if share < _SHOWN]:
+        provenance[RARELY_SHOWN] = rare
     if last_step_data is not None:
         provenance["last_step"] = {"data": last_step_data.source, "frames": len(last_step_data)}
     return Model(

@@ -19,15 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
+from deep_nrsfm_ros.data.hands import MIXED, mixed_sides
 from deep_nrsfm_ros.data.held_out import Split
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout, Tetrahedron
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre_visible
 from deep_nrsfm_ros.nrsfm.handedness import MIN_VISIBLE_SHARE, votes
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
 
@@ -36,6 +38,7 @@ Floats = NDArray[Any]
 _Lifted = tuple[Floats, Floats, NDArray[np.bool_]]
 
 _MOST_FRAMES = 2000
+_MOST_NAMES = 3  # keypoints that a sentence lists
 _NETWORK_ALONE = LiftingOptions(correction="none", test_time_rotations=1)
 _WITH_CORRECTION = LiftingOptions()
 
@@ -84,16 +87,26 @@ class Figures(NamedTuple):
 
 
 IN_WORDS = {
-    "misfit": "its keypoints and bones are off by {:.1%} of the size of the object",
-    "mirrored_share": "{:.1%} of its frames are mirrored against their neighbours",
-    "front_disagreement": "in {:.1%} of the frames its front is behind",
-    "opposed": "it lifts {:.1%} of the frames to the mirror image of the other's",
-    "turned": "it lifts {:.1%} of the frames to the mirror image of what its start makes of them",
-    "bone_variation": "its bones vary by {:.1%} of their lengths",
+    "misfit": "its image error and its bones together are off by {} of the size of the object",
+    "mirrored_share": "{} of its frames are mirrored against their neighbours",
+    "front_disagreement": "in {} of the frames its front is behind",
+    "opposed": "it lifts {} of the frames to the mirror image of the other's",
+    "turned": "it turns {} of the frames to the mirror image of what its start makes of them",
+    "bone_variation": "its bone lengths vary by {}",
 }
 """The figures by which the rule decides, in words."""
 
 _BESIDE = ("opposed", "turned")  # figures that need a model beside it
+_SHOWN = {
+    "residual": "image error of the network before the correction {} of the size of the object",
+    "bone_variation": "bone lengths vary by {}",
+    "wrong_sides": "frames that look mirrored {}",
+}
+BETTER, AS_GOOD, ALONE, DOUBTFUL = "better", "as_good", "alone", "doubtful"
+"""Verdicts; alone: no other model has these keypoints."""
+MIN_SEEN_SHARE = 0.25
+"""Share of an object's keypoints that a frame must show to tell its side: of 4 of 25 keypoints the
+mirror image is as good, and the network's prior alone decides."""
 
 MORE_WRONG_SIDES = 0.005
 """Share of mirrored or turned frames by which a model must differ from another to be worse.
@@ -153,6 +166,7 @@ class Judgement(NamedTuple):
         figures: of the new model.
         rival: name of the model at hand; "" where there is none with its keypoints.
         rival_figures: its figures.
+        verdict: BETTER, AS_GOOD, ALONE or DOUBTFUL.
         faults: of its data, a sentence each: a model learns what is wrong in its data, and the
             figures on such data do not show it.
     """
@@ -162,6 +176,7 @@ class Judgement(NamedTuple):
     figures: Figures
     rival: str = ""
     rival_figures: Figures | None = None
+    verdict: str = DOUBTFUL
     faults: tuple[str, ...] = ()
 
     @property
@@ -176,6 +191,7 @@ class Judgement(NamedTuple):
     def record(self) -> dict[str, Any]:
         """Return the judgement for the provenance of the new model."""
         result: dict[str, Any] = {"doubtful": self.doubtful, "reason": str(self)}
+        result["verdict"] = DOUBTFUL if self.doubtful else self.verdict
         result["figures"] = _rounded(self.figures)
         if self.rival_figures:
             result |= {"rival": self.rival, "rival_figures": _rounded(self.rival_figures)}
@@ -223,20 +239,110 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         unknown = Figures(*[math.nan] * len(Figures._fields))
         return Judgement(f"{error}; {_advice(model, '')} would help", "", unknown)
     name = rival.name if rival is not None and old else ""
-    on = f"on {len(frames.held_out)} held-out frames"
-    if frames.held_out is frames.training:
-        on = f"on the {len(frames.held_out)} frames of its training, which is weak evidence"
-    than = f"compared with model {name!r} {on}" if name else on
-    shown = [each for each in IN_WORDS if each in _known(new) and (old or each not in _BESIDE)]
-    summary = "; ".join(_in_words(each, new, old) for each in shown)
+    verdict = _verdict(new, old)
+    figures = f"{_on(frames)}: {_shown(new, old, name)}"
+    if not model.layout.handedness and old is None:
+        figures += f", which says nothing of depth. {MIRRORED_AS_A_WHOLE.format(model.name)}"
+    elif model.layout.warning and old is None:
+        figures += f". But {model.layout.warning}"
+    figures += _guessed(model)
+    beside = f" beside model {name!r}" if name else ""
     reason = ""
     if worse := worse_figures(new, old):
-        reasons = "; ".join(_in_words(each, new, old) for each in worse)
-        reason = f"{than}, {reasons}; {_advice(model, name)} would help"
-    verdict = (
-        f"is better than model {name!r} {on}" if name else f"has no other to compare with; {on}"
+        reason = "; ".join(_in_words(each, new, old, name) for each in worse)
+        if old is None and worse == ["front_disagreement"]:
+            reason += _fronts_in_words(comparison.fronts(model))
+        else:
+            reason += f"; {_advice(model, name)} would help"
+    if sides := mixed_sides(frames.training, MIXED):  # more frames would not help
+        reason = sides
+    if reason:
+        verdict, reason = DOUBTFUL, f"{reason}. Judged{beside} {figures}"
+    summary = f"the new model {_IN_SENTENCES[verdict].format(name, *_gains(new, old))}"
+    summary += f". Judged {figures}"
+    return Judgement(reason, summary, new, name, old, verdict)
+
+
+_IN_SENTENCES = {
+    BETTER: "is better than model {!r}: it fits {}, and mirrors {} frames",
+    AS_GOOD: "is as good as model {!r}: both fit alike, and it mirrors no more frames",
+    ALONE: "has no other to compare with: nothing shows that it mirrors frames",
+    DOUBTFUL: "is doubtful",
+}
+MIRRORED_AS_A_WHOLE = (
+    "The layout names no handedness, so the whole may be a mirror image: look at it from the side "
+    "(replay FILE --model {} --html look.html), or name a handedness and train again"
+)
+"""What is said of a model whose depth nothing decides."""
+
+
+def _verdict(new: Figures, old: Figures | None) -> str:
+    """Return the verdict on a model that the rule does not doubt."""
+    if old is None:
+        return ALONE
+    return AS_GOOD if _gains(new, old) == ("alike", "no more") else BETTER
+
+
+def _gains(new: Figures, old: Figures | None) -> tuple[str, str]:
+    """Return how a model that is not doubted fits, and how many frames it mirrors."""
+    old = old or new
+    closer = SAME_MISFIT * new.misfit < old.misfit
+    looser = new.misfit > SAME_MISFIT * old.misfit  # allowed beside a model that mirrors frames
+    is_opposed = _or_zero(new.opposed) > MOST_OPPOSED
+    fewer = is_opposed or old.wrong_sides > new.wrong_sides + MORE_WRONG_SIDES
+    fit = "more closely" if closer else "less closely" if looser else "alike"
+    return fit, "fewer" if fewer else "no more"
+
+
+def _on(frames: Split) -> str:
+    """Return on which frames models are compared."""
+    count = len(frames.held_out)
+    if frames.held_out is frames.training:
+        return f"on the {count} frames of its training, which is weak evidence"
+    return f"on {count} held-out frames, later ones that it was not trained on"
+
+
+def _shown(new: Figures, old: Figures | None, name: str) -> str:
+    """Return a few figures of both models in words."""
+    values = [
+        (each, getattr(new, each), getattr(old, each) if old else math.nan) for each in _SHOWN
+    ]
+    is_known = not math.isnan(new.mirrored_share) or not math.isnan(new.front_disagreement)
+    texts = []
+    for each, value, other in values:
+        if each == "wrong_sides" and not is_known:
+            texts.append("whether frames are mirrored cannot be told here")
+        elif not math.isnan(value):
+            beside = "" if math.isnan(other) else f" ({name}: {percent(other)})"
+            texts.append(_SHOWN[each].format(percent(value)) + beside)
+    return ", ".join(texts)
+
+
+def _guessed(model: Model) -> str:
+    """Return a sentence on the keypoints that the frames rarely show; "" if there are none."""
+    rare = model.provenance.get(RARELY_SHOWN, [])
+    if not rare:
+        return ""
+    more = f" and {len(rare) - _MOST_NAMES} more" if len(rare) > _MOST_NAMES else ""
+    said = "their guesses rest on the start" if "from" in model.provenance else "only guessed"
+    return f". Rarely shown: {', '.join(rare[:_MOST_NAMES])}{more} ({said})"
+
+
+def percent(share: float) -> str:
+    """Return a share as a percentage with two digits."""
+    value = 100 * share
+    return f"{value:.0f} %" if value >= 9.95 or value < 0.05 else f"{value:.1f} %"
+
+
+def _fronts_in_words(fronts: Sequence[tuple[Tetrahedron, float]]) -> str:
+    """Return where the fours of a handedness do not hold, the worst one first, and the remedy."""
+    four, behind = max(fronts, key=lambda each: each[1])
+    left, right, up, front = four
+    return (
+        f": {front} lies behind {left}, {right} and {up} in {percent(behind)}. This need not be "
+        "the model's fault: the layout's four may not always hold (as where an animal turns its "
+        "head). Name fours of a part that does not bend, or several, which vote"
     )
-    return Judgement(reason, f"the new model {verdict}: {summary}", new, name, old)
 
 
 def worse_figures(new: Figures, old: Figures | None) -> list[str]:
@@ -301,11 +407,11 @@ def _rounded(figures: Figures) -> dict[str, float]:
     return {name: round(value, 5) for name, value in _known(figures).items()}
 
 
-def _in_words(name: str, new: Figures, old: Figures | None) -> str:
+def _in_words(name: str, new: Figures, old: Figures | None, rival: str) -> str:
     """Return a figure of both models in words."""
-    text = IN_WORDS[name].format(getattr(new, name))
+    text = IN_WORDS[name].format(percent(getattr(new, name)))
     known = _known(old) if old and name not in _BESIDE else {}
-    return f"{text} (the other's: {known[name]:.1%})" if name in known else text
+    return f"{text} ({rival}: {percent(known[name])})" if name in known else text
 
 
 def _advice(model: Model, rival: str) -> str:
@@ -431,8 +537,24 @@ class Judge:
         S, _, visible = self._lift(model, corrected=corrected)
         T, residual, also_visible = self._lift(other, corrected=corrected)
         both, sound = visible & also_visible, np.isfinite(residual)
-        aligned = align(_unit(S, both), _unit(T, both), allow_reflection=True)
-        return float(aligned.mirrored[sound].mean())
+        tells = sound & (both.sum(1) >= MIN_SEEN_SHARE * both.shape[1])
+        if not tells.any():
+            return 0.0
+        aligned = align(_unit(S, both)[tells], _unit(T, both)[tells], allow_reflection=True)
+        return float(aligned.mirrored.sum() / sound.sum())
+
+    def fronts(self, model: Model) -> list[tuple[Tetrahedron, float]]:
+        """Return each four of the data's handedness that counts, with its share of frames behind.
+
+        The front of a four is behind in such a frame.
+        """
+        S, _, visible = self._lift(model)
+        layout = self._held_out.layout
+        corners = np.array([[layout.index(name) for name in four] for four in layout.handedness])
+        counts: NDArray[np.bool_] = np.asarray(visible[:, corners].all(2), bool)
+        behind = (votes(S, layout) < 0) & counts
+        shares = behind.sum(0) / np.maximum(counts.sum(0), 1)
+        return list(zip(layout.handedness, map(float, shares), strict=True))
 
 
 def _spread(dataset: Dataset, most: int = _MOST_FRAMES) -> Dataset:

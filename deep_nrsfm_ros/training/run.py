@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -15,6 +14,7 @@ import numpy as np
 from safetensors import SafetensorError
 
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.hands import as_right_hands
 from deep_nrsfm_ros.data.held_out import Split, split
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
@@ -92,6 +92,8 @@ def run(
     validate(config, COMMAND_LINE)
     try:
         dataset, detector_layout, faults = read_data(config, reporter)
+        if config.data.hands:
+            dataset = as_right_hands(dataset, config.data.hands)
         prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
     except (ValueError, OSError) as error:
         if should_stop():  # whoever stopped it meanwhile does not ask what the data is like
@@ -128,6 +130,8 @@ def _train_and_save(
     rivals = _rivals(config, prepared.dataset.layout, rival, old)
     share = config.curation.held_out if rivals else 0.0
     frames = split(prepared.dataset, share)
+    if frames.held_out is not frames.training:
+        reporter.say(_shared_out(len(prepared.dataset), frames))
     trainer = _train(config, frames.training, checkpoint, reporter, should_stop)
     if trainer.group.rank:
         return None
@@ -247,11 +251,22 @@ def _describe(
             if start
             else "starts from random weights"
         )
-    if dataset.layout.warning and not start:  # a start passes its handedness on
+    # A start passes its handedness on to a layout without one.
+    if dataset.layout.warning and (dataset.layout.handedness or not start):
         reporter.warn(dataset.layout.warning)
     if unseen := never_seen(dataset):
         reporter.warn(unseen)
     reporter.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
+
+
+def _shared_out(total: int, frames: Split) -> str:
+    """Return how many frames are trained on, held out and in neither part."""
+    training, held_out = len(frames.training), len(frames.held_out)
+    return (
+        f"{training} of the {total} frames are trained on; {held_out} later ones are held out to "
+        f"judge the model, and {total - training - held_out} between them are left out "
+        "(--held-out, train.held_out)"
+    )
 
 
 def _train(
@@ -304,7 +319,7 @@ def _ending(trainer: Trainer, path: Path, model: Model, checkpoint: Path) -> tup
         message = f"{path} holds what was learned so far"
         return "cancelled", message + (", --resume goes on" if checkpoint.exists() else "")
     checkpoint.unlink(missing_ok=True)
-    message, steps = f"{path} {json.dumps(model.quality)}", trainer.preset.recipe.steps
+    message, steps = str(path), trainer.preset.recipe.steps
     if trainer.step < steps:
         message += f"; after {trainer.step} of {steps} steps {trainer.end_reason}"
     return "finished", message

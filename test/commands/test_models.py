@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,8 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path
     return own, shared
 
 
-def listing(capsys: pytest.CaptureFixture[str], own: Path) -> list[str]:
-    models.main(["--models-dir", str(own)])
+def listing(capsys: pytest.CaptureFixture[str], own: Path, *options: str) -> list[str]:
+    models.main(["--models-dir", str(own), *options])
     return capsys.readouterr().out.splitlines()
 
 
@@ -95,7 +96,7 @@ def test_models_stand_in_the_order_of_the_judge(
         quality = {"reprojection_error": 0.01 if name == "a" else 0.1}
         save(folders[0] / f"{name}.safetensors", provenance=provenance, quality=quality)
     (folders[0] / "aa.safetensors").write_bytes(b"\0" * 9)
-    lines = listing(capsys, folders[0])
+    lines = listing(capsys, folders[0], "--details")
     rows = [line.split() for line in lines[1 : lines.index("")] if not line.startswith(" ")]
     assert [(row[0], row[3] if len(row) > 3 else "") for row in rows] == [
         ("c", "better"),
@@ -183,3 +184,41 @@ def test_the_date_of_a_file_is_explained(
     said = listing(capsys, folders[0])
     assert said[1].split()[-1].startswith("~")
     assert "A date with ~ is that of the file" in " ".join(said)
+
+
+def test_many_models_have_a_line_each_and_the_newest_its_reason(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k in range(40):
+        said = {"doubtful": k == 7, "reason": f"reason {k}.", "rival": "human"}
+        path = save(folders[0] / f"m{k}.safetensors", provenance=PROVENANCE | {"judgement": said})
+        os.utime(path, (1e9 + k % 30, 1e9 + k % 30))
+    save(folders[1] / "shipped.safetensors")  # newer, but not the user's own
+    os.utime(folders[0] / "m7.safetensors", (2e9, 2e9))
+    lines = listing(capsys, folders[0])
+    table = lines[: lines.index("")]
+    assert [line.strip() for line in table if "reason" in line] == ["reason 7."]
+    assert len(table) == 1 + 41 + 4 and max(map(len, table[:41])) < 80
+    assert sum("reason" in line for line in listing(capsys, folders[0], "--details")) >= 40
+
+
+def test_each_verdict_has_its_word(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    verdicts = {
+        "a": {"doubtful": False, "verdict": "alone"},
+        "b": {"doubtful": False, "verdict": "as_good", "rival": "human"},
+        "c": {"doubtful": False, "verdict": "better", "rival": "human"},
+        "d": {"doubtful": False, "rival": "human"},  # of an earlier version
+    }
+    for name, said in verdicts.items():
+        save(folders[0] / f"{name}.safetensors", provenance=PROVENANCE | {"judgement": said})
+    rows = [
+        line.split() for line in listing(capsys, folders[0]) if line[:2] in ("a ", "b ", "c ", "d ")
+    ]
+    assert {row[0]: row[3] for row in rows} == {
+        "a": "alone",
+        "b": "as_good",
+        "c": "better",
+        "d": "better",
+    }

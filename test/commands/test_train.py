@@ -20,6 +20,7 @@ import pytest
 from benchmarks.data.walking_person import in_layout
 from deep_nrsfm_ros.commands import train
 from deep_nrsfm_ros.data.bags import frames, write_bag
+from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout_file import read_layout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
@@ -149,6 +150,24 @@ def test_from_bag_to_model(
     assert model.provenance["recipe"]["steps"] == 30 and model.provenance["step"] == 30
     assert lines[-1]["cycle_error"] == model.quality["cycle_error"]
     assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
+
+
+def test_people_read_verdict_file_and_how_to_use_it_in_short_lines(
+    tmp_path: Path, models: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views = [np.dstack((view.points, view.confidence)) for view in read_clip().session.views]
+    np.save(tmp_path / "people.npy", np.concatenate(views))
+    words = ("--input", str(tmp_path / "people.npy"), "--keypoint-layout", "body25b")
+    assert in_process(*words, "--output", str(models), *QUICK, "--steps", "5") == 0
+    said = capsys.readouterr()
+    shared_out = next(line for line in said.err.splitlines() if "are trained on;" in line)
+    assert "later ones are held out to judge the model" in shared_out
+    verdict, figures, file, report, use = said.out.strip().splitlines()
+    assert verdict.startswith("finished: the new model is doubtful: ") and len(verdict) < 700
+    assert figures.startswith("  judged beside model 'human' on ") and len(figures) < 400
+    assert file == f"  model {models / 'mine.safetensors'}" and report.startswith("  report ")
+    assert "not in use before you choose it: lift FILE --model" in use and "/lifter model" in use
+    assert "{" not in said.out and "the new model is doubtful" not in said.err
 
 
 @pytest.mark.parametrize("how", ["SIGTERM", "end of standard input"])

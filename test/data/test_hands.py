@@ -4,8 +4,19 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from deep_nrsfm_ros.data.hands import mirrored, palms_as_right_hands, right_hands
+from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.hands import (
+    as_right_hands,
+    mirrored,
+    mixed_sides,
+    other_side_share,
+    palms_as_right_hands,
+    right_hands,
+)
+from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import preset
 
 LAYOUT = preset("hand21")
@@ -34,6 +45,40 @@ def test_a_mirrored_image_is_mirrored_back() -> None:
     right = right_palm() - np.array([200, 0], np.float32)
     pair = np.stack([right, mirrored(right)])[None]
     np.testing.assert_array_equal(right_hands(mirrored(pair), mirrored_image=True)[0], right)
+
+
+def hands(right: int, left: int) -> Dataset:
+    """Return so many right and left palms."""
+    palm = right_palm()
+    points = np.stack([palm] * right + [mirrored(palm)] * left)
+    points += np.random.default_rng(1).normal(0, 0.5, points.shape).astype(np.float32)
+    return Dataset(points, np.ones(points.shape[:2], bool), LAYOUT, "test")
+
+
+def test_hands_of_both_sides_are_asked_about_unless_their_side_is_said() -> None:
+    mixed = hands(60, 40)
+    assert other_side_share(mixed) == pytest.approx(0.4)
+    assert "40 % of the hands look like those of the other side" in mixed_sides(mixed)
+    assert any("--hands palms" in text for text in assess_sufficiency(mixed).warnings)
+    assert mixed_sides(hands(95, 5)) == "" == mixed_sides(hands(0, 100))
+    assert mixed_sides(mixed, 0.5) == ""
+    for side in ("right", "left", "palms"):
+        said = as_right_hands(mixed, side)
+        assert mixed_sides(said) == "" == mixed_sides(said[:10])
+        assert other_side_share(said) == pytest.approx(0.0 if side == "palms" else 0.4)
+        assert (said.points[0, 0, 0] == mixed.points[0, 0, 0]) == (side != "left")
+
+
+def test_other_objects_and_hidden_palms_are_no_question() -> None:
+    other = KeypointLayout("other", tuple(f"k{i}" for i in range(21)))
+    mixed = hands(50, 50)
+    unknown = Dataset(mixed.points, mixed.visible, other, "test")
+    assert mixed_sides(unknown) == ""
+    with pytest.raises(ValueError, match="'other' has no wrist, index_mcp, pinky_mcp"):
+        as_right_hands(unknown, "right")
+    visible = mixed.visible.copy()
+    visible[:, LAYOUT.index("wrist")] = False
+    assert mixed_sides(Dataset(mixed.points, visible, LAYOUT, "test")) == ""
 
 
 def test_palms_become_right_ones() -> None:

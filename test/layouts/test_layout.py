@@ -50,3 +50,24 @@ def test_the_mirror_image_exchanges_left_and_right() -> None:
     assert one_sided.partners() is None
     partners = HUMAN17.partners()
     assert partners is not None and [partners[i] for i in partners] == list(range(17))
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "exchanged"),
+    [
+        ("right_wing", "left_wing", True),
+        ("wing.R", "wing.L", True),
+        ("WristR", "WristL", True),
+        ("left_wing", "right_wing", False),
+        ("left_wing", "beak", False),
+        ("right_wing", "beak", False),  # one name alone may mean another side
+        ("bright", "cleft", False),
+    ],
+)
+def test_sides_against_the_names_of_the_keypoints_are_warned_of(
+    left: str, right: str, exchanged: bool
+) -> None:
+    keypoints = (left, right, "back", "front")
+    warning = KeypointLayout("bird", keypoints, handedness=(keypoints,)).warning
+    assert bool(warning) == exchanged
+    assert not exchanged or f"left: {left} and right: {right}" in warning

@@ -224,6 +224,24 @@ def test_bones_of_many_people_are_kept_by_a_training_on_few_views(
         assert "bones" not in model.provenance["from"]
 
 
+def test_errors_of_keypoints_that_no_frame_shows_are_those_that_the_start_knows(
+    source: Model, figure: Any
+) -> None:
+    points = np.ascontiguousarray(figure.points[:300])
+    for hidden, share, kept in ((0, 0.6, False), (4, 0.6, True), (4, 0.0, False)):
+        recipe = dataclasses.replace(RECIPE, steps=2, start_share=share)
+        preset = Preset(source.network.architecture, source.normaliser, recipe)
+        visible = np.ones(points.shape[:2], bool)
+        visible[:, :hidden] = False
+        trainer = train(points, visible, preset, Setup(start_from(source, figure.layout)))
+        trained = finish(trainer, "new", figure.layout, "data")
+        rare = list(figure.layout.keypoints[:hidden])
+        assert trained.provenance.get("rarely_shown", []) == rare
+        model = inherit(trained, source)
+        is_same = np.array_equal(model.error_covariance, source.error_covariance)
+        assert is_same == kept == ("error_covariance" in model.provenance["from"])
+
+
 def test_no_steps_keep_the_network_and_learn_the_last_step_from_other_people(
     source: Model, figure: Any
 ) -> None:

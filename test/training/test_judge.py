@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,15 @@ from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import initialise
 from deep_nrsfm_ros.training.finish import finish
-from deep_nrsfm_ros.training.judge import Figures, Judge, judge, rank, standings, worse_figures
+from deep_nrsfm_ros.training.judge import (
+    Figures,
+    Judge,
+    judge,
+    percent,
+    rank,
+    standings,
+    worse_figures,
+)
 from deep_nrsfm_ros.training.trainer import Trainer
 
 GOOD = Figures(
@@ -59,10 +68,10 @@ def test_a_bad_model_is_doubted_and_told_what_would_help(
     frames: Split, good: Model, bad: Model
 ) -> None:
     judgement = judge(frames, bad, good)
-    assert "compared with model 'good' on 60 held-out frames" in judgement.reason
+    assert "Judged beside model 'good' on 60 held-out frames" in judgement.reason
     assert (
         "are mirrored against their neighbours" in judgement.reason
-        and "(the other's: " in judgement.reason
+        and "(good: 0 %)" in judgement.reason
     )
     assert "would help" in judgement.reason and "--from" in judgement.reason
     assert str(judgement).startswith("the new model is doubtful: ")
@@ -88,8 +97,12 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
     for rival in (good, bad):
         judgement = judge(frames, good, rival)
         assert not judgement.doubtful and judgement.rival == rival.name
-        better = f"the new model is better than model {rival.name!r} on 60 held-out frames: "
-        assert str(judgement).startswith(f"{better}its keypoints and bones are off by ")
+        verdict = "as_good" if rival is good else "better"
+        assert judgement.record()["verdict"] == judgement.verdict == verdict
+        than = "as good as" if rival is good else "better than"
+        assert str(judgement).startswith(f"the new model is {than} model {rival.name!r}")
+        assert "on 60 held-out frames, later ones that it was not trained on" in str(judgement)
+        assert f"({rival.name}: " in str(judgement) and len(str(judgement)) < 450
         assert not judgement.record()["doubtful"]
 
 
@@ -99,9 +112,8 @@ def test_mirrored_frames_are_seen_without_another_model(
     from deep_nrsfm_ros.training import judge as module
 
     alone = judge(frames, good, None)
-    assert not alone.doubtful and str(alone).startswith(
-        "the new model has no other to compare with; on 60"
-    )
+    assert not alone.doubtful and alone.verdict == "alone"
+    assert str(alone).startswith("the new model has no other to compare with: nothing shows")
     lift = module._lift
 
     def half_mirrored(model: Model, data: Dataset, options: LiftingOptions) -> Any:
@@ -244,3 +256,77 @@ def test_a_judgement_on_the_frames_of_the_training_says_so(frames: Split, good: 
     few = frames.training[:40]
     judgement = judge(Split(few, few), good, None)
     assert "on the 40 frames of its training" in str(judgement)
+
+
+def test_the_figures_are_named_and_short(frames: Split, good: Model, bad: Model) -> None:
+    text = str(judge(frames, good, bad))
+    assert "image error of the network before the correction " in text
+    assert "bone lengths vary by " in text and "frames that look mirrored 0 % (bad: " in text
+    assert not re.search(r"\d\.\d\d", text)
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.0, "0 %"), (0.0004, "0 %"), (0.0123, "1.2 %"), (0.0996, "10 %")]
+)
+def test_a_percentage_has_two_digits(share: float, text: str) -> None:
+    assert percent(share) == text
+
+
+def test_the_whole_may_be_mirrored_where_a_layout_names_no_handedness(
+    frames: Split, good: Model
+) -> None:
+    nameless = dataclasses.replace(frames.training.layout, handedness=())
+    parts = [dataclasses.replace(part, layout=nameless) for part in frames]
+    model = dataclasses.replace(good, layout=nameless)
+    text = str(judge(Split(*parts), model, None))
+    assert "which says nothing of depth" in text and "may be a mirror image" in text
+    assert "replay FILE --model good --html look.html" in text and "handedness" in text
+    assert "mirror image" not in str(judge(Split(*parts), model, good))  # its start knows the side
+
+
+def test_frames_of_few_keypoints_do_not_tell_a_side(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deep_nrsfm_ros.training import judge as module
+
+    monkeypatch.setattr(module, "MIN_SEEN_SHARE", 0.5)  # of 12 keypoints
+    mirrored = dataclasses.replace(good, object_frame=-good.object_frame, name="other")
+    for shown, opposed in ((12, 1), (6, 1), (5, 0)):
+        some = frames.training[:40]
+        visible = np.zeros_like(some.visible)
+        visible[:, :shown] = True
+        few = dataclasses.replace(some, visible=visible)
+        assert Judge(Split(few, few)).figures(good, mirrored).opposed == opposed, shown
+
+
+def test_keypoints_that_are_rarely_shown_are_named_as_guessed(frames: Split, good: Model) -> None:
+    rare = {"rarely_shown": [f"k{i}" for i in range(5)]}
+    model = dataclasses.replace(good, provenance=good.provenance | rare)
+    assert "Rarely shown: k0, k1, k2 and 2 more (only guessed)" in str(judge(frames, model, good))
+
+
+def test_a_front_that_only_the_fours_of_the_layout_doubt_is_theirs(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = frames.training.layout.keypoints
+    four = (names[0], names[1], names[2], names[3])
+    other = dataclasses.replace(frames.training.layout, handedness=(four,))
+    parts = [dataclasses.replace(part, layout=other) for part in frames]
+    from deep_nrsfm_ros.training import judge as module
+
+    monkeypatch.setattr(module, "_front_disagreement", lambda *_: 0.17)
+    monkeypatch.setattr(module.Judge, "fronts", lambda self, model: [(four, 0.17)])
+    reason = judge(Split(*parts), good, None).reason
+    assert f"{names[3]} lies behind {names[0]}, {names[1]} and {names[2]} in 17 %" in reason
+    assert "four may not always hold" in reason and "more views" not in reason
+
+
+def test_hands_of_both_sides_are_doubtful(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deep_nrsfm_ros.training import judge as module
+
+    monkeypatch.setattr(module, "mixed_sides", lambda data, least: f"mixed above {least}")
+    judgement = judge(frames, good, good)
+    assert judgement.doubtful and judgement.reason.startswith("mixed above 0.3. Judged")
+    assert judgement.verdict == "doubtful"
