@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,10 @@ import numpy as np
 import pytest
 
 import deep_nrsfm_ros
+from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros import KeypointLayout, Lifted, Lifter, Model, Recipe, load_model, train
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
-from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
+from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN25
 from deep_nrsfm_ros.model_files.model_file import ModelFileError, save_model
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
 from deep_nrsfm_ros.training import few_frames
@@ -132,10 +135,12 @@ def test_a_model_is_loaded_by_name_by_path_and_from_a_folder(human: Model, tmp_p
         load_model("nobody")
 
 
-def test_an_array_becomes_a_model_that_lifts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_array_becomes_a_model_that_lifts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     disagreed = Consensus(np.zeros((0, 8, 3)), np.zeros((0, 3, 3)), np.ones(0), 1.0, 2)
     monkeypatch.setattr(few_frames, "MIN_STEPS", 1)
-    monkeypatch.setattr(few_frames, "consensus", lambda W, _: disagreed)
+    monkeypatch.setattr(few_frames, "consensus", lambda *_: disagreed)
     rng = np.random.default_rng(0)
     shapes = rng.standard_normal((1, 8, 3)) + 0.3 * rng.standard_normal((400, 1, 1)) * (
         rng.standard_normal((1, 8, 3))
@@ -154,7 +159,8 @@ def test_an_array_becomes_a_model_that_lifts(monkeypatch: pytest.MonkeyPatch) ->
             on_progress=progress.append,
             on_message=messages.append,
         )
-    assert ["factorisations" in message for message in messages] == [True]
+    assert ["factorisations" in message for message in messages] == [True, False]
+    assert messages[-1] == model.provenance["judgement"]["reason"]
     assert model.name == "thing" and model.layout == layout and progress
     assert "rival" not in model.provenance["judgement"]  # no model has such an object
     assert np.isfinite(Lifter(model)(points[:3]).shapes).all()
@@ -162,13 +168,31 @@ def test_an_array_becomes_a_model_that_lifts(monkeypatch: pytest.MonkeyPatch) ->
     visible[:, 5:] = False
     with pytest.raises(ValueError, match="cannot be learned"):
         train(points[:5], visible[:5], layout=layout)
+    (tmp_path / "thing.yaml").write_text("{name: thing, keypoints: [a, b, c, d, e, f, g, h]}")
+    few = Recipe(steps=1, seeds=1, few_frames=0)
+    for same in (list("abcdefgh"), tmp_path / "thing.yaml"):
+        with pytest.warns(UserWarning, match="'thing' names no handedness"):
+            again = train(points, layout=same, name="thing", recipe=few)
+        assert again.layout == layout
+    with pytest.raises(TypeError, match="layout is a int; give a KeypointLayout, .* names"):
+        train(points, layout=8)  # type: ignore[arg-type]
+
+
+def test_a_detector_is_named_by_its_keypoints_or_a_path(human: Model, tmp_path: Path) -> None:
+    names = ["left_hip", "right_hip", "left_knee", "right_knee", "neck"]
+    (tmp_path / "legs.yaml").write_text(f"{{name: legs, keypoints: {names}}}")
+    points = np.random.default_rng(0).uniform(0, 100, (2, 5, 2))
+    by_list = Lifter(human, layout=names)(points)
+    by_path = Lifter(human, layout=tmp_path / "legs.yaml")(points)
+    np.testing.assert_array_equal(by_list.shapes, by_path.shapes)
+    save_model(str(tmp_path / "mine.safetensors"), human)
+    assert load_model("mine", str(tmp_path)).name == "mine"
+    with pytest.raises(TypeError, match="layout is a int"):
+        Lifter(human, layout=5)  # type: ignore[arg-type]
 
 
 def test_a_model_of_people_is_judged_beside_the_one_at_hand(human: Model) -> None:
-    rng = np.random.default_rng(0)
-    rotations = np.linalg.qr(rng.standard_normal((220, 3, 3)))[0]
-    shapes = rng.standard_normal((25, 3)) + 0.1 * rng.standard_normal((220, 25, 3))
-    points = 100 * (shapes @ rotations)[..., :2] + 300  # no person
+    points, _ = in_layout(HUMAN25, 220)
     recipe = Recipe(steps=1, learning_rate=0.1, batch=4)
     with pytest.warns(UserWarning, match="the new model is doubtful: .* would help"):
         model = train(points, layout=HUMAN25, recipe=recipe)
@@ -176,3 +200,31 @@ def test_a_model_of_people_is_judged_beside_the_one_at_hand(human: Model) -> Non
     assert judgement["rival"] == "human" and model.provenance["from"]["model"] == "human"
     assert judgement["doubtful"] and "would help" in judgement["reason"]
     assert {"residual", "bone_variation"} <= judgement["figures"].keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda p, c: (p * [1, -1] + [0, 720], c), "upside down"),
+        (lambda p, c: (np.where(np.arange(25)[:, None] % 9 == 2, -1, p), None), "exactly .-1, -1."),
+        (lambda p, c: (p, 100 * c), "confidence up to 9.*divide it by 100"),
+        (lambda p, c: (p / IMAGE, c), "multiply x by its width and y by its height"),
+        (lambda p, c: (p - p[:, :1], c), "keypoint 0 .from 0. lies at"),
+        (lambda p, c: (np.where(np.arange(25)[:, None] == 3, np.nan, p), c), "no frame shows "),
+    ],
+)
+def test_arrays_are_checked_as_files_are(
+    change: Callable[..., tuple[Any, Any]], complaint: str
+) -> None:
+    points, confidence = change(*in_layout(HUMAN25, 60))
+    recipe = Recipe(steps=1, learning_rate=1e-7, batch=4)
+    with pytest.warns(UserWarning, match=complaint):
+        model = train(points, confidence, layout=HUMAN25, recipe=recipe)
+    if "no frame" not in complaint:
+        judgement = model.provenance["judgement"]
+        assert judgement["doubtful"] and re.search(complaint, judgement["reason"])
+
+
+def test_arrays_in_another_layout_are_refused() -> None:
+    with pytest.raises(ValueError, match="poor fit as human25: is it body25"):
+        train(*in_layout(BODY25, 60), layout=HUMAN25)

@@ -107,7 +107,7 @@ class Session(NamedTuple):
         path = self.models / f"{name}{MODEL_SUFFIX}"
         record = read_record(self.models, name)
         if record or not path.exists():
-            arguments = (*arguments, "--steps", str(steps), "--threads", "1")
+            arguments = (*arguments, "--steps", str(steps), "--threads", "1", "--force")
             arguments = ("--resume",) if record else arguments
             command = [sys.executable, "-m", "deep_nrsfm_ros.commands.train", *arguments]
             subprocess.run([*command, "--name", name, "--output", str(self.models)], check=True)

@@ -35,7 +35,6 @@ from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import StreamCheck
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.training.config import COMMAND_LINE, DataConfig, TrainingConfig
-from deep_nrsfm_ros.training.data_check import check_dataset
 from deep_nrsfm_ros.training.preparation import read_data
 from deep_nrsfm_ros.training.reporter import Reporter
 from deep_nrsfm_ros.training.validation import validate
@@ -126,9 +125,7 @@ def by_train(path: Path, case: Case) -> Answer:
         if warning := validate(config, COMMAND_LINE):
             warnings.append(warning)
         reporter = Recorder(False, lambda: False)
-        dataset, _ = read_data(config, reporter)
-        layout = HUMAN17
-        dataset = check_dataset(dataset, layout, data.image_size, reporter)
+        dataset = read_data(config, reporter).dataset
     except ValueError as error:
         return Answer(str(error), "no answer")
     said = "; ".join(warnings)

@@ -19,9 +19,8 @@ from deep_nrsfm_ros.lifting.sanity import (
     Finding,
     Size,
     check,
-    facing,
     is_person,
-    orientation,
+    pose,
 )
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -101,8 +100,7 @@ def summarise(
         if better := better_layout(fits, recording.source, residual):
             findings = [f for f in findings if f.code != "poor-fit"] + [better]
     if is_person(model.layout):
-        findings += orientation(recording.lifted.rotations)
-        findings += facing(recording.lifted.rotations, detections.confidence, recording.source)
+        findings += pose(recording.lifted.rotations, detections.confidence, recording.source)
     if is_lifted.any() and is_lifted.mean() < _FEW_LIFTED:
         few = f"only {is_lifted.sum()} of {len(is_lifted)} objects are lifted"
         findings.append(Finding("few-lifted", few))

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
+from deep_nrsfm_ros.training.same_name import CUT_OFF
 
 COLUMNS = ("model", "object", "keypoints", "judged", "date")
 BETTER, AS_GOOD, ALONE, DOUBTFUL, NOT_JUDGED = "better", "as_good", "alone", "doubtful", "-"
@@ -135,6 +136,8 @@ def _origin(model: Model) -> str:
     last = said.get("last_step")
     if isinstance(last, dict) and "data" in last:
         parts.append(f"error covariance and bones from {last['data']}")
+    if said.get(CUT_OFF):
+        parts.append("cut off before its end")
     if isinstance(start, dict) and not same_network:
         parts.append(f"from model {start.get('model')}")
     return "; ".join(parts)

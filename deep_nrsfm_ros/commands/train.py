@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train a model from bags and files of 2D keypoints, or motion capture: one model file out."""
+"""Train a model from bags and files of 2D keypoints, or motion capture: one model file out.
+
+Exit code 0: the training has ended, or was cancelled; 2: the input or an option is at fault; 3: the
+model is written, and is doubtful since its data looks wrong (--force: 0).
+"""
 
 from __future__ import annotations
 
@@ -24,12 +28,16 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
 from deep_nrsfm_ros.reporting.page import Training, write_report
 from deep_nrsfm_ros.training.config import TrainingConfig
-from deep_nrsfm_ros.training.distributed import rank
+from deep_nrsfm_ros.training.distributed import own_share, rank
 from deep_nrsfm_ros.training.handedness_check import handedness_warning
+from deep_nrsfm_ros.training.job import EXIT_DOUBTFUL
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments
 from deep_nrsfm_ros.training.run import TrainingResult, run
+
+CANCELLED = 128 + signal.SIGINT
+"""Exit code of a training that was stopped, by whatever signal."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -100,7 +108,9 @@ def parser() -> argparse.ArgumentParser:
         help="the model's layout: a preset, a layout file (.yaml), a model file, or 'numbered' "
         "for points without names (default: that of --from, or human25)",
     )
-    result.add_argument("--name", help="name of the model (default: trained)")
+    result.add_argument(
+        "--name", help="name of the model, not one of the package's (default: trained)"
+    )
     result.add_argument(
         "--output",
         dest="folder",
@@ -135,6 +145,12 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         help="take all options that are not given here from this JSON file, such as the record "
         ".NAME.training.json of another training",
+    )
+    run.add_argument(
+        "--force",
+        action="store_true",
+        default=False,
+        help="end with exit code 0 even if the data looks wrong",
     )
     run.add_argument(
         "--json-progress", action="store_true", default=False, help="one JSON object a line"
@@ -256,7 +272,11 @@ def write_page(result: TrainingResult, reporter: Reporter) -> str:
 
 @program
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command; exit code 2 says that the input was at fault."""
+    """Run the command; the exit code says how it ended and whether to believe the model.
+
+    2: the input was at fault; 3: a model came of data that looks wrong; 130: it was stopped before
+    its end.
+    """
     arguments = parser().parse_args(argv)
     should_stop = stop_on_signals()
     if arguments.json_progress:
@@ -265,8 +285,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         if result := run(parse(arguments, reporter.say), reporter, should_stop):
             report_end(result, reporter)
+            if result.state == "cancelled":
+                sys.exit(CANCELLED)
+            has_faults = result.judgement is not None and bool(result.judgement.faults)
+            # torchrun takes any other code than 0 for a crash.
+            if has_faults and not arguments.force and own_share().size == 1:
+                sys.exit(EXIT_DOUBTFUL)
     except CancelledError:
         reporter.end("cancelled", "nothing had been learned; nothing was written")
+        sys.exit(CANCELLED)
     except (ValueError, OSError) as error:
         reporter.end("failed", str(error))
         sys.exit(2)

@@ -63,6 +63,7 @@ class BagReading(NamedTuple):
         reason: why the first unreadable message could not be read; "" if all could.
         warnings: a sentence for each damaged bag that says what is missing, and for each bag that
             was left out, since nothing of it can be used.
+        starts: each bag that was read, with the index of its first frame.
     """
 
     dataset: Dataset
@@ -70,6 +71,7 @@ class BagReading(NamedTuple):
     unreadable: int
     reason: str
     warnings: tuple[str, ...]
+    starts: tuple[tuple[Path, int], ...]
 
 
 def read_bags(
@@ -102,6 +104,7 @@ def read_bags(
         raise BagError("no bag to read; name at least one")
     failures: list[BagError] = []
     read: list[str] = []
+    starts: list[tuple[Path, int]] = []
     for path in map(Path, paths):
         with ExitStack() as stack:
             try:
@@ -111,6 +114,7 @@ def read_bags(
                 failures.append(error)
                 continue
             read.append(path.name)
+            starts.append((path, builder.count))
             for topic, input_type, decode in topics:
                 before, reader = messages, MessageReader(input_type, decode)
                 builder.begin_sequence()
@@ -147,7 +151,7 @@ def read_bags(
     if on_progress:
         on_progress(messages, messages)
     dataset = builder.dataset(f"bags {names}")
-    return BagReading(dataset, messages, unreadable, reason, tuple(warnings))
+    return BagReading(dataset, messages, unreadable, reason, tuple(warnings), tuple(starts))
 
 
 def _add(

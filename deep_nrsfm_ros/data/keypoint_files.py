@@ -8,7 +8,7 @@ import gzip
 import io
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -259,9 +259,9 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
         lines = (line for line in file if line.strip())
         for number, line in enumerate(lines):
             yield DefaultFrame(f"line {number + 1}", number, is_document=True), line
-            on_progress(min(file.tell(), size), size)
+            on_progress(min(raw.tell(), size), size)  # of what is compressed, as the size is
 
-    with gzip.open(path) if is_compressed else path.open("rb") as file:
+    with path.open("rb") as raw, gzip.open(raw) if is_compressed else nullcontext(raw) as file:
         try:
             _read_frames(builder, documents())
         except (EOFError, OSError, zlib.error) as error:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -30,7 +30,7 @@ from deep_nrsfm_ros.lifting.own_bones import (
     partner_bones,
 )
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
-from deep_nrsfm_ros.model_files.find_layout import find_layout
+from deep_nrsfm_ros.model_files.find_layout import layout_of
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 
 _BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
@@ -93,7 +93,7 @@ class Lifter:
         model: Model | str | Path,
         options: LiftingOptions | None = None,
         *,
-        layout: KeypointLayout | str | None = None,
+        layout: KeypointLayout | str | Path | Sequence[str] | None = None,
         history: HistoryOptions | None = None,
     ) -> None:
         """Prepare a backend for the model.
@@ -102,9 +102,9 @@ class Lifter:
             model: weights, layout and error statistics, or the name or file of a model, as
                 `load_model` takes it.
             options: None: all defaults.
-            layout: the detector's layout of q keypoints, as an object or by the name of a preset
-                or a layout file ("coco17"); its keypoints are mapped to the model's by name.
-                None: the model's layout.
+            layout: the detector's layout of q keypoints, as an object, by the name of a preset
+                or a layout file ("coco17"), or a list of the keypoints' names; its keypoints are
+                mapped to the model's by name. None: the model's layout.
             history: what is remembered of identities, for lifts with a `Memory`; None: all
                 defaults.
 
@@ -123,9 +123,7 @@ class Lifter:
         self.options = _checked("options", options, LiftingOptions)
         check_min_visible("min_visible", self.options.min_visible, model)
         history = _checked("history", history, HistoryOptions)
-        if isinstance(layout, str):
-            layout = find_layout("layout", layout)
-        self.layout = layout or model.layout
+        self.layout = model.layout if layout is None else layout_of("layout", layout)
         self._to_model = KeypointMap(self.layout, model.layout)
         self.constants = _constants(model, self.options, history, self._to_model)
         backend = CompiledBackend if supports(model.network) else NumpyBackend

@@ -38,14 +38,20 @@ _TINY = 3.0  # pixels; no detector finds keypoints of smaller objects
 _HIGH = 2.0  # COCO's mark of a visible keypoint; OpenPose and MMPose go a little above 1
 _MANY_HIGH = 0.05  # fraction of confidences above it that is another scale
 _SCALES = (10, 100, 255, 1000)  # largest values of usual scales
-_UPRIGHT = 0.7  # cosine between the up axis of a person and an axis of the image
+_UPRIGHT = 0.7  # cosine between the up axis of a person, in the image, and an axis of the image
 _NEARLY_ALL = 0.9  # fraction of people that makes an orientation suspicious
+_LYING = 0.6  # |cosine| between the up axis and the image's x, which a standing person is below
+_IN_IMAGE = 0.3  # length in the image of an up axis of length 1 from which on its direction counts
 _FACE = ("nose", "left_eye", "right_eye")
 _SEEN = 0.5  # confidence of a face that is seen
 _TURNED = 0.3  # cosine between the front of a person and the camera's axis: less is a profile
 _MIN_FACES = 5  # people, which are too few for a verdict on left and right
 _MIN_FOCAL = 10.0  # pixels; a smaller focal length belongs to normalised coordinates
 _MIN_REPEATS = 3  # points on one spot that may be a sentinel
+_MARKED = 0.001  # fraction of points on a spot such as (-1, -1) that is more than chance
+_REPEATED = 0.01  # fraction of points on any other spot that is more than chance
+_STANDS_OUT = 5  # times the points of the next spot: pixels of a coarse grid repeat alike
+_FILLED = 0.98  # side of a box of 0 to 1 from which on an object fills it
 _OUTSIDE = 0.05  # fraction of points far outside the image that is too many
 _MARGIN = 0.5  # of the image's size: points further outside are far outside
 _SCALED_TWICE = 20.0  # sizes of the image from its corner to the points
@@ -152,8 +158,10 @@ def is_signed(points: Floats, visible: NDArray[np.bool_]) -> bool:
 def find_sentinel(points: Floats, visible: NDArray[np.bool_]) -> tuple[Floats, int] | None:
     """Return the spot (2,) that stands for a missing keypoint, and how often it is there.
 
-    A spot such as (-1, -1) or (9999, 9999) is one when several visible keypoints lie on it: both
-    coordinates are negative or 0, or they are equal.
+    A spot such as (-1, -1) or (9999, 9999) is one when 0.1 % of the visible keypoints lie on it:
+    both coordinates are negative or 0, or they are equal. Any other spot, such as the middle of the
+    image, is one when 1 % lie on it, of three different keypoints or more. A spot without a
+    negative coordinate must have far more of them than any other spot.
 
     Args:
         points: (n, q, 2).
@@ -162,13 +170,56 @@ def find_sentinel(points: Floats, visible: NDArray[np.bool_]) -> tuple[Floats, i
     Returns:
         None if there is no such spot.
     """
+    total = int(visible.sum())
     x, y = points[..., 0], points[..., 1]
-    suspect = visible & (((x <= 0) & (y <= 0)) | (x == y))
-    if suspect.sum() < _MIN_REPEATS:
+    is_below = visible & (x <= 0) & (y <= 0)
+    spot = _most_frequent(points[is_below])
+    if spot and spot[1] >= max(_MIN_REPEATS, _MARKED * total):
+        return spot
+    for is_candidate, least in ((visible & (x == y), _MARKED), (visible, _REPEATED)):
+        spot = _most_frequent(points[is_candidate])
+        if not spot or spot[1] < max(_MIN_REPEATS, least * total):
+            continue
+        is_there = visible & (points == spot[0]).all(-1)
+        next_spot = _most_frequent(points[visible & ~is_there])
+        stands_out = not next_spot or spot[1] >= _STANDS_OUT * next_spot[1]
+        # A keypoint that stands still is on one spot, but not three of them.
+        if stands_out and (least == _MARKED or is_there.any(0).sum() >= _MIN_REPEATS):
+            return spot
+    return None
+
+
+def _most_frequent(points: Floats) -> tuple[Floats, int] | None:
+    """Return the most frequent of points (n, 2), and how often it is there; None without points."""
+    if not len(points):
         return None
-    spots, counts = np.unique(points[suspect], axis=0, return_counts=True)
+    first, counts = np.unique(
+        points[:, 0] + 1j * points[:, 1], return_index=True, return_counts=True
+    )[1:]
     most = int(counts.argmax())
-    return (spots[most], int(counts[most])) if counts[most] >= _MIN_REPEATS else None
+    return points[first[most]], int(counts[most])
+
+
+def find_origin(points: Floats, confidence: Floats) -> list[Finding]:
+    """Return whether a keypoint is the origin of all others, so that it counts as missing.
+
+    Args:
+        points: (n, q, 2), as the source gives them.
+        confidence: (n, q) likewise; 0 where missing.
+    """
+    points, given = _sample(points), _sample(confidence) > 0
+    at_origin = (points == 0).all(-1) & given
+    always = np.flatnonzero(at_origin.sum(0) >= _NEARLY_ALL * max(len(points), 1))
+    if len(always) != 1 or not is_signed(points, given & ~at_origin):
+        return []
+    return [
+        Finding(
+            "origin",
+            f"keypoint {always[0]} (from 0) lies at (0, 0) in nearly all objects, and (0, 0) means "
+            "missing: the points are relative to it; add a constant to all coordinates, such as "
+            "1000",
+        )
+    ]
 
 
 def confidence_scale(confidence: Floats) -> list[Finding]:
@@ -237,10 +288,10 @@ def orientation(rotations: Floats) -> list[Finding]:
         rotations: (n, 3, 3) from object axes (x front, y left, z up) to camera axes (y down); NaN
             where not lifted.
     """
-    up = rotations[~np.isnan(rotations[:, 0, 0]), :2, 2]
-    if not len(up):
+    x, y = _up_in_image(rotations).T
+    if not len(x):
         return []
-    if (upside_down := (up[:, 1] > _UPRIGHT).mean()) > _NEARLY_ALL:
+    if (upside_down := (y > 0).mean()) > _NEARLY_ALL and np.median(y) > _UPRIGHT:
         return [
             Finding(
                 "orientation",
@@ -248,7 +299,8 @@ def orientation(rotations: Floats) -> list[Finding]:
                 "height - y if it points up, or turn the image",
             )
         ]
-    if (sideways := (np.abs(up[:, 0]) > _UPRIGHT).mean()) > _NEARLY_ALL:
+    sideways = (np.abs(x) > _LYING).mean()
+    if sideways > _NEARLY_ALL and np.median(np.abs(x)) > _UPRIGHT:
         return [
             Finding(
                 "orientation",
@@ -259,13 +311,24 @@ def orientation(rotations: Floats) -> list[Finding]:
     return []
 
 
+def _up_in_image(rotations: Floats) -> Floats:
+    """Return the direction (m, 2) of the up axes in the image, of those that have one there."""
+    up = rotations[:, :2, 2]
+    length = np.linalg.norm(up, axis=1)
+    has_direction = length > _IN_IMAGE  # False where not lifted
+    directions: Floats = up[has_direction] / length[has_direction, None]
+    return directions
+
+
 def facing(
     rotations: Floats, confidence: Floats, layout: KeypointLayout, least: float = _SEEN
 ) -> list[Finding]:
-    """Return whether left and right look exchanged: faces are seen of people who face away.
+    """Return whether depth comes out mirrored: faces are seen of people who face away.
 
-    A person with left and right exchanged is a person with mirrored depth, who fits as well. Only
-    the face tells them apart: nobody's nose and eyes are seen from behind.
+    A person in a mirrored image is a person with mirrored depth, who fits as well. Only the face
+    tells them apart: nobody's nose and eyes are seen from behind. Which mirror it is, the up axis
+    of these people shows: y that points up turns them upside down, too, exchanged x and y lay them
+    on their side, and with left and right exchanged they are upright.
 
     Args:
         rotations: (n, 3, 3) as in `orientation`.
@@ -280,13 +343,39 @@ def facing(
     seen = (confidence[:, face] >= least).all(1) & (np.abs(front) > _TURNED)
     if seen.sum() < _MIN_FACES or (away := (front[seen] > 0).mean()) <= _NEARLY_ALL:
         return []
+    people = f"{away:.0%} of the {seen.sum()} people whose face is seen"
+    up = _up_in_image(rotations[seen])
+    x, y = (float(value) for value in np.median(up, axis=0)) if len(up) else (0.0, -1.0)
+    if abs(x) > _UPRIGHT:
+        return [
+            Finding(
+                "handedness",
+                f"{people} come out facing away and lie on their side: x and y are exchanged; "
+                "exchange them",
+            )
+        ]
+    if y > 0:
+        return [
+            Finding(
+                "handedness",
+                f"{people} come out facing away and upside down: y points up, and must point down; "
+                "use height - y",
+            )
+        ]
     return [
         Finding(
             "handedness",
-            f"{away:.0%} of the {seen.sum()} people whose face is seen come out facing away: left "
-            "and right look exchanged; check the keypoint layout, and that images are not mirrored",
+            f"{people} come out facing away: left and right look exchanged; check the keypoint "
+            "layout, and that images are not mirrored",
         )
     ]
+
+
+def pose(
+    rotations: Floats, confidence: Floats, layout: KeypointLayout, least: float = _SEEN
+) -> list[Finding]:
+    """Return `facing`, which says the cause, or else `orientation`; for the arguments see there."""
+    return facing(rotations, confidence, layout, least) or orientation(rotations)
 
 
 def _sentinel(spot: Floats, times: int, total: int) -> Finding:
@@ -294,9 +383,9 @@ def _sentinel(spot: Floats, times: int, total: int) -> Finding:
     x, y = (float(value) for value in spot)
     return Finding(
         "sentinel",
-        f"{times} of {total} visible keypoints lie at exactly ({x:g}, {y:g}), which detectors "
-        f"write for a missing keypoint: give them confidence 0, NaN or (0, 0), or name the value "
-        f"(--missing-value={x:g} for files, `missing` in a field mapping)",
+        f"{times} of {total} visible keypoints lie at exactly ({x:g}, {y:g}), as detectors write "
+        "it for a missing keypoint: give them confidence 0, NaN or (0, 0), or name the value "
+        f"(--missing-value={x or y:g} for files, `missing` in a field mapping)",
     )
 
 
@@ -321,11 +410,18 @@ def _coordinates(
                 f"keypoints lie between {low:.2f} and {high:.2f}{camera}: these are no pixels; "
                 "convert them to pixels with x right and y down",
             )
+        elif _fill_their_box(points, visible):
+            yield Finding(
+                "normalised",
+                f"keypoints of each object fill {low:.2f} to {high:.2f}: they are fractions of its "
+                "box, not pixels; multiply x by the width of the box and y by its height",
+            )
         else:
             yield Finding(
                 "normalised",
                 f"keypoints lie between {low:.2f} and {high:.2f}{camera}: they are normalised, not "
-                "pixels; give the size of the image (image_width and image_height)",
+                "pixels; give the size of the image (image_width and image_height), or multiply x "
+                "by its width and y by its height",
             )
         return
     extent = _extent(points, visible)
@@ -365,11 +461,23 @@ def _coordinates(
 
 def _extent(points: Floats, visible: NDArray[np.bool_]) -> float:
     """Return the median of the larger sides of the objects' bounding boxes."""
+    sides = _sides(points, visible)
+    return float(np.median(sides.max(-1))) if len(sides) else np.inf
+
+
+def _fill_their_box(points: Floats, visible: NDArray[np.bool_]) -> bool:
+    """Return whether nearly all objects reach from 0 to 1 in x and in y."""
+    sides = _sides(points, visible)
+    return bool(len(sides)) and (sides.min(-1) > _FILLED).mean() > _NEARLY_ALL
+
+
+def _sides(points: Floats, visible: NDArray[np.bool_]) -> Floats:
+    """Return the sides (m, 2) of the bounding boxes of the objects with several keypoints."""
     mask = visible[..., None]
     high = np.max(points, axis=1, where=mask, initial=-np.inf)
     low = np.min(points, axis=1, where=mask, initial=np.inf)
-    several = visible.sum(1) > 1
-    return float(np.median((high - low)[several].max(-1))) if several.any() else np.inf
+    sides: Floats = (high - low)[visible.sum(1) > 1]
+    return sides
 
 
 def _stamps(stamps: NDArray[np.int64]) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -43,4 +44,31 @@ def find_layout(option: str, name_or_path: str) -> KeypointLayout:
     raise ValueError(
         f"{option} is {name_or_path!r}; name a preset ({presets}), "
         f"a layout file ({LAYOUT_SUFFIXES[0]}) or a model file ({MODEL_SUFFIX})"
+    )
+
+
+def layout_of(
+    option: str, value: KeypointLayout | str | Path | Sequence[str], name: str = "keypoints"
+) -> KeypointLayout:
+    """Return the keypoint layout that an argument of the Python API stands for.
+
+    Args:
+        option: name of the argument, for error messages.
+        value: a layout, what `find_layout` takes, as a string or a path, or the names of the
+            keypoints in the order of the arrays.
+        name: name of a layout that is made of the names of keypoints.
+
+    Raises:
+        TypeError: the value is none of these.
+        ValueError: see `find_layout`; or a name of a keypoint is empty or there twice.
+    """
+    if isinstance(value, KeypointLayout):
+        return value
+    if isinstance(value, (str, Path)):
+        return find_layout(option, str(value))
+    if isinstance(value, Sequence) and all(isinstance(each, str) for each in value):
+        return KeypointLayout(name, tuple(value))
+    raise TypeError(
+        f"{option} is a {type(value).__name__}; give a KeypointLayout, the name of a preset, a "
+        "layout file (.yaml), or a list of the keypoints' names"
     )

@@ -60,14 +60,15 @@ class Model:
     """A trained network of p keypoints and all that is needed to lift with it.
 
     Attributes:
-        name: name of the model.
+        name: name of the model; one that is read from a file has the name of the file.
         network: architecture and weights.
         layout: layout of the p keypoints.
         normaliser: takes keypoints to the input of the network.
         object_frame: (3, 3) orthonormal A from the network's axes to the object's (S A, A^T M).
             det -1 undoes a mirrored depth. The axes are x front, y left, z up where the layout
             has a handedness.
-        provenance: data, recipe, seed, date and versions.
+        provenance: data, recipe, seed, date and versions. `judgement` is what the judge said at the
+            end of the training: `doubtful`, a bool, `reason`, a sentence, and the figures.
         quality: label-free figures, such as `reprojection_error` and `cycle_error`.
         error_covariance: (3p, 3p) covariance of the network's errors, in its own axes (see
             `lifting/correction.py`); the identity if it was not measured.
@@ -122,8 +123,21 @@ class Model:
         return Bones(ends, lengths, spread, correlation if correlation.size else None)
 
 
-def save_model(path: Path, model: Model) -> None:
-    """Write a model file completely or not at all: under a temporary name, then renamed."""
+def save_model(path: str | Path, model: Model) -> None:
+    """Write a model file completely or not at all: under a temporary name, then renamed.
+
+    Args:
+        path: the file, NAME.safetensors; its folder is made where it is missing. `load_model` and
+            the lifter find a model by its name in `$ROS_HOME/deep_nrsfm_ros/models`.
+        model: the model.
+
+    Raises:
+        TypeError: the arguments are of other types.
+        OSError: the file cannot be written.
+    """
+    if not isinstance(model, Model):
+        raise TypeError(f"model is a {type(model).__name__}; save_model takes the file, the model")
+    path = Path(path).expanduser()
     header = {
         "name": model.name,
         "architecture": dataclasses.asdict(model.network.architecture),
@@ -154,8 +168,8 @@ def save_model(path: Path, model: Model) -> None:
         partial.unlink(missing_ok=True)
 
 
-def load_model(model: str | Path, models_dir: Path | None = None) -> Model:
-    """Return a model by its name or from its file.
+def load_model(model: str | Path, models_dir: str | Path | None = None) -> Model:
+    """Return a model by its name or from its file; it has the name of its file.
 
     Args:
         model: name of a model ("human"), or path of a model file. A `Path` is always a file.
@@ -168,7 +182,8 @@ def load_model(model: str | Path, models_dir: Path | None = None) -> Model:
     """
     path = model
     if not isinstance(path, Path):
-        path = find_model(path, model_folders(models_dir or default_models_dir()))
+        own = Path(models_dir).expanduser() if models_dir else default_models_dir()
+        path = find_model(path, model_folders(own))
     content = _read(path)
     try:
         metadata = _metadata(content)
@@ -183,7 +198,8 @@ def load_model(model: str | Path, models_dir: Path | None = None) -> Model:
         reason = _foreign(content) or f"is damaged or no safetensors file: {error}"
         raise ModelFileError(f"{path} {reason}") from error
     try:
-        return _build(json.loads(metadata["model"]), weights)
+        model_in_file = _build(json.loads(metadata["model"]), weights)
+        return dataclasses.replace(model_in_file, name=path.stem)
     except KeyError as error:
         raise ModelFileError(f"{path} has a damaged header or weights: it lacks {error}") from error
     except (TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as e:

@@ -248,7 +248,11 @@ class LifterNode(Node):
         self._bodies = BodyPublishers(self, self._body_options, camera.tf_prefix)
         self._bodies.describe(self._pipeline.model.layout)
         self._training = TrainingService(
-            self, self._training_request, self._switch_model, self._sandbox.models_dir
+            self,
+            self._training_request,
+            self._switch_model,
+            lambda: self._pipeline.model,
+            self._sandbox.models_dir,
         )
 
     def activate(self) -> None:

@@ -18,8 +18,10 @@ from deep_nrsfm_ros.data.bag_files import BagError, BagFile, open_bag, opens_qui
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.serialised import MessageReader
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.node import publishing
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, status
+from deep_nrsfm_ros.training.activation import reason_to_stay
 from deep_nrsfm_ros.training.config import PARAMETERS, DataConfig, TrainingConfig
 from deep_nrsfm_ros.training.job import JobStatus, TrainingJob
 from deep_nrsfm_ros.training.record import find_records, read_record
@@ -95,6 +97,7 @@ class TrainingService:
         node: Node,
         request: Callable[[], TrainingRequest],
         activate: Callable[[str], None],
+        present: Callable[[], Model],
         folder: Path,
     ) -> None:
         """Offer the services on `node`.
@@ -103,9 +106,11 @@ class TrainingService:
             node: the lifter.
             request: returns the training that the present parameters ask for; raises ValueError.
             activate: switches to the model in a file; raises ValueError if it cannot.
+            present: returns the model that the lifter has.
             folder: folder of models and of the records of trainings.
         """
         self._node, self._request, self._activate = node, request, activate
+        self._present = present
         self._folder = folder
         self._job: TrainingJob | None = None
         self._closed = False
@@ -210,13 +215,28 @@ class TrainingService:
         """Activate the model of a finished training, if it should be, and say so."""
         if self._activate_when == "never":
             return progress
-        if self._activate_when == "if_better" and progress.values.get("judgement") != "better":
-            return progress._replace(message=f"{progress.message}; not in use (train.activate)")
+        model = str(progress.values.get("model", ""))
+        if self._activate_when == "if_better":
+            if progress.values.get("judgement") != "better":
+                return progress._replace(message=f"{progress.message}; not in use (train.activate)")
+            if reason := self._reason_to_stay(model):
+                node = self._node.get_fully_qualified_name()
+                how = f"to switch: ros2 param set {node} model {Path(model).stem}"
+                return progress._replace(
+                    message=f"{progress.message}; not in use (train.activate): {reason}; {how}"
+                )
         try:
-            self._activate(str(progress.values.get("model", "")))
+            self._activate(model)
         except ValueError as problem:
             return progress._replace(message=f"{progress.message}; not in use: {problem}")
         return progress._replace(message=f"{progress.message}; in use from now on")
+
+    def _reason_to_stay(self, file: str) -> str:
+        """Return why the lifter should not switch to the model in a file by itself, or ""."""
+        try:
+            return reason_to_stay(load_model(Path(file)), self._present())
+        except ValueError:  # damaged: to switch to it fails with the reason
+            return ""
 
     def _publish(self, progress: JobStatus) -> None:
         """Publish progress, and log it where the state changes or there is a message."""

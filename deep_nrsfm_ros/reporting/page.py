@@ -26,6 +26,7 @@ from deep_nrsfm_ros.reporting.shapes import shape_space
 from deep_nrsfm_ros.reporting.template import embedded, render
 
 if TYPE_CHECKING:
+    from deep_nrsfm_ros.training.judge import Standing
     from deep_nrsfm_ros.training.progress import Progress
 
 REPORT_SUFFIX = ".html"
@@ -187,11 +188,18 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
         {
             "name": standing.model.name,
             "is_this": standing.model is training.model,
-            "verdict": standing.verdict,
+            "verdict": _verdict(standing, training.model),
             "figures": [getattr(standing.figures, name) for name in _FIGURES],
         }
         for standing in standings(_split(training), models, rival)
     ]
+
+
+def _verdict(standing: Standing, model: Model) -> str:
+    """Return the verdict on a model; that on the one of the page counts its data, too."""
+    judgement = model.provenance.get("judgement", {})
+    is_faulty = standing.model is model and bool(judgement.get("faults"))
+    return "doubtful" if is_faulty else standing.verdict
 
 
 def _shapes(

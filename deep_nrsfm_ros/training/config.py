@@ -93,7 +93,7 @@ class OutputConfig:
 
     Attributes:
         folder: folder of models.
-        name: name of the model; an existing model of this name is replaced.
+        name: name of the model; `same_name` says what becomes of one that has it.
         threads: threads of torch; 0 is one a core.
     """
 

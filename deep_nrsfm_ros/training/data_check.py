@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
-import dataclasses
+import re
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -13,64 +16,127 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.layout_fit import MAX_OBJECTS, better_layout, fit_layouts
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.options import LiftingOptions
-from deep_nrsfm_ros.lifting.sanity import (
-    Finding,
-    Size,
-    check,
-    facing,
-    orientation,
-    quality,
-    to_pixels,
-)
-from deep_nrsfm_ros.model_files.model_file import load_model
-from deep_nrsfm_ros.training.layout_choice import PEOPLE
-from deep_nrsfm_ros.training.reporter import Reporter
+from deep_nrsfm_ros.lifting.sanity import Finding, Size, check, find_sentinel, pose, quality
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
+from deep_nrsfm_ros.training.layout_choice import PEOPLE, in_words
+
+Floats = NDArray[np.floating[Any]]
+
+WRONG_LAYOUT = "layout"
+"""Code of the finding that another layout fits clearly better: no model can come of such data."""
+SERIOUS = {
+    *("poor-fit", "orientation", "handedness", "normalised", "sentinel", "origin"),
+    *("confidence-scale", "misspelt", "one-side", "incomplete"),
+}
+"""Codes of the findings that make a model doubtful: it learns what is wrong in its data."""
 
 _PERSON = {"left_hip", "left_ankle", "left_shoulder"}  # keypoints of every layout of people
 _MOST_CHECKED = 100_000  # frames
+_NUMBER = re.compile(r"[-+]?\d[\d.,e+]*")
+_SAME_POINT = 1e-3  # of the size of the data, within which two files have the same keypoint
+_COMPARED = 200  # frames
 
 
-def check_dataset(
-    dataset: Dataset, source: KeypointLayout, image_size: Size | None, reporter: Reporter
-) -> Dataset:
-    """Return a dataset in pixels, and report what looks wrong in it.
+class SourceFinding(NamedTuple):
+    """Something that looks wrong in one source of the data.
+
+    Attributes:
+        source: name of the bag or file.
+        finding: what looks wrong in it.
+    """
+
+    source: str
+    finding: Finding
+
+
+def check_objects(
+    points: Floats,
+    confidence: Floats | NDArray[np.bool_],
+    layout: KeypointLayout,
+    target: KeypointLayout,
+    image_size: Size | None = None,
+    *,
+    may_be_another: bool = True,
+) -> list[Finding]:
+    """Return what looks wrong in the objects of one bag, file or array.
+
+    People are lifted, to see whether they fit a model of people.
 
     Args:
-        dataset: as read.
-        source: layout in which the detector is said to have given the keypoints.
-        image_size: width and height of the image in pixels, by which normalised keypoints are
-            multiplied; None: unknown.
-        reporter: takes the warnings.
+        points: (n, q, 2); 0 where missing.
+        confidence: (n, q) from 0, where missing, to 1, or whether they are visible.
+        layout: in which the points are said to be.
+        target: of the object that is trained on.
+        image_size: width and height of the image in pixels; None: unknown.
+        may_be_another: whether the points may be in another layout than it is said.
     """
-    if image_size is not None:  # else nothing is multiplied
-        points = to_pixels(dataset.points, dataset.visible.astype(np.float32), image_size)
-        dataset = dataclasses.replace(dataset, points=np.asarray(points, np.float32))
-    for finding in _findings(dataset, source, image_size):
-        reporter.warn(str(finding))
-    return dataset
-
-
-def _findings(dataset: Dataset, source: KeypointLayout, image_size: Size | None) -> list[Finding]:
-    """Return what looks wrong; people are lifted, to see whether they fit a model of people."""
-    step = max(1, len(dataset) // _MOST_CHECKED)
-    dataset = dataset[::step]
-    confidence = dataset.visible.astype(np.float32)
-    findings = check(dataset.points, confidence, None, image_size)
-    if not set(dataset.layout.keypoints) >= _PERSON:
+    step = max(1, len(points) // _MOST_CHECKED)
+    points, confidence = points[::step], np.asarray(confidence[::step], np.float32)
+    findings = check(points, confidence, None, image_size)
+    if not set(target.keypoints) >= _PERSON or not len(points):
         return findings
     model = load_model(PEOPLE)
-    chosen = np.linspace(0, len(dataset) - 1, min(len(dataset), MAX_OBJECTS)).astype(int)
+    try:
+        to_model = KeypointMap(layout, model.layout)
+    except ValueError:  # it shares too few keypoints with the model
+        return findings
+    if sentinel := find_sentinel(points, confidence > 0):
+        confidence = np.where((points == sentinel[0]).all(-1), np.float32(0), confidence)
+    chosen = np.linspace(0, len(points) - 1, min(len(points), MAX_OBJECTS)).astype(int)
     lifter = Lifter(model, LiftingOptions(correction="none", test_time_rotations=1))
-    mapped = KeypointMap(dataset.layout, model.layout)(dataset.points[chosen], confidence[chosen])
-    lifted = lift_all(lifter.lift, *mapped)
+    sample = np.asarray(points[chosen], np.float32), np.asarray(confidence[chosen], np.float32)
+    lifted = lift_all(lifter.lift, *to_model(*sample))
     # Confidence is not rated: a model is trained where the one at hand does not suffice.
     poor = [f for f in quality(lifted.residual, lifted.object_confidence) if f.code == "poor-fit"]
-    if poor and dataset.layout.keypoints == source.keypoints:
-        fits = fit_layouts(dataset.points, confidence, model, [source])
-        better = better_layout(fits, source, float(np.nanmedian(lifted.residual)))
+    if poor and may_be_another:
+        fits = fit_layouts(*sample, model, [layout])
+        better = better_layout(fits, layout, float(np.nanmedian(lifted.residual)))
         poor = [better] if better else poor
-    if poor:
-        return findings + poor
-    # A dataset has no confidence, only visible keypoints.
-    exchanged = facing(lifted.rotations, confidence[chosen], dataset.layout)
-    return findings + orientation(lifted.rotations) + exchanged
+    return findings + (poor or pose(lifted.rotations, sample[1], layout))
+
+
+def serious(findings: Iterable[SourceFinding]) -> list[str]:
+    """Return a sentence for each kind of finding that makes a model doubtful."""
+    return sentences(each for each in findings if each.finding.code in SERIOUS)
+
+
+def sentences(findings: Iterable[SourceFinding]) -> list[str]:
+    """Return a sentence for each kind of finding, with the sources in which it was found.
+
+    Of findings that differ in their numbers alone, the numbers of the first one are told.
+    """
+    kinds: dict[str, list[SourceFinding]] = {}
+    for each in findings:
+        kinds.setdefault(_NUMBER.sub("#", str(each.finding)), []).append(each)
+    return [
+        f"{in_words(dict.fromkeys(each.source for each in kind))}: {kind[0].finding}"
+        for kind in kinds.values()
+    ]
+
+
+def never_seen(dataset: Dataset, start: Model | None = None) -> str:
+    """Return a sentence on the keypoints that no frame shows; "" if each is shown.
+
+    Args:
+        dataset: the frames of a training.
+        start: the model that it starts from, whose guesses remain; None: it has none.
+    """
+    times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
+    missing = [name for name, times in times_visible if not times]
+    as_start = f", as {start.name!r} does" if start else ""
+    sentence = f"no frame shows {', '.join(missing)}: the model will only guess them{as_start}"
+    return sentence if missing else ""
+
+
+def is_copy(dataset: Dataset, other: Dataset) -> bool:
+    """Return whether two datasets have the same keypoints, apart from rounding."""
+    if len(dataset) != len(other) or not len(dataset):
+        return False
+    rows = np.linspace(0, len(dataset) - 1, min(len(dataset), _COMPARED)).astype(int)
+    first, second = dataset.points[rows], other.points[rows]
+    one, two = dataset.visible[rows], other.visible[rows]
+    both = one & two
+    if 2 * both.sum() < max(one.sum(), two.sum()) or not both.any():
+        return False
+    size = np.ptp(first[both], axis=0).max()
+    return bool(np.abs(first - second)[both].max() <= _SAME_POINT * size)

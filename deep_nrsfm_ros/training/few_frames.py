@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus, seconds_at_most
 from deep_nrsfm_ros.nrsfm.network import complete, whitening_network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.frames import FrameStore
@@ -32,11 +33,31 @@ MAX_SPREAD = 0.25
 """Spread of the solutions above which none is believed."""
 
 
+TIME_SHARE = 2 / 3
+"""Share of a time limit that the factorisations take at most; the steps have the rest."""
+
 _REPORT_SECONDS = 30.0
 
 
-class _StoppedError(Exception):
-    """The factorisations were stopped; the text says why, "" where the training was stopped."""
+class _TrainingStoppedError(Exception):
+    """The training was stopped while it factorised."""
+
+
+class _TimeIsUpError(Exception):
+    """The factorisations have taken their share of the time limit."""
+
+
+class Factorised(NamedTuple):
+    """What the factorisations found.
+
+    Attributes:
+        shapes: of the frames; None where a network learns them better.
+        minutes_needed: time limit with which they would have come to their end; 0 where they did,
+            or never began.
+    """
+
+    shapes: Consensus | None = None
+    minutes_needed: float = 0.0
 
 
 def factorise(
@@ -45,60 +66,91 @@ def factorise(
     should_stop: Callable[[], bool] = lambda: False,
     on_message: Callable[[str], None] = lambda sentence: None,
     most_seconds: float = math.inf,
-) -> Consensus | None:
+) -> Factorised:
     """Return the shapes of the frames by factorisation; None where a network learns them better.
 
     They are None for many or very few frames, short trainings, many missing keypoints, where the
-    factorisations disagree, and where they take too long.
+    factorisations disagree, and where there is no time for the first of them.
 
     Args:
         frames: all frames of the training.
         preset: its recipe says for how many frames to factorise.
-        should_stop: called in each iteration; None is returned once it is True.
+        should_stop: called in each iteration; the shapes are None once it is True.
         on_message: called with a sentence before the first factorisation, every half minute, and
-            where they are given up.
-        most_seconds: after which they are given up.
+            where they are cut short.
+        most_seconds: after which they are cut short, and their best shapes until then are returned.
     """
     recipe, p = preset.recipe, frames.points.shape[1]
     if not MIN_FRAMES <= len(frames) <= recipe.few_frames or recipe.steps < MIN_STEPS:
-        return None
+        return Factorised()
     if p < 4 or not recipe.cycle:
-        return None
+        return Factorised()
     batch = frames.batch(torch.arange(len(frames), device=frames.device))
     points, mask = batch.points.cpu().numpy(), batch.mask.cpu().numpy()
     if mask.mean() < MIN_VISIBLE:
-        return None
+        return Factorised()
     if not mask.all():
         net = whitening_network(second_moment(frames, preset.normaliser))
         centred = points - (points * mask).sum(1, keepdims=True) / mask.sum(1, keepdims=True)
         points, _ = complete(net, centred * mask, mask)
-    on_message(
-        f"classic factorisations of all {len(points)} frames come first and may take minutes; "
-        "few_frames 0 leaves them out"
-    )
     began = reported = time.monotonic()
+    found: list[Consensus] = []
 
     def before_each() -> None:
         nonlocal reported
         if should_stop():
-            raise _StoppedError
+            raise _TrainingStoppedError
         now = time.monotonic()
         if now - began > most_seconds:
-            raise _StoppedError(
-                f"the factorisations are given up after {now - began:.0f} s, to leave time for the "
-                "network, which learns without them"
-            )
+            raise _TimeIsUpError
         if now - reported > _REPORT_SECONDS:
             reported = now
             on_message(f"still factorising after {now - began:.0f} s")
 
+    needed = math.nan
     try:
-        found = consensus(points, before_each)
-    except _StoppedError as stopped:
-        if reason := str(stopped):
-            on_message(reason)
-        return None
-    return found if found.spread <= MAX_SPREAD else None
+        needed = seconds_at_most(points, before_each)
+        on_message(
+            f"classic factorisations of all {len(points)} frames come first and take up to about "
+            f"{_rounded(needed)} s here; few_frames 0 leaves them out"
+        )
+        found.append(consensus(points, before_each, found.append))
+    except _TrainingStoppedError:
+        return Factorised()
+    except _TimeIsUpError:
+        minutes = _minutes_for(needed if needed > most_seconds else 2 * most_seconds)
+        on_message(_cut_short(most_seconds, needed, minutes, anything=bool(found)))
+        return Factorised(_believed(found), minutes)
+    return Factorised(_believed(found))
+
+
+def _believed(found: Sequence[Consensus]) -> Consensus | None:
+    """Return the last of the shapes that were found; None where the solutions disagree."""
+    return found[-1] if found and found[-1].spread <= MAX_SPREAD else None
+
+
+def _minutes_for(seconds: float) -> float:
+    """Return the time limit, in half minutes, that leaves the factorisations so many seconds."""
+    return math.ceil(seconds / TIME_SHARE / 30) / 2
+
+
+def _rounded(seconds: float) -> int:
+    """Return whole seconds, to a precision that an estimate has."""
+    return max(1, round(seconds) if seconds < 20 else round(seconds / 5) * 5)
+
+
+def _cut_short(spent: float, needed: float, minutes: float, *, anything: bool) -> str:
+    """Return a sentence on factorisations that were cut short, and on what would help."""
+    learns = (
+        "the network learns the less exact shapes that they found until then"
+        if anything
+        else "the network learns without them, and may come out mirrored in part"
+    )
+    known = f"they need up to about {_rounded(needed)} s here: " if needed > spent else ""
+    return (
+        f"the factorisations are cut short after {spent:.0f} s, to leave time for the network; "
+        f"{learns}; {known}give --minutes {minutes:g} (train.minutes), or leave it out"
+    )
 
 
 class FactorisedShapes:

@@ -178,6 +178,8 @@ def _provenance(trainer: Trainer, source: str) -> dict[str, Any]:
             "solutions": trainer.factorisation.solutions,
             "spread": round(trainer.factorisation.spread, 4),
         }
+    if trainer.minutes_needed:
+        provenance["factorisation_needs_minutes"] = trainer.minutes_needed
     provenance |= {"seed": trainer.seed, "step": trainer.step}
     if trainer.kept_step is not None:
         provenance["kept_step"] = trainer.kept_step

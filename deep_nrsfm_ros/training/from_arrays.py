@@ -7,6 +7,7 @@ import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,11 +19,13 @@ from deep_nrsfm_ros.data.held_out import split
 from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.observation import from_arrays
-from deep_nrsfm_ros.model_files.find_layout import find_layout
+from deep_nrsfm_ros.lifting.observation import Observation, from_arrays
+from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale, find_origin, looks_normalised
+from deep_nrsfm_ros.model_files.find_layout import layout_of
 from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
 from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model, load_once
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
+from deep_nrsfm_ros.training.data_check import SERIOUS, WRONG_LAYOUT, check_objects, never_seen
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 
@@ -34,9 +37,9 @@ def train(
     points: ArrayLike,
     confidence: ArrayLike | None = None,
     *,
-    layout: KeypointLayout | str,
+    layout: KeypointLayout | str | Path | Sequence[str],
     name: str = "trained",
-    start: Model | str = "",
+    start: Model | str | Path = "",
     recipe: Recipe | None = None,
     sequence_starts: Sequence[int] = (),
     on_progress: Callable[[Progress], None] = lambda progress: None,
@@ -45,19 +48,22 @@ def train(
     """Train a model on 2D keypoints and return it; `save_model` writes it to a file.
 
     The data are curated as the command `train` does it: frames with few keypoints, near-duplicates
-    and outliers are left out. Warnings about the data and the result are Python warnings.
+    and outliers are left out. They are checked as the command checks a file. Warnings about the
+    data and the result are Python warnings.
 
     Where the object has a model, the new one is compared with it without labels, on the last tenth
-    of each sequence, which the training does not use: `provenance["judgement"]` of the result has
-    the figures, and a doubtful model gives a warning with the reason and what would help.
+    of each sequence, which the training does not use. `provenance["judgement"]` of the result has
+    `doubtful` (a bool), `reason` (the sentence on it) and the figures of both; `on_message` gets
+    the sentence, and a doubtful model gives a warning. A model of data that looks wrong is
+    doubtful, too.
 
     Args:
-        points: (f, p, 2) keypoints of f frames, in any unit, x right and y down. A keypoint at
-            (0, 0) or with a NaN is missing.
+        points: (f, p, 2) keypoints of f frames, x right and y down, in pixels or another unit that
+            is the same for x and y. A keypoint at (0, 0) or with a NaN is missing.
         confidence: (f, p) from 0, which is missing, to 1, or booleans of visibility. None: all
             keypoints are visible.
-        layout: keypoint layout of the points, as an object or by the name of a preset or a layout
-            file ("coco17"); it is the model's too.
+        layout: keypoint layout of the points, as an object, by the name of a preset or a layout
+            file ("coco17"), or a list of the keypoints' names; it is the model's too.
         name: name of the model.
         start: model to start from, its name or its file. "" is a model that comes with the package
             and has most keypoints of the layout, if there is one; "none" is random weights.
@@ -70,12 +76,13 @@ def train(
             (0,): one recording. (): unknown, each quarter of the frames counts as a sequence.
         on_progress: called every few seconds from the first step on, and at the end.
         on_message: called with a sentence when work of up to minutes begins before the first step,
-            such as the factorisations of at most `Recipe.few_frames` frames; `print` shows it.
+            such as the factorisations of at most `Recipe.few_frames` frames, and at the end with
+            what the judge says; `print` shows it.
 
     Raises:
         MissingExtraError: torch is not installed.
-        ValueError: the arrays do not fit each other or the layout, or a model cannot be learned
-            from them.
+        ValueError: the arrays do not fit each other or the layout, the keypoints are clearly in
+            another layout, or a model cannot be learned from them.
     """
     require_extra("train", "training")
     from deep_nrsfm_ros.training.finish import finish
@@ -85,19 +92,21 @@ def train(
     from deep_nrsfm_ros.training.setup import Setup
 
     check_name("name", name)
-    if isinstance(layout, str):
-        layout = find_layout("layout", layout)
+    layout = layout_of("layout", layout, name)
     seen = from_arrays(points, confidence, layout)
     starts = np.array(sequence_starts, np.int64)
     visible = seen.confidence > 0
     data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
+    findings = _findings(points, confidence, seen, layout)
     curated = curate(data)
     origin = _origin(start, layout)
     sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
     if sufficiency.refusal:
         raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
-    missing = "" if origin else layout.warning  # a start passes its handedness on
-    for warning in (missing, *curated.warnings, *sufficiency.warnings):
+    # A start passes its handedness on to a layout without one.
+    missing = layout.warning if layout.handedness or not origin else ""
+    unseen = never_seen(curated.dataset, origin)
+    for warning in (missing, unseen, *map(str, findings), *curated.warnings, *sufficiency.warnings):
         if warning:
             warnings.warn(warning, stacklevel=2)
     rival = origin or _shipped(layout)
@@ -114,7 +123,9 @@ def train(
     model = finish(trainer, name, layout, curated.dataset.source)
     if origin:
         model = inherit(model, origin)
-    judgement = judge(frames, model, rival)
+    faults = [str(finding) for finding in findings if finding.code in SERIOUS]
+    judgement = judge(frames, model, rival, faults)
+    on_message(str(judgement))
     if judgement.doubtful:
         warnings.warn(str(judgement), stacklevel=2)
     date = time.strftime("%Y-%m-%d", time.gmtime())
@@ -122,7 +133,33 @@ def train(
     return model
 
 
-def _origin(start: Model | str, layout: KeypointLayout) -> Model | None:
+def _findings(
+    points: ArrayLike, confidence: ArrayLike | None, seen: Observation, layout: KeypointLayout
+) -> list[Finding]:
+    """Return what looks wrong in the arrays.
+
+    Args:
+        points: as given.
+        confidence: as given.
+        seen: the observation of them.
+        layout: of the keypoints.
+
+    Raises:
+        ValueError: another layout fits clearly better.
+    """
+    given = np.ones(np.shape(points)[:-1]) if confidence is None else np.asarray(confidence, float)
+    findings = confidence_scale(given) + find_origin(np.asarray(points), given)
+    # Only fractions of an image's size have units of their own for x and y.
+    is_normalised = looks_normalised(seen.points, seen.confidence > 0)
+    for finding in check_objects(seen.points, seen.confidence, layout, layout):
+        if finding.code == WRONG_LAYOUT:
+            raise ValueError(str(finding))
+        if finding.code != "normalised" or is_normalised:
+            findings.append(finding)
+    return findings
+
+
+def _origin(start: Model | str | Path, layout: KeypointLayout) -> Model | None:
     """Return the model to start from; None for random weights."""
     if isinstance(start, Model):
         return start

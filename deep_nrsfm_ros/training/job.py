@@ -23,6 +23,9 @@ ACTIVE = ("starting", "reading", "curating", "training")
 ENDED = ("finished", "failed", "cancelled")
 TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
 
+EXIT_DOUBTFUL = 3
+"""Exit code of a training that has ended with a model of data that looks wrong, as of `lift`."""
+
 _OUTPUT_TAIL = 10  # lines
 _KILL_TIMEOUT = 0.5  # s, from SIGKILL to the end of the process
 _NICENESS = 10  # about a tenth of the CPU time of a process at 0; 19 gets almost none
@@ -159,7 +162,7 @@ class TrainingJob:
         """Return the last progress of a process that ended with `code`."""
         last = self._last_status
         values = last.values if last else {}
-        if last and last.ended and (code == 0 or last.state == "failed"):
+        if last and last.ended and (code in (0, EXIT_DOUBTFUL) or last.state != "finished"):
             return last
         if self._cancelled:
             return JobStatus("cancelled", "stopped before there was a model to keep", values)

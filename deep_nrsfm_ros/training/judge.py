@@ -122,6 +122,12 @@ SAME_MISFIT = 1.02
 
 The new model is then better: the frames that it has learned, it fits more closely.
 """
+MOST_FOLDED = 0.75
+"""Share of opposed frames of a model that mirrors about half of them, as a folded one does.
+
+Above it one of both models is the mirror image of the other as a whole. Steady bones do not tell
+which, and a model that was trained on from the other has not turned it by learning.
+"""
 LOOSER_BONES = 2.5
 """Times the other's variation of bones above which a model has fitted its keypoints too closely.
 
@@ -161,6 +167,8 @@ class Judgement(NamedTuple):
         rival: name of the model at hand; "" where there is none with its keypoints.
         rival_figures: its figures.
         verdict: BETTER, AS_GOOD, ALONE or DOUBTFUL.
+        faults: of its data, a sentence each: a model learns what is wrong in its data, and the
+            figures on such data do not show it.
     """
 
     reason: str
@@ -169,6 +177,7 @@ class Judgement(NamedTuple):
     rival: str = ""
     rival_figures: Figures | None = None
     verdict: str = DOUBTFUL
+    faults: tuple[str, ...] = ()
 
     @property
     def doubtful(self) -> bool:
@@ -186,11 +195,32 @@ class Judgement(NamedTuple):
         result["figures"] = _rounded(self.figures)
         if self.rival_figures:
             result |= {"rival": self.rival, "rival_figures": _rounded(self.rival_figures)}
+        if self.faults:
+            result["faults"] = list(self.faults)
         return result
 
 
-def judge(frames: Split, model: Model, rival: Model | None) -> Judgement:
-    """Return whether a new model should replace the one at hand.
+def judge(
+    frames: Split, model: Model, rival: Model | None, faults: Sequence[str] = ()
+) -> Judgement:
+    """Return whether a new model should replace the one at hand; without labels.
+
+    Args:
+        frames: as in `compare`.
+        model: as in `compare`.
+        rival: as in `compare`.
+        faults: sentences about what looks wrong in the data. The model is doubtful for them alone:
+            more frames, or other options, would not help.
+    """
+    judgement = compare(frames, model, rival)
+    if not faults:
+        return judgement
+    reason = f"its data looks wrong: {'; '.join(faults)}. Mend it and train again"
+    return judgement._replace(reason=reason, faults=tuple(faults))
+
+
+def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
+    """Return whether a new model is better than the one at hand, by their figures.
 
     Args:
         frames: those that the model was trained on, and those held out.
@@ -354,12 +384,15 @@ def _worse(new: Figures, old: Figures | None) -> list[str]:
     if worse := [name for name in both if values[name] > known[name] + MORE_WRONG_SIDES]:
         return worse
     is_opposed = _or_zero(new.opposed) > MOST_OPPOSED
+    if _or_zero(new.turned) > MOST_FOLDED:
+        return ["turned"]
     less = any(known[name] > values[name] + MORE_WRONG_SIDES for name in both)
     if less and (is_opposed or old.wrong_sides > MOST_MIRRORED):
         return []
     bones, other_bones = _or_zero(new.bone_variation), _or_zero(old.bone_variation)
     if is_opposed:
-        return [] if bones < STEADIER_BONES * other_bones else ["opposed"]
+        is_folded = new.opposed < MOST_FOLDED and bones < STEADIER_BONES * other_bones
+        return [] if is_folded else ["opposed"]
     if _or_zero(new.turned) > MORE_WRONG_SIDES:  # too few for the mean of the bones to tell whose
         return ["turned"]
     worse = ["bone_variation"] if bones > LOOSER_BONES * other_bones else []
@@ -402,6 +435,8 @@ def _in_words(name: str, new: Figures, old: Figures | None, rival: str) -> str:
 def _advice(model: Model, rival: str) -> str:
     """Return what would help a doubtful model."""
     advice = ["more views", "more frames"]
+    if minutes := model.provenance.get("factorisation_needs_minutes"):
+        advice.insert(0, f"more time (--minutes {minutes:g}, train.minutes, or no limit)")
     if "from" in model.provenance:
         advice.append("fewer steps")
     else:

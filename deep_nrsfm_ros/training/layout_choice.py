@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -116,7 +117,12 @@ def detector_layout(config: TrainingConfig, layouts: list[KeypointLayout]) -> st
 
 
 def _sources(choices: list[_Choice]) -> str:
+    """Return the names of bags and files."""
+    return in_words(choice.source for choice in choices)
+
+
+def in_words(sources: Iterable[str]) -> str:
     """Return the names of bags and files, e.g. "a.npz, b.npz, c.npz and 7 more"."""
-    names = ", ".join(choice.source for choice in choices[:_SHOWN])
-    more = len(choices) - _SHOWN
-    return names + (f" and {more} more" if more > 0 else "")
+    names = list(sources)
+    more = len(names) - _SHOWN
+    return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -22,8 +22,9 @@ class Limits:
 
     minutes: float = option(
         0.0,
-        "minutes of wall time after which the training ends; the learning rate falls to zero by "
-        "then; 0 = no limit",
+        "minutes of wall time, whatever else keeps the cores busy, after which the training ends; "
+        "the learning rate falls to zero by then; factorisations of few frames (few_frames) take "
+        "at most two thirds of it; 0 = no limit",
         low=0.0,
         high=100_000.0,
     )

@@ -25,7 +25,7 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.best_checkpoint import BestCheckpoint
 from deep_nrsfm_ros.training.checkpoint import read_checkpoint, write_checkpoint
 from deep_nrsfm_ros.training.early_stopping import end_reason, time_is_up
-from deep_nrsfm_ros.training.few_frames import FactorisedShapes, factorise
+from deep_nrsfm_ros.training.few_frames import TIME_SHARE, Factorised, FactorisedShapes, factorise
 from deep_nrsfm_ros.training.fine_tuning import lacks_whitening
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.limb_exchange import with_limb_exchange
@@ -36,8 +36,7 @@ from deep_nrsfm_ros.training.steps import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SCREENING_SHARE = 0.1  # of the time, at most
-_FACTORISATION_SHARE = 0.5  # of the time limit, at most
-_FACTORISED = "factorised"  # name of a tensor of checkpoints: 1 if factorised shapes teach
+_FACTORISED = "factorised."  # begins the names of checkpoints' tensors of factorised shapes
 _SMALLEST_EXTENT = 1e-4  # of the largest one; a frame of less has no extent
 _ROUNDING = 1e-5  # of the largest coordinate of a frame; an extent of less is that of float32
 
@@ -51,7 +50,8 @@ class Callbacks:
         on_progress: called every few seconds, and at the end, by the first process.
         should_stop: called before each step (every 16 steps in a group of processes); True ends
             the training.
-        on_message: called with a sentence when work of up to minutes begins before the first step.
+        on_message: called with a sentence when work of up to minutes begins before the first step,
+            and with the step at which a training goes on.
     """
 
     on_step: Callable[[Trainer], None] = lambda trainer: None
@@ -138,9 +138,28 @@ def train(
     return _Loop(part, preset, setup, callbacks, checkpointing, saved).train()
 
 
-def _was_taught(saved: dict[str, Tensor]) -> bool:
-    """Return whether factorised shapes teach the training of a checkpoint."""
-    return bool(saved.get(_FACTORISED, 1.0))
+def _tensors_of(factorised: Factorised) -> dict[str, Tensor]:
+    """Return what factorisations found as named tensors of a checkpoint."""
+    tensors = {_FACTORISED + "minutes_needed": torch.tensor(factorised.minutes_needed)}
+    if factorised.shapes is not None:
+        for name, value in factorised.shapes._asdict().items():
+            tensors[_FACTORISED + name] = torch.as_tensor(value)
+    return tensors
+
+
+def _saved_factorisation(saved: dict[str, Tensor]) -> Factorised:
+    """Return what factorisations had found when a checkpoint was written."""
+    of = {
+        name.removeprefix(_FACTORISED): tensor
+        for name, tensor in saved.items()
+        if name.startswith(_FACTORISED)
+    }
+    minutes_needed = float(of.pop("minutes_needed", 0.0))
+    if not of:
+        return Factorised(None, minutes_needed)
+    shapes, rotations, scales = (of[name].numpy() for name in ("shapes", "rotations", "scales"))
+    spread, solutions = float(of["spread"]), int(of["solutions"])
+    return Factorised(Consensus(shapes, rotations, scales, spread, solutions), minutes_needed)
 
 
 class _Loop:
@@ -168,35 +187,36 @@ class _Loop:
         self.frames, self.preset, self.setup = frames, preset, setup
         self.callbacks, self.checkpointing, self.group = callbacks, checkpointing, setup.group
         self.clock = Clock(recipe.steps, setup.limits.minutes * 60)
-        factorisation = self.factorisation = self._factorisation(saved)
-        # A training that is stopped while it factorises once more keeps what its checkpoint says.
-        self.is_taught = factorisation is not None if saved is None else _was_taught(saved)
+        self.factorised = self._factorisation(saved)
+        factorisation = self.factorised.shapes
         # Seeds differ in which frames they mirror; factorised shapes leave them no choice.
-        self.screening = recipe.seeds > 1 and setup.start is None and not self.is_taught
+        self.screening = recipe.seeds > 1 and setup.start is None and factorisation is None
         self.first_seed = recipe.seed * (recipe.seeds if self.screening else 1)
         self.trainer = self._trainer(self.first_seed)
         self.leader: Trainer | None = None
         self.leader_error = math.inf
         self.best = BestCheckpoint(setup.limits, recipe)
         self.mirror = MirrorCheck(frames, preset.normaliser, most_frames(recipe), self.group)
-        factorised = None if factorisation is None else FactorisedShapes(factorisation)
-        self.known_shapes = KnownShapesSource(self.mirror, recipe, factorised)
-        self.saved = time.monotonic()
+        taught = None if factorisation is None else FactorisedShapes(factorisation)
+        self.known_shapes = KnownShapesSource(self.mirror, recipe, taught)
+        # Factorised shapes took long: they are saved with the first step.
+        self.saved = time.monotonic() if factorisation is None else -math.inf
         self.stopped, self.time_fraction = False, 0.0
         self.iterations = 0  # of this process, over all seeds
         if saved is not None:
             self._restore(saved)
 
-    def _factorisation(self, saved: dict[str, Tensor] | None) -> Consensus | None:
+    def _factorisation(self, saved: dict[str, Tensor] | None) -> Factorised:
         """Return the shapes that few frames teach, if any; the clock counts the time they take.
 
-        A training that continues has them again if it had them before, however long they take.
+        A training that continues has those of its checkpoint.
         """
-        had_none = saved is not None and not _was_taught(saved)
-        if had_none or self.setup.start is not None or self.group.size > 1:
-            return None
+        if saved is not None:
+            return _saved_factorisation(saved)
+        if self.setup.start is not None or self.group.size > 1:
+            return Factorised()
         calls, limit = self.callbacks, self.clock.limit
-        most_seconds = _FACTORISATION_SHARE * limit if limit and saved is None else math.inf
+        most_seconds = TIME_SHARE * limit if limit else math.inf
         found = factorise(
             self.frames, self.preset, calls.should_stop, calls.on_message, most_seconds
         )
@@ -254,7 +274,9 @@ class _Loop:
 
     def _trainer(self, seed: int) -> Trainer:
         """Return a new trainer of a seed."""
-        return Trainer(self.frames, self.preset, seed, self.setup, self.factorisation)
+        trainer = Trainer(self.frames, self.preset, seed, self.setup, self.factorised.shapes)
+        trainer.minutes_needed = self.factorised.minutes_needed
+        return trainer
 
     def _advance(self, steps: int, time_budget: float, *, chosen: bool = False) -> None:
         """Train up to step `steps`, or until `time_budget` of the time limit has elapsed.
@@ -294,7 +316,7 @@ class _Loop:
         """Return all that a training needs to continue, as named tensors."""
         tensors = self.trainer.state() | self.best.state() | self.known_shapes.state()
         tensors["seconds"] = torch.tensor(self.clock.seconds(), dtype=torch.float64)
-        tensors[_FACTORISED] = torch.tensor(float(self.is_taught))
+        tensors |= _tensors_of(self.factorised)
         if self.screening:
             tensors["screening"] = torch.tensor(self.leader_error, dtype=torch.float64)
         if self.leader:
@@ -322,6 +344,10 @@ class _Loop:
             self.leader = self._trainer(self.first_seed)
             self.leader.restore(leader)
             self.leader_error = float(tensors["screening"])
+        where = f"step {self.trainer.step} of {self.preset.recipe.steps}"
+        if self.screening:
+            where += f", where seed {self.trainer.seed} is screened"
+        self.callbacks.on_message(f"goes on at {where}")
 
 
 def _frames_with_extent(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> FrameStore:

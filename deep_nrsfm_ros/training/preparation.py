@@ -22,12 +22,28 @@ from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
 from deep_nrsfm_ros.data.virtual_people import read_virtual_people
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.lifting.sanity import Finding, to_pixels
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
-from deep_nrsfm_ros.training.config import COMMAND_LINE, DataConfig, TrainingConfig
+from deep_nrsfm_ros.training.config import COMMAND_LINE, PARAMETERS, DataConfig, TrainingConfig
+from deep_nrsfm_ros.training.data_check import (
+    WRONG_LAYOUT,
+    SourceFinding,
+    check_objects,
+    is_copy,
+    sentences,
+    serious,
+)
 from deep_nrsfm_ros.training.distributed import own_share
-from deep_nrsfm_ros.training.layout_choice import LayoutChoice, detector_layout, layout_choice
+from deep_nrsfm_ros.training.layout_choice import (
+    LayoutChoice,
+    detector_layout,
+    in_words,
+    layout_choice,
+)
 from deep_nrsfm_ros.training.reporter import Reporter
 from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
+
+_OPTION = f"({COMMAND_LINE('keypoint_layout')}, {PARAMETERS('keypoint_layout')})"
 
 
 @dataclass(frozen=True)
@@ -67,19 +83,22 @@ class ReadData(NamedTuple):
         dataset: in the layout of the model.
         detector_layout: value of the lifter's `keypoint_layout` for the detector that gave the
             keypoints; "" where that is the layout of the model, or unknown.
+        faults: a sentence for each thing that looks wrong in it, so that a model of it is doubtful.
     """
 
     dataset: Dataset
     detector_layout: str
+    faults: tuple[str, ...] = ()
 
 
 def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
     """Return the data that the configuration names, and report what was lost on the way.
 
     Each of several processes reads its own share of bags and files; all read the motion capture.
-    Where nothing says the keypoint layout of a bag or a file, it is chosen (`layout_choice`).
+    Where nothing says the keypoint layout of a bag or a file, it is chosen (`layout_choice`). Each
+    is checked by itself (`data_check`): in a mixture, sound ones would hide a faulty one.
 
-    Raises ValueError where there is no such data, or none that can be read.
+    Raises ValueError where there is no such data, or none that can be read or learned from.
     """
     data = config.data
     source, target = find_layouts(config, COMMAND_LINE)
@@ -98,13 +117,15 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
     if config.object == NUMBERED:
         source = target = _numbered(data, options)
     choice, keypoint_map = layout_choice(config), KeypointMap(source, target)
-    parts: list[Part] = []
+    parts, findings = list[Part](), list[SourceFinding]()
     if data.bags:
-        parts += _read_bags(data, keypoint_map, options, reporter, choice)
+        parts += _read_bags(data, keypoint_map, options, reporter, choice, findings)
     if data.inputs:
-        parts += _read_inputs(data, keypoint_map, options, reporter, choice, bool(parts))
+        parts += _read_inputs(data, keypoint_map, options, reporter, choice, bool(parts), findings)
     if choice:
         choice.report(reporter)
+    for sentence in sentences(findings):
+        reporter.warn(sentence)
     dataset = concatenate([part.dataset for part in parts])
     if len(dataset) > -(-config.limits.max_frames // own_share().size):
         total = len(dataset) * own_share().size
@@ -112,7 +133,8 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
             f"bags and files have {total} frames; at most {config.limits.max_frames} are "
             "read (max_frames); name fewer files, or allow more"
         )
-    return ReadData(dataset, detector_layout(config, [part.layout for part in parts]))
+    detector = detector_layout(config, [part.layout for part in parts])
+    return ReadData(dataset, detector, tuple(serious(findings)))
 
 
 def read_people(
@@ -149,10 +171,12 @@ def _read_bags(
     options: ReadOptions,
     reporter: Reporter,
     choice: LayoutChoice | None,
+    findings: list[SourceFinding],
 ) -> list[Part]:
     """Return the objects in the bags of each layout, and report what could not be read.
 
-    A bag that cannot be read is left out with a warning, unless no data is left.
+    A bag that cannot be read, or is clearly in another layout, is left out with a warning, unless
+    no data is left. What looks wrong in a bag is added to `findings`.
     """
     target, failures, parts = keypoint_map.target, list[ValueError](), list[Part]()
     groups: dict[tuple[str, ...], tuple[KeypointLayout, list[Path]]] = {}
@@ -179,7 +203,22 @@ def _read_bags(
         if reading.unreadable:
             count = f"{reading.unreadable} of {reading.messages}"
             reporter.warn(f"{count} messages could not be read: {reading.reason}")
-        parts.append(Part(reading.dataset, layout))
+        whole = _in_pixels(reading.dataset, options)
+        ends = [start for _, start in reading.starts[1:]] + [len(whole)]
+        kept = list[tuple[str, Dataset]]()
+        for (bag, start), end in zip(reading.starts, ends, strict=True):
+            dataset = whole[start:end]
+            found = _check_bag(bag, dataset, layout, options, is_chosen=choice is not None)
+            if wrong := _wrong_layout(bag, found):
+                failures.append(wrong)
+                continue
+            findings += [SourceFinding(bag.name, finding) for finding in found]
+            kept.append((bag.name, dataset))
+        if kept and len(kept) < len(reading.starts):
+            source = f"bags {', '.join(name for name, _ in kept)}"
+            whole = dataclasses.replace(concatenate([each for _, each in kept]), source=source)
+        if kept:
+            parts.append(Part(whole, layout))
     if not parts and not data.inputs:
         raise failures[0]
     for failure in failures:
@@ -194,12 +233,14 @@ def _read_inputs(
     reporter: Reporter,
     choice: LayoutChoice | None,
     may_be_none: bool,
+    findings: list[SourceFinding],
 ) -> list[Part]:
     """Return the objects in each file, those of one identity one after the other.
 
     So near-duplicates of one person follow one another, as the curation expects. A file that
-    cannot be read is left out with a warning, unless no data is left. Where there are several
-    sources, the names that a file has for its keypoints go before the layout of the configuration.
+    cannot be read, or is clearly in another layout, is left out with a warning, unless no data is
+    left. What looks wrong in a file is added to `findings`. Where there are several sources, the
+    names that a file has for its keypoints go before the layout of the configuration.
     Each of several processes reads every n-th file; where there are fewer files than processes, it
     takes its share of the objects in each.
     """
@@ -210,7 +251,7 @@ def _read_inputs(
     named = keypoint_map.source if data.keypoint_layout and is_only_source else None
     fallback = None if choice else keypoint_map.source
     options = dataclasses.replace(options, layout=named, fallback=fallback)
-    parts, failures = list[Part](), list[ValueError]()
+    parts, failures, copies = list[Part](), list[ValueError](), list[str]()
     for path in paths:
         try:
             own = _options_for(path, options)
@@ -223,11 +264,23 @@ def _read_inputs(
             names, to_target = _match_names(path, layout, keypoint_map.target)
             if not len(detections) or not detections.confidence.any():
                 raise ValueError(f"{path}: it has no object with keypoints")
+            found = check_objects(
+                detections.points,
+                detections.confidence,
+                layout,
+                keypoint_map.target,
+                options.image_size,
+                # The names in a file say its layout, and a chosen one is the one that fits.
+                may_be_another=layout is keypoint_map.source,
+            )
+            if wrong := _wrong_layout(path, found):
+                raise wrong
         except ValueError as error:  # of one file: the others may do
             failures.append(error)
             continue
-        found = (*detections.findings, *names.findings)
-        for warning in (*detections.warnings, *names.warnings, *map(str, found)):
+        found = [*detections.findings, *names.findings, *found]
+        findings += [SourceFinding(path.name, finding) for finding in found]
+        for warning in (*detections.warnings, *names.warnings):
             reporter.warn(f"{path.name}: {warning}")
         order = np.lexsort((detections.frame, detections.identities))
         order = order[share.rows(len(order))]
@@ -236,12 +289,52 @@ def _read_inputs(
         points, confidence = to_target(detections.points[order], detections.confidence[order])
         visible, source = confidence > 0, f"file {path.name}"
         dataset = Dataset(points, visible, keypoint_map.target, source, sequence_starts=starts)
+        if same := [part.dataset.source for part in parts if is_copy(dataset, part.dataset)]:
+            copies.append(f"{path.name} (of {same[0].removeprefix('file ')})")
         parts.append(Part(dataset, layout))
     if not parts and not may_be_none:
         raise failures[0]
+    if copies:
+        reporter.warn(f"the same keypoints twice: {in_words(copies)}; leave the copies out")
     for failure in failures:
         reporter.warn(f"left out: {failure}")
     return parts
+
+
+def _in_pixels(dataset: Dataset, options: ReadOptions) -> Dataset:
+    """Return the dataset of bags in pixels: normalised keypoints times the image's size."""
+    if options.image_size is None:  # else nothing is multiplied
+        return dataset
+    points = to_pixels(dataset.points, dataset.visible.astype(np.float32), options.image_size)
+    return dataclasses.replace(dataset, points=np.asarray(points, np.float32))
+
+
+def _check_bag(
+    path: Path, dataset: Dataset, layout: KeypointLayout, options: ReadOptions, *, is_chosen: bool
+) -> list[Finding]:
+    """Return what looks wrong in a bag.
+
+    Args:
+        path: of the bag.
+        dataset: its objects, in the layout of the model.
+        layout: of the keypoints, as the detector gave them.
+        options: of reading.
+        is_chosen: the layout is the one that fits best.
+    """
+    target, size = dataset.layout, options.image_size
+    found = check_objects(
+        dataset.points, dataset.visible, target, target, size, may_be_another=False
+    )
+    if is_chosen or not any(finding.code == "poor-fit" for finding in found):
+        return found
+    sample = sample_bag(path, dataclasses.replace(options, layout=layout))
+    return check_objects(sample.points, sample.confidence, layout, target, size)
+
+
+def _wrong_layout(path: Path, findings: list[Finding]) -> ValueError | None:
+    """Return the error of a bag or file that is clearly in another layout; None if it is not."""
+    wrong = next((finding for finding in findings if finding.code == WRONG_LAYOUT), None)
+    return ValueError(f"{path}: {wrong} {_OPTION}") if wrong else None
 
 
 def _match_names(

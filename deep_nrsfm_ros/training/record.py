@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, NamedTuple
 
 from deep_nrsfm_ros.training.config import TrainingConfig, option_text
 from deep_nrsfm_ros.training.disk import unwritable
+from deep_nrsfm_ros.training.same_name import UNFINISHED
 
 CHECKPOINT = ".checkpoint"
 RECORD = ".training.json"
@@ -124,11 +126,18 @@ def read_record(folder: Path, name: str) -> TrainingRecord | None:
 
 
 @contextmanager
-def keep_record(config: TrainingConfig) -> Iterator[Path]:
+def keep_record(
+    config: TrainingConfig, say: Callable[[str], None] = lambda sentence: None
+) -> Iterator[Path]:
     """Record the configuration of a training until the end of the block.
 
     The record outlives the block if there is a checkpoint at its end, and a process that is killed.
-    Unless the configuration says to resume, an existing checkpoint is removed.
+    Unless the configuration says to resume, an unfinished training of the same name becomes that of
+    NAME_unfinished, which can be resumed until one of NAME ends with a model that is not doubtful.
+
+    Args:
+        config: the configuration.
+        say: takes a sentence on an unfinished training that becomes NAME_unfinished.
 
     Yields:
         The path of the checkpoint.
@@ -151,8 +160,8 @@ def keep_record(config: TrainingConfig) -> Iterator[Path]:
                 "another name"
             )
         try:
-            if not config.resume:
-                checkpoint.unlink(missing_ok=True)
+            if not config.resume and checkpoint.exists():
+                say(_set_aside(folder, name))
             file = partial.open("w", encoding="utf-8")
         except OSError as error:
             raise ValueError(unwritable(folder, error)) from error
@@ -165,6 +174,31 @@ def keep_record(config: TrainingConfig) -> Iterator[Path]:
                 checkpoint.with_name(f"{checkpoint.name}.partial").unlink(missing_ok=True)
                 if not checkpoint.exists():
                     record.unlink(missing_ok=True)
+
+
+def _set_aside(folder: Path, name: str) -> str:
+    """Give an unfinished training another name; return a sentence on it.
+
+    Its record is copied: this process has locked it under its old name.
+    """
+    aside = f"{name}{UNFINISHED}"
+    with suppress(OSError):
+        shutil.copyfile(record_file(folder, name), record_file(folder, aside))
+    checkpoint_file(folder, name).replace(checkpoint_file(folder, aside))
+    return (
+        f"the training of {name!r} begins anew. The unfinished one is kept as {aside!r} until one "
+        f"of {name!r} ends with a model that is not doubtful: --resume --name {aside} goes on with "
+        "it"
+    )
+
+
+def give_up_unfinished(folder: Path, name: str) -> None:
+    """Remove the unfinished training that `keep_record` has set aside for one of `name`."""
+    aside = f"{name}{UNFINISHED}"
+    record = read_record(folder, aside)
+    if record and not record.running:
+        for file in (checkpoint_file(folder, aside), record_file(folder, aside)):
+            file.unlink(missing_ok=True)
 
 
 def _write(file: IO[str], config: TrainingConfig, record: Path) -> None:

@@ -41,6 +41,7 @@ class Reporter:
         self._bar: tqdm[Any] | None = None
         self._state = ""
         self._last = 0.0
+        self._ended = ("", 0)  # state and total of the count that was complete
         self.curves: list[Any] = []
         self.warnings: list[str] = []
 
@@ -56,10 +57,16 @@ class Reporter:
         """Report a state from time to time, and at its end; raise CancelledError to end it."""
         if self._should_stop():
             raise CancelledError
-        if done == total or time.monotonic() - self._last > 0.2:
+        is_due = time.monotonic() - self._last > 0.2
+        # A file may be at its end many times, while its last lines are read.
+        if done == total and self._ended == (state, total):
+            return
+        # A bar of each of many small files would hide the warnings.
+        if is_due or done == total and (self.as_json or self._bar is not None):
             self._show(state, done, total, {})
         if done == total:
             self._close_bar()
+            self._ended = (state, total)
 
     def training(self, progress: Any) -> None:
         """Report a `training.progress.Progress`, and keep it for the curves."""

@@ -24,6 +24,7 @@ from deep_nrsfm_ros.training.config import PARAMETERS, DataConfig, OutputConfig,
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.record import checkpoint_file, record_file
 from deep_nrsfm_ros.training.resume import resume_request
+from deep_nrsfm_ros.training.same_name import BEFORE, DOUBTFUL, UNFINISHED
 from deep_nrsfm_ros.training.validation import read_field_mapping, validate
 
 
@@ -59,7 +60,9 @@ class TrainingOptions:
         "weights",
     )
     name: str = option(
-        "trained", "name of the new model; an existing model of this name is replaced"
+        "trained",
+        "name of the new model, not one of the package's; a good model of this name is replaced "
+        "only by one that is not doubtful beside it, and is kept as NAME_before",
     )
     threads: int = option(1, "threads that the training may use", low=1, high=1024)
     max_minutes: float = option(
@@ -77,8 +80,9 @@ class TrainingOptions:
     )
     activate: str = option(
         "if_better",
-        "whether to switch to the new model when the training has finished: if_better = unless "
-        "its figures without labels are worse than those of the present one, always, never",
+        "whether to switch to the new model when the training has finished: if_better = if its "
+        "figures without labels are not worse than those of the present one, it is of the object "
+        "that the lifter lifts, and its depth cannot be mirrored as a whole; always; never",
         choices=("if_better", "always", "never"),
     )
 
@@ -240,8 +244,9 @@ def sandboxed(options: TrainingOptions, sandbox: PathSandbox) -> TrainingOptions
     """Return the options with absolute paths; raise ValueError for a path outside the sandbox."""
     check_name("train.name", options.name)
     folder, name = sandbox.models_dir, options.name
-    results = (folder / f"{name}{suffix}" for suffix in (MODEL_SUFFIX, ".html"))
-    traces = (checkpoint_file(folder, name), record_file(folder, name))
+    names = [f"{name}{end}" for end in ("", BEFORE, DOUBTFUL, UNFINISHED)]
+    results = (folder / f"{each}{suffix}" for each in names for suffix in (MODEL_SUFFIX, ".html"))
+    traces = (of(folder, each) for each in names for of in (checkpoint_file, record_file))
     sandbox.outputs("train.name", (*results, *traces))
     return dataclasses.replace(
         options,

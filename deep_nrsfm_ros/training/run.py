@@ -16,18 +16,27 @@ from safetensors import SafetensorError
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.hands import as_right_hands
 from deep_nrsfm_ros.data.held_out import Split, split
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
-from deep_nrsfm_ros.training.data_check import check_dataset
+from deep_nrsfm_ros.training.data_check import never_seen
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.preparation import Prepared, prepare, read_data, read_people
-from deep_nrsfm_ros.training.record import checkpoint_file, keep_record
+from deep_nrsfm_ros.training.record import checkpoint_file, give_up_unfinished, keep_record
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter
-from deep_nrsfm_ros.training.validation import find_layouts, validate
+from deep_nrsfm_ros.training.same_name import (
+    BEFORE,
+    CUT_OFF,
+    OldModel,
+    keep_before,
+    name_beside,
+    old_model,
+)
+from deep_nrsfm_ros.training.validation import validate
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.training.judge import Judgement
@@ -48,7 +57,7 @@ class TrainingResult(NamedTuple):
         mapping: field mapping of the messages in the data; "" for none.
         judgement: whether the model should replace the one at hand; None: it was cut off.
         frames: those of the training and those held out; None: nothing is held out.
-        rival: the model at hand; None: there is none.
+        rival: the model that it was judged beside; None: there is none.
     """
 
     model: Model
@@ -82,10 +91,7 @@ def run(
     """
     validate(config, COMMAND_LINE)
     try:
-        dataset, detector_layout = read_data(config, reporter)
-        if not config.data.cmu:
-            source, _ = find_layouts(config, COMMAND_LINE)
-            dataset = check_dataset(dataset, source, config.data.image_size, reporter)
+        dataset, detector_layout, faults = read_data(config, reporter)
         if config.data.hands:
             dataset = as_right_hands(dataset, config.data.hands)
         prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
@@ -94,31 +100,35 @@ def run(
             raise CancelledError from error
         raise
     try:
-        with _record(config) as checkpoint:
-            result = _train_and_save(config, prepared, checkpoint, reporter, should_stop)
+        with _record(config, reporter) as checkpoint:
+            result = _train_and_save(config, prepared, faults, checkpoint, reporter, should_stop)
             return result and result._replace(detector_layout=detector_layout)
     except SafetensorError as error:  # neither OSError nor ValueError, though the disk is full
         raise ValueError(unwritable(config.output.folder, error)) from error
 
 
-def _record(config: TrainingConfig) -> AbstractContextManager[Path]:
+def _record(config: TrainingConfig, reporter: Reporter) -> AbstractContextManager[Path]:
     """Return the context of the training's record; only the first of several processes keeps it."""
     if rank():
         return nullcontext(checkpoint_file(config.output.folder, config.output.name))
-    return keep_record(config)
+    return keep_record(config, reporter.warn)
 
 
 def _train_and_save(
     config: TrainingConfig,
     prepared: Prepared,
+    faults: tuple[str, ...],
     checkpoint: Path,
     reporter: Reporter,
     should_stop: Callable[[], bool],
 ) -> TrainingResult | None:
     """Train on the prepared data; the first process saves the model and returns the result."""
     start, rival = (load_once(Path(f)) if f else None for f in (config.start, config.rival))
-    _describe(prepared, reporter, start)
-    share = config.curation.held_out if rival else 0.0
+    is_resumed = config.resume and checkpoint.exists()
+    _describe(prepared, reporter, start, is_resumed=is_resumed)
+    old = old_model(config.output.folder, config.output.name)
+    rivals = _rivals(config, prepared.dataset.layout, rival, old)
+    share = config.curation.held_out if rivals else 0.0
     frames = split(prepared.dataset, share)
     if frames.held_out is not frames.training:
         reporter.say(_shared_out(len(prepared.dataset), frames))
@@ -129,7 +139,6 @@ def _train_and_save(
         checkpoint.unlink(missing_ok=True)
         raise CancelledError
     from deep_nrsfm_ros.training.finish import finish
-    from deep_nrsfm_ros.training.judge import judge
 
     dataset = prepared.dataset
     people = read_people(config, dataset.layout, reporter)
@@ -138,17 +147,20 @@ def _train_and_save(
     model = dataclasses.replace(model, provenance=model.provenance | {"date": date})
     if start:
         model = inherit(model, start)
-    judgement = judge(frames, model, rival) if trainer.end_reason else None
-    if judgement:
+    judgement, rival = None, rivals[0] if rivals else None
+    if trainer.end_reason:
+        judgement, rival = _judge(frames, model, rivals, faults)
         model.provenance["judgement"] = judgement.record()
-    path = config.output.folder / f"{config.output.name}{MODEL_SUFFIX}"
-    if judgement and judgement.doubtful and path.resolve() == Path(config.rival).resolve():
-        model = dataclasses.replace(model, name=f"{model.name}_doubtful")
-        path = path.with_name(f"{model.name}{MODEL_SUFFIX}")
-    save_model(path, model)
-    ending = _ending(trainer, path, model, checkpoint)
+    else:
+        model.provenance[CUT_OFF] = True
+    model, path, note = _save(config, model, old, judgement)
+    if rival and rival.name == path.stem:
+        rival = dataclasses.replace(rival, name=f"{rival.name}{BEFORE}")
+    state, message = _ending(trainer, path, model, checkpoint)
+    if judgement and not judgement.doubtful:
+        give_up_unfinished(config.output.folder, config.output.name)
     return TrainingResult(
-        *(model, path, prepared, *ending),
+        *(model, path, prepared, state, message + note),
         mapping=config.data.mapping,
         judgement=judgement,
         frames=None if frames.held_out is frames.training else frames,
@@ -156,22 +168,94 @@ def _train_and_save(
     )
 
 
-def _describe(prepared: Prepared, reporter: Reporter, start: Model | None) -> None:
+def _rivals(
+    config: TrainingConfig, layout: KeypointLayout, rival: Model | None, old: OldModel | None
+) -> list[Model]:
+    """Return the models that the new one must be better than to take its name.
+
+    They are the model at hand, and a good one of that name and of the same object. Motion capture
+    is compared with none.
+
+    Args:
+        config: names the data and the model at hand.
+        layout: of the new model.
+        rival: the model at hand.
+        old: the model that has the name of the new one.
+    """
+    rivals = [rival] if rival else []
+    if config.data.cmu or old is None or not old.is_rival(layout):
+        return rivals
+    return rivals if _is_file_of(old, config.rival) else [*rivals, load_once(old.path)]
+
+
+def _is_file_of(old: OldModel, file: str) -> bool:
+    """Return whether an old model is the one in a file; "" is no file."""
+    return bool(file) and old.path.resolve() == Path(file).resolve()
+
+
+def _judge(
+    frames: Split, model: Model, rivals: list[Model], faults: tuple[str, ...]
+) -> tuple[Judgement, Model | None]:
+    """Return a judgement that doubts the model if there is one, else the first one, and its rival.
+
+    Args:
+        frames: those of the training and those held out.
+        model: the new one.
+        rivals: see `_rivals`.
+        faults: of the data, in words.
+    """
+    from deep_nrsfm_ros.training.judge import judge
+
+    judgement = judge(frames, model, rivals[0] if rivals else None, faults)
+    for other in rivals[1:]:
+        if judgement.doubtful:
+            break
+        second = judge(frames, model, other, faults)
+        if second.doubtful:
+            return second, other
+    return judgement, rivals[0] if rivals else None
+
+
+def _save(
+    config: TrainingConfig, model: Model, old: OldModel | None, judgement: Judgement | None
+) -> tuple[Model, Path, str]:
+    """Write the model file, beside a good one if need be; return model, file and a note on it.
+
+    Args:
+        config: names the file.
+        model: the new one.
+        old: the model that has its name.
+        judgement: of the new one; None: it was cut off.
+    """
+    is_at_stake = old is not None and (old.is_good or _is_file_of(old, config.rival))
+    name = name_beside(model.name, old if is_at_stake else None, judgement)
+    path, note = config.output.folder / f"{name}{MODEL_SUFFIX}", ""
+    if name != model.name:
+        note = f"; model {model.name!r} stays as it was"
+    elif path.is_file() and not (config.resume and old and old.is_cut_off):
+        # A cut-off model is of the training that goes on.
+        note = f"; the model {name!r} that was there is kept as {keep_before(path)!r}"
+    model = dataclasses.replace(model, name=name)
+    save_model(path, model)
+    return model, path, note
+
+
+def _describe(
+    prepared: Prepared, reporter: Reporter, start: Model | None, *, is_resumed: bool
+) -> None:
     """Report the size of the dataset, what it cannot teach, and what the training starts from."""
     dataset = prepared.dataset
-    reporter.say(
-        f"starts from model {start.name!r} (--from none, train.from none: from random weights)"
-        if start
-        else "starts from random weights"
-    )
+    if not is_resumed:  # the training loop says where it goes on
+        reporter.say(
+            f"starts from model {start.name!r} (--from none, train.from none: from random weights)"
+            if start
+            else "starts from random weights"
+        )
     # A start passes its handedness on to a layout without one.
     if dataset.layout.warning and (dataset.layout.handedness or not start):
         reporter.warn(dataset.layout.warning)
-    times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
-    if missing := [name for name, times in times_visible if not times]:
-        as_start = f", as {start.name!r} does" if start else ""
-        names = ", ".join(missing)
-        reporter.warn(f"no frame shows {names}: the model will only guess them{as_start}")
+    if unseen := never_seen(dataset, start):
+        reporter.warn(unseen)
     reporter.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
 
 

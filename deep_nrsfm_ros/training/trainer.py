@@ -68,6 +68,8 @@ class Trainer:
         end_reason: why the training has ended; "" if it was stopped or goes on.
         mirrored_share: share of frames with mirrored depth at the end, 0 to 0.5; NaN unknown.
         factorisation: shapes of the frames that the network is taught; None: none.
+        minutes_needed: time limit with which the factorisations would have come to their end; 0
+            where none cut them short.
         from_random: whether the training began with random weights.
         total_frames: frames of all processes.
         cpu_seconds: processor time of this process in steps.
@@ -103,7 +105,7 @@ class Trainer:
         self.kept_step: int | None = None
         self.end_reason = ""
         self.mirrored_share = math.nan
-        self.factorisation = factorisation
+        self.factorisation, self.minutes_needed = factorisation, 0.0
         self.from_random = start is None
         self._limb_exchange = setup.limb_exchange
         device = frames.device

@@ -24,6 +24,7 @@ from deep_nrsfm_ros.training.config import DataConfig, OptionNames, TrainingConf
 from deep_nrsfm_ros.training.disk import check_room
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, start_from
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange, check_limb_exchange
+from deep_nrsfm_ros.training.same_name import check_not_shipped
 
 _NUMBERED_LAYOUT = KeypointLayout(NUMBERED, ())  # its points are counted when the bags are read
 
@@ -48,12 +49,19 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
         ValueError: names the first option that is wrong, and says what to do.
     """
     check_name(names("name"), config.output.name)
+    check_not_shipped(names("name"), config.output.name, config.output.folder)
     _check_ranges(config, names)
     require_extra("train", "training")
     _check_data(config, names)
     source, target = find_layouts(config, names)
     if target != _NUMBERED_LAYOUT:
-        KeypointMap(source, target)
+        try:
+            KeypointMap(source, target)
+        except ValueError as error:
+            raise ValueError(
+                f"{str(error).rstrip('.')}; set {names('keypoint_layout')} to the layout of the "
+                f"recorded keypoints, for which {source.name!r} is taken now, or {names('object')}"
+            ) from None
     config.layout_loss.check(target, names)
     check_limb_exchange(config.recipe.limb_exchange, names("limb_exchange"))
     if config.recipe.limb_exchange > 0:

@@ -65,6 +65,15 @@ def test_what_a_model_was_started_from_is_said(
     )
 
 
+def test_a_model_whose_training_was_cut_off_says_so(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(folders[0] / "half.safetensors", provenance=PROVENANCE | {"cut_off": True})
+    assert "4000 steps; cut off before its end" in " ".join(
+        " ".join(listing(capsys, folders[0])).split()
+    )
+
+
 def test_a_training_of_no_steps_has_those_of_its_start(
     folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

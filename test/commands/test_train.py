@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
+import re
 import signal
 import subprocess
 import time
@@ -15,22 +17,27 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.data.walking_person import in_layout
 from deep_nrsfm_ros.commands import train
 from deep_nrsfm_ros.data.bags import frames, write_bag
+from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout_file import read_layout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
-from deep_nrsfm_ros.training import run
+from deep_nrsfm_ros.training import judge, run
 from deep_nrsfm_ros.training.config import TrainingConfig
+from deep_nrsfm_ros.training.record import find_records, read_record
 from deep_nrsfm_ros.training.trainer import Trainer
 from test.fixtures.forked_python import TRAINING, ForkedPython
 from test.fixtures.training_program import RunTraining
 
 DEADLINE = 90.0
-QUICK = ("--widths", "8", "4", "--batch", "8", "--threads", "1", "--name", "mine")
+FORCE = "--force"  # the people made up here fit no model of people
+QUICK = ("--widths", "8", "4", "--batch", "8", "--threads", "1", "--name", "mine", FORCE)
+SUFFIXES = (".html", ".safetensors")
 ENDLESS = ("--steps", "1000000")
 
 
@@ -148,9 +155,9 @@ def test_from_bag_to_model(
 def test_people_read_verdict_file_and_how_to_use_it_in_short_lines(
     tmp_path: Path, models: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    points, confidence = people(400)
-    np.save(tmp_path / "people.npy", np.dstack((points, confidence)))
-    words = ("--input", str(tmp_path / "people.npy"), "--keypoint-layout", "coco17")
+    views = [np.dstack((view.points, view.confidence)) for view in read_clip().session.views]
+    np.save(tmp_path / "people.npy", np.concatenate(views))
+    words = ("--input", str(tmp_path / "people.npy"), "--keypoint-layout", "body25b")
     assert in_process(*words, "--output", str(models), *QUICK, "--steps", "5") == 0
     said = capsys.readouterr()
     shared_out = next(line for line in said.err.splitlines() if "are trained on;" in line)
@@ -208,7 +215,7 @@ def test_cancelling_keeps_what_was_learned(
         process.stdin.close()
     lines = finish(process)
     assert time.monotonic() - before < 20
-    assert process.returncode == 0
+    assert process.returncode == train.CANCELLED == 130
     assert lines[-1]["state"] == "cancelled" and "learned so far" in lines[-1]["message"]
     assert lines[-1]["model"] == str(models / "mine.safetensors")
     assert 0 < assert_lifts(models / "mine.safetensors").provenance["step"] < 1000000
@@ -226,14 +233,16 @@ def test_resume_goes_on_where_it_was_cancelled(
     models: Path,
     in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     words = [*arguments, "--steps", "12", "--seeds", "1"]
     assert in_process(*words) == 0
     whole = dict(load_model(models / "mine.safetensors").network.named_weights())
     with monkeypatch.context() as cancelled:
         cancelled.setattr(train, "stop_on_signals", stop_after(5))
-        assert in_process(*words) == 0
+        assert in_process(*words) == 130
     assert load_model(models / "mine.safetensors").provenance["step"] == 5
+    assert "starts from" in capsys.readouterr().err
     taken: list[int] = []
     advance = Trainer.advance
     monkeypatch.setattr(Trainer, "advance", lambda t: (taken.append(t.step), advance(t)))
@@ -241,7 +250,11 @@ def test_resume_goes_on_where_it_was_cancelled(
     assert taken == list(range(5, 12))
     for name, weight in load_model(models / "mine.safetensors").network.named_weights():
         np.testing.assert_array_equal(weight, whole[name])
-    assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
+    said = capsys.readouterr().err
+    assert "goes on at step 5 of 12" in said and "starts from" not in said
+    names = [f"{name}{suffix}" for name in ("mine", "mine_before") for suffix in SUFFIXES]
+    assert sorted(f.name for f in models.iterdir()) == names
+    assert load_model(models / "mine_before.safetensors").provenance["step"] == 12  # the first one
 
 
 def test_the_curation_can_be_stopped(
@@ -252,7 +265,7 @@ def test_the_curation_can_be_stopped(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(train, "stop_on_signals", stop_after(-1))
-    assert in_process(*arguments) == 0
+    assert in_process(*arguments) == 130
     assert "cancelled: nothing had been learned" in capsys.readouterr().out
     assert not list(models.glob("*"))
 
@@ -278,7 +291,7 @@ def test_data_that_nobody_can_train_on_does_not_turn_a_stop_into_a_failure(
     assert in_process(*words, *QUICK, "--json-progress") == 2
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["state"] == "failed"
     monkeypatch.setattr(train, "stop_on_signals", lambda: lambda: True)
-    assert in_process(*words, *QUICK, "--json-progress") == 0
+    assert in_process(*words, *QUICK, "--json-progress") == 130
     (*_, end) = map(json.loads, capsys.readouterr().out.splitlines())
     assert end["state"] == "cancelled" and "nothing had been learned" in end["message"]
     assert not list(models.glob("*"))
@@ -289,14 +302,29 @@ def test_without_resume_it_begins_anew(
     models: Path,
     in_process: RunTraining,
     monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     with monkeypatch.context() as cancelled:
         cancelled.setattr(train, "stop_on_signals", stop_after(4))
-        assert in_process(*arguments, "--steps", "12") == 0
+        assert in_process(*arguments, "--steps", "12", "--seeds", "1") == 130
+        cancelled.setattr(train, "stop_on_signals", stop_after(0))
+        assert in_process(*arguments, "--steps", "3") == 130  # before anything is learned
+    said = capsys.readouterr().err
+    assert "'mine' begins anew. The unfinished one is kept as 'mine_unfinished'" in said
+    assert "--resume --name mine_unfinished goes on with it" in said
+    record = read_record(models, "mine_unfinished")
+    assert record and record.saved and record.config and record.config.recipe.steps == 12
+    resume = ("--resume", "--name", "mine_unfinished", "--output", str(models), "--threads", "1")
+    with monkeypatch.context() as cancelled:
+        cancelled.setattr(train, "stop_on_signals", stop_after(2))
+        assert in_process(*resume) == 130
+    assert "goes on at step 4 of 12" in capsys.readouterr().err
     # A checkpoint of another architecture would be refused, were it read.
     assert in_process(*arguments, "--steps", "3", "--widths", "6", "3") == 0
     model = load_model(models / "mine.safetensors")
     assert model.provenance["step"] == 3 and model.network.architecture.widths == (6, 3)
+    assert load_model(models / "mine.safetensors").provenance["judgement"]["doubtful"]
+    assert read_record(models, "mine_unfinished")  # it may be the better one
 
 
 def test_time_ends_a_training(
@@ -327,10 +355,11 @@ def test_a_cancelled_screening_keeps_a_model_and_goes_on(
     capsys.readouterr()
     with monkeypatch.context() as cancelled:
         cancelled.setattr(train, "stop_on_signals", stop_after(6))
-        assert in_process(*words) == 0
+        assert in_process(*words) == 130
     assert "--resume goes on" in capsys.readouterr().out
     assert assert_lifts(models / "mine.safetensors").provenance["step"] == 5
     assert in_process(*words, "--resume") == 0
+    assert "is screened" in capsys.readouterr().err
     again = load_model(models / "mine.safetensors")
     assert again.provenance["seed"] == whole.provenance["seed"] and again.quality == whole.quality
 
@@ -345,6 +374,11 @@ BAD: dict[str, tuple[list[str], str]] = {
     "layouts that share nothing": (
         ["--bag", "BAG", "--keypoint-layout", "coco17", "--object", "cmu31"],
         "at least 4",
+    ),
+    "the layout of another object": (
+        ["--bag", "BAG", "--keypoint-layout", "coco17", "--object", "cmu31"],
+        "; set --keypoint-layout to the layout of the recorded keypoints, for which 'coco17' is "
+        "taken now, or --object",
     ),
     "unknown object": (["--bag", "BAG", "--object", "horse"], "--object is 'horse'; name a preset"),
     "unknown layout": (
@@ -370,6 +404,11 @@ BAD: dict[str, tuple[list[str], str]] = {
         "share 0 keypoints by name",
     ),
     "out of range": (["--bag", "BAG", "--learning-rate", "7"], "--learning-rate is 7.0"),
+    "name of a model of the package": (
+        ["--bag", "BAG", "--name", "human"],
+        "--name is 'human', the name of a model that comes with the package and that yours would "
+        "hide; choose another, such as 'my_human'",
+    ),
     "no dictionary": (["--bag", "BAG", "--widths"], "widths"),
     "output is a file": (
         ["--bag", "BAG", "--keypoint-layout", "coco17", "--output", "FOLDER/file"],
@@ -434,7 +473,7 @@ def test_the_ground_truth_is_not_read(
     found = []
     for shapes in (None, np.full((60, 17, 3), np.nan, np.float32)):
         dataset = Dataset(points, confidence > 0, COCO17, "made up", shapes)
-        monkeypatch.setattr(run, "read_data", lambda config, reporter, e=dataset: (e, ""))
+        monkeypatch.setattr(run, "read_data", lambda config, reporter, e=dataset: (e, "", ()))
         assert in_process(*arguments, "--steps", "5") == 0
         found.append(load_model(models / "mine.safetensors"))
     assert found[0].quality == found[1].quality
@@ -494,6 +533,81 @@ def test_points_that_nobody_described_are_numbered(
     assert "names no handedness" in (models / "mine.html").read_text()
 
 
+def mark_as_good(path: Path) -> bytes:
+    """Let a model file say that the judge did not doubt it; return its content."""
+    model = load_model(path)
+    judgement = {"doubtful": False, "reason": "made up"}
+    save_model(path, dataclasses.replace(model, provenance={"judgement": judgement}))
+    return path.read_bytes()
+
+
+def test_a_good_model_of_the_name_is_compared_with_and_not_lost(
+    tmp_path: Path,
+    models: Path,
+    in_process: RunTraining,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "paw.yaml").write_text(PAW)
+    data = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"))
+    words = (*data, *QUICK, "--output", str(models), "--few-frames", "0", "--seeds", "1")
+    path = models / "mine.safetensors"
+    assert in_process(*words, "--steps", "150") == 0
+    good = mark_as_good(path)
+    capsys.readouterr()
+    assert in_process(*words, "--steps", "1") == 0  # a poor one
+    said = capsys.readouterr().out
+    assert "the new model is doubtful: compared with model 'mine' on the 60 frames" in said
+    assert "; model 'mine' stays as it was" in said
+    assert path.read_bytes() == good
+    doubtful = load_model(models / "mine_doubtful.safetensors")
+    assert doubtful.provenance["judgement"]["rival"] == "mine"
+
+    for steps in (4, 5):
+        with monkeypatch.context() as cancelled:
+            cancelled.setattr(train, "stop_on_signals", stop_after(steps))
+            assert in_process(*words, "--steps", "150") == 130
+    assert {record.name for record in find_records(models)} == {"mine", "mine_unfinished"}
+    said = capsys.readouterr().out
+    assert f"{models / 'mine_unfinished.safetensors'} holds what was learned so far" in said
+    assert "; model 'mine' stays as it was" in said and path.read_bytes() == good
+
+    assert in_process(*words, "--resume") == 0  # the same once more: as good
+    assert not find_records(models)  # the earlier one is given up
+    said = capsys.readouterr().out
+    assert "the new model is better than model 'mine'" in said
+    assert "the model 'mine' that was there is kept as 'mine_before'" in said
+    assert (models / "mine_before.safetensors").read_bytes() == good
+    assert load_model(path).provenance["step"] == 150
+    names = [f"mine{end}{suffix}" for end in ("", "_before") for suffix in SUFFIXES]
+    assert set(names) <= {f.name for f in models.iterdir()}
+    rows = re.findall(
+        r"<td>(mine[a-z_]*)</td><td>(.*?)</td>", path.with_suffix(".html").read_text()
+    )
+    assert ("mine", "better") in rows and ("mine_before", "at hand") in rows
+
+
+def test_a_new_model_must_be_better_than_the_one_at_hand_and_that_of_its_name(
+    arguments: list[str], models: Path, in_process: RunTraining, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert in_process(*arguments, "--steps", "3") == 0
+    good = mark_as_good(models / "mine.safetensors")
+    judged: list[str] = []
+
+    def stand_in(frames: Any, model: Model, rival: Model | None) -> judge.Judgement:
+        judged.append(rival.name if rival else "")
+        figures = judge.Figures(*[0.1] * 9)
+        reason = "worse" if judged[-1] == "mine" else ""
+        return judge.Judgement(reason, "it is better", figures, judged[-1], figures)
+
+    monkeypatch.setattr(judge, "judge", stand_in)
+    assert in_process(*arguments, "--steps", "3") == 0
+    assert judged == ["human", "mine"]
+    assert (models / "mine.safetensors").read_bytes() == good
+    provenance = load_model(models / "mine_doubtful.safetensors").provenance
+    assert provenance["judgement"]["rival"] == "mine"
+
+
 def test_it_goes_on_from_another_model(
     bag: Path,
     arguments: list[str],
@@ -506,7 +620,7 @@ def test_it_goes_on_from_another_model(
     assert time.strptime(first.provenance["date"], "%Y-%m-%d")
     # Weights that hardly move show where they come from.
     still = ("--bag", str(bag), "--keypoint-layout", "coco17", "--from", "mine", "--threads", "1")
-    slow = ("--steps", "1", "--learning-rate", "1e-7", "--output", str(models))
+    slow = ("--steps", "1", "--learning-rate", "1e-7", "--output", str(models), FORCE)
     assert in_process(*still, *slow, "--name", "same") == 0
     same = load_model(models / "same.safetensors")
     assert same.layout == first.layout == HUMAN25
@@ -531,10 +645,10 @@ def test_it_does_not_resume_what_started_elsewhere(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert in_process(*arguments, "--steps", "3") == 0
-    start = (*arguments[: -len(QUICK)], "--name", "next", "--steps", "12", "--batch", "8")
+    start = (*arguments[: -len(QUICK)], "--name", "next", "--steps", "12", "--batch", "8", FORCE)
     with monkeypatch.context() as cancelled:
         cancelled.setattr(train, "stop_on_signals", stop_after(4))
-        assert in_process(*start, "--from", "mine") == 0
+        assert in_process(*start, "--from", "mine") == 130
     # The same data, but the whitening of another training.
     path = models / "mine.safetensors"
     model = load_model(path)
@@ -608,6 +722,30 @@ def test_a_report_that_cannot_be_written_costs_no_model(
     assert sorted(f.name for f in models.iterdir()) == ["mine.html", "mine.safetensors"]
 
 
+def test_a_model_of_data_that_looks_wrong_is_doubtful(
+    models: Path, in_process: RunTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, confidence = in_layout(COCO17)
+    percent = np.concatenate([points, 100 * confidence[..., None]], -1)
+    np.save(tmp_path / "a.npy", percent)
+    words = ("--input", str(tmp_path / "a.npy"), "--keypoint-layout", "coco17", "--threads", "1")
+    few = ("--steps", "3", "--learning-rate", "1e-7", "--name", "mine", "--output", str(models))
+    assert in_process(*words, *few, "--json-progress") == 3
+    end = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert end["state"] == "finished" and end["judgement"] == "doubtful"
+    fault = "a.npy: confidence up to "
+    assert f"the new model is doubtful: its data looks wrong: {fault}" in end["message"]
+    assert "divide it by 100. Mend it and train again" in end["message"]
+    judgement = load_model(models / "mine.safetensors").provenance["judgement"]
+    assert judgement["doubtful"] and judgement["faults"][0].startswith(fault)
+    page = html.unescape((models / "mine.html").read_text())
+    assert judgement["reason"] in page and "<td>mine</td><td>doubtful</td>" in page
+    assert in_process(*words, *few, FORCE) == 0
+    np.save(tmp_path / "a.npy", percent / [1, 1, 100])
+    assert in_process(*words, *few) == 0
+    assert "looks wrong" not in capsys.readouterr().err.split("curating")[-1]
+
+
 def test_a_configuration_file_gives_the_options_that_are_not_given(
     arguments: list[str],
     models: Path,
@@ -618,7 +756,7 @@ def test_a_configuration_file_gives_the_options_that_are_not_given(
     config = TrainingConfig.from_arguments(train.parser().parse_args([*arguments, "--batch", "5"]))
     file = tmp_path / "config.json"
     file.write_text(config.to_json())
-    assert in_process("--config", str(file), "--steps", "3") == 0
+    assert in_process("--config", str(file), "--steps", "3", FORCE) == 0
     recipe = load_model(models / "mine.safetensors").provenance["recipe"]
     assert (recipe["steps"], recipe["batch"]) == (3, 5)
     file.write_text('{"data": {"bag": []}}')

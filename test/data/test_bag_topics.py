@@ -275,7 +275,7 @@ def test_bags_of_ros_1(tmp_path: Path, recorded: Any) -> None:
     other.write_bytes(whole.read_bytes())
     for path in (whole, parts, other):
         reading = read_bags([path], COCO17, COCO17)
-        assert reading[1:] == (6, 0, "", ())
+        assert reading[1:5] == (6, 0, "", ())
         np.testing.assert_array_equal(reading.dataset.points, given[..., :2])
     detections = read_keypoints(whole)
     assert detections.stamps.tolist() == [10**9] * 6 and detections.frame_id == "camera"

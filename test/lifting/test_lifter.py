@@ -291,7 +291,7 @@ def test_an_argument_of_another_type_is_refused() -> None:
 
 def test_a_model_may_be_given_by_its_name(tmp_path: Path) -> None:
     save_model(tmp_path / "mine.safetensors", random_model())
-    assert Lifter(tmp_path / "mine.safetensors").model.name == "random"
+    assert Lifter(tmp_path / "mine.safetensors").model.name == "mine"
     assert Lifter("human", layout="coco17").model.name == "human"
     with pytest.raises(ModelFileError, match="no model 'humna'; there are"):
         Lifter("humna")

@@ -10,7 +10,14 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
-from deep_nrsfm_ros.lifting.sanity import check, is_person, looks_normalised, orientation
+from deep_nrsfm_ros.lifting.sanity import (
+    check,
+    find_origin,
+    is_person,
+    looks_normalised,
+    orientation,
+    pose,
+)
 
 CAMERA = Intrinsics((1000.0, 1000.0), (640.0, 360.0))
 SIZE = (1280, 720)
@@ -91,6 +98,52 @@ def test_sentinels(spot: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("spot", "remedy"), [((-1, 0), "-1"), ((0, -1), "-1"), ((-1, -2), "-1"), ((99, 99), "99")]
+)
+def test_the_value_that_a_sentinel_is_named_by(spot: tuple[int, int], remedy: str) -> None:
+    points = people()
+    points[::3, 5:8] = spot
+    (finding,) = check(points, ALL)
+    assert f"(--missing-value={remedy} for files" in finding.message
+
+
+def test_a_missing_keypoint_in_the_middle_of_the_image() -> None:
+    points = people()
+    points[::3, 5:8] = np.array(SIZE) / 2
+    assert codes(points) == ["sentinel"]
+
+
+def test_keypoints_that_lie_alike_by_chance_are_no_sentinels() -> None:
+    random = np.random.default_rng(0)
+    many = random.uniform(100, 500, (5000, 17, 2))
+    many[:4, 3] = 197, 197  # 4 of 85000
+    many[-8:, 5] = 0, -1
+    assert not check(many, np.ones((5000, 17)))
+    still = people()
+    still[:, 2] = 320, 100  # a keypoint that does not move
+    assert not codes(still)
+    coarse = np.floor(random.uniform(0, 8, (N, 17, 2))) * 40 + 41  # cells of a heatmap
+    assert not codes(coarse)
+
+
+def test_points_relative_to_one_of_them() -> None:
+    points = people() - people()[:, :1]
+    (finding,) = find_origin(points, ALL)
+    assert finding.code == "origin" and "keypoint 0 (from 0) lies at (0, 0)" in finding.message
+    assert not find_origin(people(), ALL)
+    missing = people()
+    missing[:, 13:] = 0  # the legs of somebody who sits
+    assert not find_origin(missing, ALL) and not find_origin(people(), np.zeros_like(ALL))
+
+
+def test_points_relative_to_the_box_of_each_object() -> None:
+    points = people()
+    low, high = points.min(1, keepdims=True), points.max(1, keepdims=True)
+    (finding,) = check((points - low) / (high - low), ALL)
+    assert finding.code == "normalised" and "fractions of its box" in finding.message
+
+
+@pytest.mark.parametrize(
     ("stamps", "expected"),
     [
         (STAMPS // 1_000_000, "milliseconds"),
@@ -145,6 +198,10 @@ def test_people_upside_down_and_on_their_side() -> None:
     some = np.tile(upright, (N, 1, 1))
     some[::4, 1] *= -1
     assert not orientation(some)
+    lean = np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]) @ upright * [[1], [-1], [1]]
+    some = np.tile(lean, (N, 1, 1))
+    some[::4, :2, 2] = 0.6, 0.45  # a person leans in the image of a rolled camera
+    assert "100% of the people are upside down" in orientation(some)[0].message
     assert is_person(HUMAN17) and not is_person(KeypointLayout.numbered(17))
 
 
@@ -165,3 +222,21 @@ def test_the_scale_of_confidence(confidence: np.ndarray, expected: str) -> None:
     found = check(people(), confidence.reshape(N, Q))
     assert [f.code for f in found] == ["confidence-scale"] * bool(expected)
     assert expected in "".join(map(str, found))
+
+
+@pytest.mark.parametrize(
+    ("mirror", "expected"),
+    [
+        (np.diag([1, 1, -1]) @ np.diag([1, -1, 1]), "y points up"),
+        (np.diag([1, 1, -1]) @ np.eye(3)[[1, 0, 2]], "x and y are exchanged"),
+        (np.diag([1, 1, -1]), "left and right look exchanged"),
+    ],
+)
+def test_which_mirror_it_is(mirror: np.ndarray, expected: str) -> None:
+    upright = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], np.float32)
+    seen = np.ones((N, len(HUMAN17)))
+    assert not pose(np.tile(upright, (N, 1, 1)), seen, HUMAN17)
+    (finding,) = pose(np.tile(mirror @ upright, (N, 1, 1)), seen, HUMAN17)
+    assert finding.code == "handedness" and expected in finding.message
+    hidden = pose(np.tile(mirror @ upright, (N, 1, 1)), 0 * seen, HUMAN17)
+    assert [f.code for f in hidden] == ["orientation"] * ("left" not in expected)

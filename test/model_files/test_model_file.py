@@ -66,7 +66,8 @@ def test_round_trip(tmp_path: Path, layout: KeypointLayout, widths: tuple[int, .
     saved = model(layout, Architecture(widths, "block", "closed_form", "free"))
     save_model(tmp_path / "models" / "m.safetensors", saved)
     loaded = load_model(tmp_path / "models" / "m.safetensors")
-    for field in ("name", "layout", "normaliser", "provenance", "quality"):
+    assert loaded.name == "m"  # that of the file
+    for field in ("layout", "normaliser", "provenance", "quality"):
         assert getattr(loaded, field) == getattr(saved, field)
     assert loaded.network.architecture == saved.network.architecture
     np.testing.assert_array_equal(loaded.object_frame, saved.object_frame)
@@ -368,8 +369,28 @@ def test_what_json_cannot_hold_leaves_the_old_file(file: Path) -> None:
 
 
 def test_saving_replaces(file: Path) -> None:
-    save_model(file, dataclasses.replace(model(), name="second"))
-    assert load_model(file).name == "second"
+    save_model(file, dataclasses.replace(model(), quality={"cycle_error": 0.5}))
+    assert load_model(file).quality == {"cycle_error": 0.5}
+
+
+def test_a_model_has_the_name_of_its_file(tmp_path: Path) -> None:
+    save_model(tmp_path / "first.safetensors", model())
+    (tmp_path / "first.safetensors").rename(tmp_path / "second.safetensors")
+    assert load_model(tmp_path / "second.safetensors").name == "second"
+    assert load_model("second", str(tmp_path)).name == "second"
+
+
+def test_a_file_is_named_by_a_string_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_model("mine.safetensors", model())
+    assert load_model("mine.safetensors").name == "mine"
+    monkeypatch.setenv("HOME", str(tmp_path))
+    save_model("~/new/mine.safetensors", model())
+    assert (tmp_path / "new" / "mine.safetensors").is_file()
+    with pytest.raises(TypeError, match="takes the file, the model"):
+        save_model(model(), "mine.safetensors")  # type: ignore[arg-type]
 
 
 def test_find_model(tmp_path: Path) -> None:

@@ -187,9 +187,9 @@ def test_normalised_keypoints_wait_for_the_size_of_the_image(
     assert "set image_width and image_height" in status.message
     client.node.destroy_timer(sender)
     assert client.set_parameters(image_width=640, image_height=480) == ""
-    wide = unpack(client.exchange(publisher, message)).copy()
+    wide, _ = exchange(client, publisher, message)
     assert client.set_parameters(image_width=480) == ""
-    square = unpack(client.exchange(publisher, message))
+    square, _ = exchange(client, publisher, message)
     spread = [np.ptp(xyzc[0, :, :2], axis=0) for xyzc in (wide, square)]
     ratio = (spread[0] / spread[0][1]) / (spread[1] / spread[1][1])
     np.testing.assert_allclose(ratio, [640 / 480, 1], rtol=0.05)

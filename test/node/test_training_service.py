@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import time
 from array import array
@@ -53,6 +54,7 @@ def lifter(start_lifter: StartLifter) -> LifterProcess:
 def test_a_training_from_request_to_use(
     lifter: LifterProcess, connect: Connect, models: Path
 ) -> None:
+    shutil.copytree(models / "joints", models / "person")  # a bag
     client = connect()
     publisher = client.publisher(Float32MultiArray)
     assert values(client.wait_for_training("idle"))["state"] == "idle"
@@ -89,8 +91,27 @@ def test_a_training_from_request_to_use(
     client.set_parameters(train__name="finish")
     assert client.call("/lifter/train").success
     finished = client.wait_for_training("finished")
-    assert "in use" in finished.message and (models / "finish.safetensors").exists()
-    client.wait_for_health(lambda _, v: v["model"] == "joints")
+    assert (
+        "not in use (train.activate): it is a model of 'cmu31', and the lifter lifts 'human17'"
+        in (finished.message)
+    )
+    assert "to switch: ros2 param set /lifter model finish" in finished.message
+    assert (models / "finish.safetensors").exists()
+    client.wait_for_health(lambda _, v: v["model"] == "person")
+    client.heard["/lifter/training_status"].clear()
+
+    client.set_parameters(train__activate="always")
+    assert client.call("/lifter/train").success
+    assert client.wait_for_training("finished").message.endswith("; in use from now on")
+    client.wait_for_health(lambda _, v: v["model"] == "finish")
+    client.heard["/lifter/training_status"].clear()
+
+    client.set_parameters(model="person", train__bags=[str(models / "person")])
+    client.set_parameters(train__activate="if_better", train__name="other")  # of the same object
+    client.heard["/lifter/training_status"].clear()
+    assert client.call("/lifter/train").success
+    assert client.wait_for_training("finished").message.endswith("; in use from now on")
+    client.wait_for_health(lambda _, v: v["model"] == "other")
 
 
 def test_a_training_that_fails_leaves_the_lifter_as_it_was(

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import time
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -11,7 +12,12 @@ import pytest
 from benchmarks.data.synthetic_furniture import table
 from deep_nrsfm_ros.nrsfm.factorisation import consensus as consensus_module
 from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import block_matrix
-from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus, consensus, image_scales
+from deep_nrsfm_ros.nrsfm.factorisation.consensus import (
+    Consensus,
+    consensus,
+    image_scales,
+    seconds_at_most,
+)
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.nrsfm.metrics import shape_errors
 from deep_nrsfm_ros.training.few_frames import MAX_SPREAD
@@ -86,14 +92,58 @@ def test_images_without_a_common_shape_have_no_agreement() -> None:
     assert consensus(W).spread > MAX_SPREAD
 
 
-def test_rounds_come_closer_where_the_first_solutions_disagree() -> None:
+class Rounds(NamedTuple):
+    """Tables whose first solutions disagree, and the way to their consensus."""
+
+    shapes: np.ndarray
+    W: np.ndarray
+    results: list[Consensus]
+    iterations: int
+
+
+@pytest.fixture(scope="module")
+def rounds() -> Rounds:
     rng = np.random.default_rng(0)
-    tables = centre(table(rng, 100))
-    W = tables @ random_cameras(100, rng).astype(float)
-    found = consensus(W)
-    before = min(shape_errors(block_matrix(W, K), tables).proper for K in (3, 4))
-    assert shape_errors(found.shapes, tables).proper < 0.2 * before
+    shapes = centre(table(rng, 100))
+    W = shapes @ random_cameras(100, rng).astype(float)
+    results: list[Consensus] = []
+    iterations: list[None] = []
+    found = consensus(W, lambda: iterations.append(None), results.append)
+    assert found is results[-1]
+    return Rounds(shapes, W, results, len(iterations))
+
+
+def test_rounds_come_closer_where_the_first_solutions_disagree(rounds: Rounds) -> None:
+    found = rounds.results[-1]
+    before = min(shape_errors(block_matrix(rounds.W, K), rounds.shapes).proper for K in (3, 4))
+    assert shape_errors(found.shapes, rounds.shapes).proper < 0.2 * before
     assert 0.02 < found.spread < MAX_SPREAD
+
+
+def test_results_on_the_way_are_of_use(rounds: Rounds) -> None:
+    errors = [shape_errors(each.shapes, rounds.shapes).proper for each in rounds.results]
+    assert len(errors) == 5
+    assert errors[-1] == min(errors) < 0.5 * errors[0] < 0.2
+    assert all(each.spread < MAX_SPREAD for each in rounds.results)
+
+
+def test_iterations_are_foretold(rounds: Rounds, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(consensus_module, "_seconds_of_one", lambda *_: 1.0)
+    assert rounds.iterations <= seconds_at_most(rounds.W) < 1.7 * rounds.iterations
+
+
+def test_the_first_result_of_images_without_a_common_shape_has_no_agreement() -> None:
+    results: list[Consensus] = []
+    consensus(np.random.default_rng(0).standard_normal((30, 10, 2)), on_result=results.append)
+    assert results[0].spread > MAX_SPREAD
+
+
+def test_the_seconds_are_those_of_timed_iterations() -> None:
+    _, W = images(5, noise=0.02)
+    iterations: list[int] = []
+    assert 0 < seconds_at_most(W, lambda: iterations.append(0)) < 60
+    assert len(iterations) < 100
+    assert seconds_at_most(W, lambda: time.sleep(0.01)) > 40
 
 
 def test_scales_of_images_are_found_where_they_differ() -> None:

@@ -13,7 +13,11 @@ from PIL import Image
 
 from deep_nrsfm_ros.commands.demo.first_look import main
 from deep_nrsfm_ros.data.clip import read_clip
+from deep_nrsfm_ros.data.keypoint_files import read_keypoints
+from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.layouts.presets import BODY25B, HUMAN17
+from deep_nrsfm_ros.model_files.folders import default_models_dir
+from deep_nrsfm_ros.model_files.model_file import load_model, save_model
 from deep_nrsfm_ros.reporting.stage import Stage, make_stage, stage_page
 from deep_nrsfm_ros.reporting.stage_image import Room, animation_frames, save_animation
 
@@ -135,6 +139,30 @@ def test_a_first_look_without_ros(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert said.count("100 of 100 frames lifted") == 4 and len(said.splitlines()) <= 40
     assert (tmp_path / "look" / "demo.html").as_uri() in said
     assert (tmp_path / "look" / "demo.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_keypoints_are_files_to_lift_and_to_train_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["--output", str(tmp_path)])
+    said = capsys.readouterr().out
+    assert f"`lift` and `train` on: {tmp_path / 'cam01.npz'} to cam04.npz" in said
+    for view in read_clip().session.views:
+        read = read_keypoints(tmp_path / f"{view.camera.name}.npz", ReadOptions())
+        assert read.layout is not None and read.layout.keypoints == BODY25B.keypoints
+        assert len(read.stamps) == 100
+        np.testing.assert_array_equal(read.points, view.points)
+
+
+def test_a_model_of_ones_own_is_found_by_name_and_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_HOME", str(tmp_path))
+    folder = default_models_dir()
+    folder.mkdir(parents=True)
+    save_model(folder / "my_own.safetensors", load_model("human17"))
+    main(["--model", "my_own", "--output", str(tmp_path / "look")])
+    assert capsys.readouterr().out.count("mm off after alignment") == 4
 
 
 def test_a_model_that_lifts_no_person_is_refused(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def main() -> None:
     if behaviour == "wait":
         stop.wait()
         say("cancelled", message="kept the best of 1 step", model="best.safetensors")
-        return
+        sys.exit(130)
     model = "new.safetensors"
     if config["data"]["bags"]:
         folder = Path(config["output"]["folder"])
@@ -59,6 +59,8 @@ def main() -> None:
         )
     judgement = "doubtful" if behaviour == "doubtful" else "better"
     say("finished", message="done", model=model, step=2, steps=2, judgement=judgement)
+    if behaviour == "doubtful":
+        sys.exit(3)  # its data looked wrong
 
 
 if __name__ == "__main__":

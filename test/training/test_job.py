@@ -70,6 +70,12 @@ def test_progress_and_the_finished_model_are_reported() -> None:
     assert_gone(job.pid)
 
 
+def test_a_training_on_data_that_looks_wrong_has_finished() -> None:
+    _, listener = start("doubtful")
+    finished = listener.until_end()[-1]
+    assert finished.state == "finished" and finished.values["judgement"] == "doubtful"
+
+
 def test_the_process_is_in_its_own_session_and_yields_to_others() -> None:
     job, listener = start("finish")
     values = listener.next().values

@@ -80,6 +80,17 @@ def test_a_bad_model_is_doubted_and_told_what_would_help(
     assert record["figures"]["residual"] > record["rival_figures"]["residual"]
 
 
+def test_time_would_help_a_model_whose_factorisations_were_cut_short(
+    frames: Split, good: Model, bad: Model
+) -> None:
+    hurried = dataclasses.replace(
+        bad, provenance=bad.provenance | {"factorisation_needs_minutes": 2.5}
+    )
+    advice = "more time (--minutes 2.5, train.minutes, or no limit), more views"
+    assert advice in judge(frames, hurried, good).reason
+    assert "more time" not in judge(frames, bad, good).reason
+
+
 def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
     frames: Split, good: Model, bad: Model
 ) -> None:
@@ -166,6 +177,34 @@ def test_a_rival_of_another_object_is_none(frames: Split, good: Model) -> None:
 )
 def test_the_rule(change: dict[str, float], worse: list[str]) -> None:
     assert worse_figures(GOOD._replace(**change), GOOD) == worse
+
+
+@pytest.mark.parametrize(
+    ("change", "worse"),
+    [
+        ({"opposed": 1.0, "bone_variation": 0.01}, ["opposed"]),  # steady bones do not tell whose
+        ({"opposed": 0.5, "bone_variation": 0.01}, []),
+        ({"opposed": 1.0, "turned": 1.0, "bone_variation": 0.01}, ["turned"]),
+        ({"opposed": 0.0, "turned": 1.0, "bone_variation": 0.01}, ["turned"]),
+    ],
+)
+def test_a_model_that_lifts_nearly_all_frames_to_the_mirror_image_is_never_better(
+    change: dict[str, float], worse: list[str]
+) -> None:
+    at_hand = GOOD._replace(residual=0.5, mirrored_share=0.3, front_disagreement=0.3)
+    both = {"mirrored_share": 0.3, "front_disagreement": 0.3}
+    assert worse_figures(GOOD._replace(**both | change), at_hand) == worse
+    if "turned" in change:  # whatever else is said of the start
+        assert worse_figures(GOOD._replace(**change), at_hand) == worse
+
+
+def test_faults_of_the_data_make_a_model_doubtful(frames: Split, good: Model) -> None:
+    upside_down = "walk.npy: 98% of the people are upside down: y must point down"
+    judgement = judge(frames, good, good, [upside_down])
+    assert judgement.doubtful and upside_down in str(judgement) and "Mend it" in str(judgement)
+    assert "would help" not in str(judgement)  # more frames of such data would not
+    assert judgement.record()["faults"] == [upside_down]
+    assert judgement.figures == judge(frames, good, good).figures
 
 
 def test_the_mirror_image_of_a_mirrored_model_is_no_fault() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.data.walking_person import in_layout
+from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros.commands.train import parser
 from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -89,17 +89,83 @@ def test_each_bag_and_file_is_taken_by_itself(
 
 
 def test_the_layout_that_the_user_names_is_kept(
-    tmp_path: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    named = ("--input", write(tmp_path / "a.npz", BODY25), "--keypoint-layout", "human25")
+    posetrack = LAYOUTS["posetrack18_17"]  # its keypoints fit as coco17, too
+    named = ("--input", write(tmp_path / "a.npz", posetrack), "--keypoint-layout", posetrack.name)
     found = read(*named)
-    np.testing.assert_array_equal(found.dataset.points, in_layout(BODY25)[0])
-    assert found.detector_layout == "" and not capsys.readouterr().err
-    words = (*map(str, named), "--name", "mine", "--output", str(tmp_path), "--steps", "1")
-    assert in_process(*words, "--threads", "1") == 0
+    np.testing.assert_array_equal(found.dataset.points, expected(posetrack))
+    assert found.detector_layout == posetrack.name and not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--bag", "--input"])
+@pytest.mark.parametrize("target", ["human25", "human17"])
+def test_a_layout_that_is_clearly_wrong_is_refused(
+    option: str,
+    target: str,
+    tmp_path: Path,
+    in_process: RunTraining,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    wrong = write(tmp_path / "wrong", BODY25)
+    words = (option, str(wrong), "--keypoint-layout", "human25", "--object", target)
+    place = ("--name", "mine", "--output", str(tmp_path), "--steps", "1", "--threads", "1")
+    assert in_process(*words, *place) == 2
     said = capsys.readouterr().err
-    assert "warning: poor fit as human25: is it body25?" in said and "takes another" not in said
-    assert "-p keypoint_layout:=body25" not in (tmp_path / "mine.html").read_text()
+    assert f"failed: {wrong}: poor fit as human25: is it body25? It fits 0.08 instead of " in said
+    assert "set the keypoint layout to body25 (--keypoint-layout, train.keypoint_layout)" in said
+    assert not list(tmp_path.glob("*mine*"))
+
+
+@pytest.mark.parametrize("option", ["--bag", "--input"])
+def test_a_source_in_another_layout_is_left_out(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    right, wrong = write(tmp_path / "right", HUMAN25), write(tmp_path / "wrong", BODY25)
+    found = read(option, wrong, option, right, "--keypoint-layout", "human25")
+    np.testing.assert_array_equal(found.dataset.points, in_layout(HUMAN25)[0])
+    assert "wrong" not in found.dataset.source and not found.faults
+    assert (
+        f"warning: left out: {wrong}: poor fit as human25: is it body25?" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize("option", ["--bag", "--input"])
+def test_each_source_is_checked_by_itself(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, confidence = in_layout(COCO17)
+    upside_down = points * np.array([1, -1]) + np.array([0, IMAGE[1]])
+    words: list[str | Path] = ["--object", "human25", "--keypoint-layout", "coco17"]
+    for i in range(4):
+        path = tmp_path / f"{i}"
+        write_bag(path, "/keypoints", frames(points if i else upside_down, confidence))
+        words += [option, path]
+    found = read(*words)
+    (fault,) = found.faults
+    assert fault.startswith("0: ") and "y must point down" in fault
+    assert f"warning: {fault}" in capsys.readouterr().err
+    assert len(found.dataset) == 4 * len(points)
+
+
+def test_a_bag_of_normalised_keypoints_becomes_pixels(tmp_path: Path) -> None:
+    points, confidence = in_layout(COCO17)
+    write_bag(tmp_path / "bag", "/keypoints", frames(points / np.array(IMAGE), confidence))
+    words = ("--bag", tmp_path / "bag", "--keypoint-layout", "coco17", "--object", "coco17")
+    assert "they are normalised" in read(*words).faults[0]
+    sized = read(*words, "--image-width", str(IMAGE[0]), "--image-height", str(IMAGE[1]))
+    assert not sized.faults
+    np.testing.assert_allclose(sized.dataset.points, points, rtol=1e-4, atol=0.01)
+
+
+def test_a_file_that_is_read_twice_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "a.npz", COCO17)
+    write(tmp_path / "b.npy", COCO17)
+    read("--input", tmp_path, "--object", "coco17")
+    said = capsys.readouterr().err
+    assert "warning: the same keypoints twice: b.npy (of a.npz); leave the copies out" in said
 
 
 def test_the_page_names_the_layout_for_the_lifter(

@@ -106,7 +106,7 @@ def test_the_caller_reads_the_name_that_it_has_set(
 def test_a_start_is_checked(config: TrainingConfig, tmp_path: Path) -> None:
     coco = config.with_start(save(tmp_path / "coco.safetensors", COCO17))
     assert validate(coco, PARAMETERS) == ""
-    with pytest.raises(ValueError, match=r"train\.widths is \(8,\); model 'm'"):
+    with pytest.raises(ValueError, match=r"train\.widths is \(8,\); model 'coco'"):
         validate(coco.with_options({"widths": (8,)}), PARAMETERS)
     points = config.with_start(save(tmp_path / "points.safetensors", KeypointLayout.numbered(5)))
     with pytest.raises(ValueError, match="and layout 'human17' share 0 keypoints"):

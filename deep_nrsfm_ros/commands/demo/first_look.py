@@ -2,8 +2,9 @@
 """Lift a real person, seen by four cameras one at a time, and write a page that shows it.
 
 The clip is part of the package: 2D keypoints of a detector, images, and ground truth to compare
-with. With --node the keypoints take the way of a robot: they are played over DDS to the lifter, its
-answers are recorded, and a model is trained on the recording by the lifter's service.
+with. The keypoints of each camera are written as a file too, to try `lift` and `train` on. With
+--node they take the way of a robot: they are played over DDS to the lifter, its answers are
+recorded, and a model is trained on the recording by the lifter's service.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from deep_nrsfm_ros.layouts.presets import BODY25B
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import LiftingOptions
-from deep_nrsfm_ros.model_files.folders import model_folders
+from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
@@ -47,7 +48,11 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument(
         "--output", type=Path, default=Path("demo_output"), help="folder of the results"
     )
-    parser.add_argument("--model", default="human", help="model to lift with: a name or a path")
+    parser.add_argument(
+        "--model",
+        default="human",
+        help="model to lift with: a name or a path; your own are found as by `lift`",
+    )
     parser.add_argument(
         "--node",
         action="store_true",
@@ -68,13 +73,22 @@ def say(text: str) -> None:
     print(f"- {text}", flush=True)
 
 
+def model_file(name: str, output: Path) -> Path:
+    """Return the file of a model: of an earlier demo, the user's own, or of the package.
+
+    Raises:
+        ValueError: it is not there.
+    """
+    return find_model(name, [output / "models", *model_folders(default_models_dir())])
+
+
 def read_model(name: str, output: Path) -> Model:
     """Return the model of the demo.
 
     Raises:
         ValueError: it is not there, damaged, or lacks a joint of the ground truth.
     """
-    model = load_model(find_model(name, model_folders(output / "models")))
+    model = load_model(model_file(name, output))
     if lacking := [joint for joint in JOINTS if joint not in model.layout.keypoints]:
         raise ValueError(f"model {model.name!r} lifts no person: it has no {lacking[0]}")
     return model
@@ -97,6 +111,19 @@ def lift_view(view: View, model: Model) -> NDArray[np.floating]:
     recording = lift_recording(detections, BODY25B, lifter, intrinsics=view.camera.intrinsics)
     shapes: NDArray[np.floating] = recording.lifted.shapes
     return shapes
+
+
+def write_keypoints(clip: Clip, output: Path) -> None:
+    """Write a file of keypoints for each camera, as `lift` and `train` read it, and name them."""
+    output.mkdir(parents=True, exist_ok=True)
+    files = [output / f"{view.camera.name}.npz" for view in clip.session.views]
+    for file, view in zip(files, clip.session.views, strict=True):
+        names = np.array(BODY25B.keypoints)
+        stamps = stamps_at(RATE, len(view.points))
+        np.savez_compressed(
+            file, points=view.points, confidence=view.confidence, names=names, stamps=stamps
+        )
+    say(f"keypoints of each camera, to try `lift` and `train` on: {files[0]} to {files[-1].name}")
 
 
 def show(stage: Stage, output: Path) -> str:
@@ -142,6 +169,7 @@ def run(args: argparse.Namespace) -> None:
             f"{view.camera.name}: {known.sum()} of {len(known)} frames lifted; joints are "
             f"{error.aligned:.0f} mm off after alignment, the rotation {error.rotation:.0f} degrees"
         )
+    write_keypoints(clip, args.output)
     show(stage_of(clip, model, lifted), args.output)
 
 

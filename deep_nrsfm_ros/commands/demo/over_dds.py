@@ -22,7 +22,14 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.commands.demo.client import NO_LATENCY, Client, DemoError, Played, lifter
 from deep_nrsfm_ros.commands.demo.domain import take_domain
 from deep_nrsfm_ros.commands.demo.evaluation import read_points, table
-from deep_nrsfm_ros.commands.demo.first_look import TORSO, read_model, say, show, stage_of
+from deep_nrsfm_ros.commands.demo.first_look import (
+    TORSO,
+    model_file,
+    read_model,
+    say,
+    show,
+    stage_of,
+)
 from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
 from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, Session
@@ -30,7 +37,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25B
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.folders import model_folders
-from deep_nrsfm_ros.model_files.model_file import find_model, load_model
+from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.training.job import ENDED
@@ -60,7 +67,7 @@ def run(given: argparse.Namespace) -> None:
         OSError: a file cannot be read or written.
     """
     models = given.output / "models"
-    present = find_model(given.model, model_folders(models))
+    present = model_file(given.model, given.output)
     model, clip = read_model(given.model, given.output), read_clip()
     session = clip.session
     bags = {name: given.output / name for name in ("keypoints", "lifted", "trained")}
@@ -69,7 +76,8 @@ def run(given: argparse.Namespace) -> None:
     count = write_bag(bags["keypoints"], TOPIC, detections(session))
     say(f"{count} messages of four cameras in {bags['keypoints']}, topic {TOPIC}")
     parameters = {
-        "model": given.model,
+        # The lifter finds models of its folder and of the package by name, others by file.
+        "model": given.model if present.parent in model_folders(models) else present,
         "models_dir": models,
         "keypoint_layout": BODY25B.name,
         "camera_info": CAMERA_INFO,

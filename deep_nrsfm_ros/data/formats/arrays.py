@@ -23,7 +23,7 @@ from deep_nrsfm_ros.data.formats.names import contradiction, layout_of_names
 from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import to_observation
-from deep_nrsfm_ros.lifting.sanity import confidence_scale
+from deep_nrsfm_ros.lifting.sanity import confidence_scale, find_origin
 
 _MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
 _OPTIONAL = (
@@ -146,7 +146,8 @@ def _detections(
     scores = _scores(arrays, m, options)
     identities, warning = _identities(arrays, frame)
     warnings = [*warnings, warning] if warning else warnings
-    findings = confidence_scale(points[..., 2]) if points.shape[2] == 3 else []
+    given = points[..., 2] if points.shape[2] == 3 else np.ones((m, q))
+    findings = confidence_scale(given) + find_origin(points[..., :2], given)
     observation = to_observation(points, options.min_confidence)
     order = np.argsort(frame, kind="stable")
     kept = order[scores[order] >= options.min_score] if options.min_score else order

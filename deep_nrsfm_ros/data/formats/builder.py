@@ -25,7 +25,7 @@ from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
 from deep_nrsfm_ros.lifting.observation import to_observation
-from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale, looks_normalised
+from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale, find_origin, looks_normalised
 
 NO_KEYPOINTS = "have no keypoints"
 _ROWS = 1024  # by which arrays grow at least
@@ -366,7 +366,8 @@ class DetectionsBuilder:
                 f"{len(group.frame)} objects: it is a depth and no confidence, so all keypoints "
                 "count as seen"
             )
-        for finding in confidence_scale(group.confidence[: len(group.frame)]):
+        points, confidence = (v[: len(group.frame)] for v in (group.points, group.confidence))
+        for finding in (*confidence_scale(confidence), *find_origin(points, confidence)):
             self.find(finding)
         if self._outside_box > _MANY * max(self._with_box, 1):
             self.find(

@@ -27,13 +27,16 @@ the consensus is ours.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.factorisation.block_matrix import (
+    NORM_ITERATIONS,
     block_cameras,
     block_rotations,
     least_nuclear_norm,
@@ -69,6 +72,7 @@ _MORE_ITERATIONS = 300  # where there is no noise: EM converges slowly
 _NO_NOISE = 1e-5  # variance of the noise, relative to that of the images, that is none
 _NO_NOISE_AT_LAST = 1e-6  # the same after the last round: furniture 5e-7, dance 1e-5
 _FEW_MODES = (2, 3, 4)
+_TIMED = 15  # iterations from which the duration of all is estimated
 _MODES_FROM_MEAN = (5, 8, 12, 20)  # of EM-PPCA where solutions agree
 
 
@@ -81,7 +85,8 @@ class Consensus(NamedTuple):
         scales: (f,) of the images, 1 where they hardly differ: scale * projected shape = image.
         spread: root mean square difference of depth between the solutions and the result, relative
             to the size of the images: 0.03 typical, 0.3 no agreement. It is that of the solutions
-            before EM-PPCA starts from their mean, which are independent of each other.
+            before EM-PPCA starts from their mean, which are independent of each other; at first
+            that of the two cameras with the lowest nuclear norms.
         solutions: number of solutions that were averaged.
     """
 
@@ -99,33 +104,95 @@ class _Solution(NamedTuple):
     S: Floats
 
 
-def consensus(W: Floats, before_each: Callable[[], None] = lambda: None) -> Consensus:
+def consensus(
+    W: Floats,
+    before_each: Callable[[], None] = lambda: None,
+    on_result: Callable[[Consensus], None] = lambda result: None,
+) -> Consensus:
     """Return the shapes on which factorisations of all frames agree.
 
     Args:
         W: (f, p, 2) complete images, x right and y down; at least 4 frames and points.
         before_each: called before each iteration of each factorisation, so every second or more
             often for 2000 images; an exception ends the work.
+        on_result: called with each mean of solutions on the way, which are nearer to the shapes
+            from one to the next; the last one is returned.
     """
     W = centre(W.astype(np.float64))
     scales = image_scales(W)
     W = W / scales[:, None, None]
-    starts = _best_starts(W, before_each)
+    result = None
+    for found in _means(W, before_each):
+        shapes = centre(found.seen @ found.Q)
+        result = Consensus(shapes, found.Q, scales, found.spread, found.solutions)
+        on_result(result)
+    assert result is not None
+    return result
+
+
+def seconds_at_most(W: Floats, before_each: Callable[[], None] = lambda: None) -> float:
+    """Return about how many seconds `consensus` takes at most here, from a few timed iterations.
+
+    It counts the iterations of the longer way, in rounds, from two cameras that are kept. Where
+    solutions agree it takes half of that or less.
+
+    Args:
+        W: see `consensus`.
+        before_each: see `consensus`.
+    """
+    W = centre(W.astype(np.float64))
+    Q = rotation_from_camera(rigid_rotations(W).swapaxes(1, 2))
+    fewest, most = MODES[0], MODES[-1]
+    norm = _seconds_of_one(
+        lambda tick: least_nuclear_norm(W, Q[:, :2], _TIMED, before_each=tick), before_each
+    )
+    less, more = (_seconds_of_one(partial(_run_em, W, K), before_each) for K in (fewest, most))
+
+    def em(modes: Sequence[int]) -> float:
+        slope = (more - less) / (most - fewest)
+        return sum(less + slope * (K - fewest) for K in modes)
+
+    modes, starts = _modes_in_rounds(W), 2
+    norms = len(RANKS) + 1 + len(modes) * (starts + 1 + len(_ROUNDS) + 1)
+    each = 2 * em(_FEW_MODES) + starts * em(MODES) + em(modes)
+    rounds = (sum(_ROUNDS) + _LAST_ROUND) * em(modes)
+    return NORM_ITERATIONS * norms * norm + _EM_ITERATIONS * each + rounds
+
+
+def _run_em(W: Floats, K: int, before_each: Callable[[], None]) -> None:
+    """Take the iterations of EM-PPCA that are timed."""
+    fit_from_rigid(W, K, iterations=_TIMED, before_each=before_each)
+
+
+def _seconds_of_one(
+    run: Callable[[Callable[[], None]], object], before_each: Callable[[], None]
+) -> float:
+    """Return the mean seconds of an iteration of `run`, which calls its argument before each."""
+    ticks = []
+
+    def tick() -> None:
+        before_each()
+        ticks.append(time.monotonic())
+
+    run(tick)
+    return (ticks[-1] - ticks[0]) / (len(ticks) - 1)
+
+
+def _means(W: Floats, before_each: Callable[[], None]) -> Iterator[_Mean]:
+    """Yield means of solutions, from the first to the best one."""
+    starts, spread = _best_starts(W, before_each)
+    yield _mean(W, starts)._replace(spread=spread)
     if exact := _exact(W, before_each):
-        found = _mean(W, exact)
-    else:
-        models = [
-            model
-            for start in starts
-            for model in _models(W, start, MODES, _EM_ITERATIONS, before_each)
-        ]
-        refined = [_solution(W, model) for model in models]
-        agreeing = _agreeing(W, starts, refined)
-        if agreeing:
-            found = _once_more(W, agreeing, before_each)
-        else:
-            found = _in_rounds(W, models, before_each)
-    return Consensus(centre(found.seen @ found.Q), found.Q, scales, found.spread, found.solutions)
+        yield _mean(W, exact)
+        return
+    models = [
+        model for start in starts for model in _models(W, start, MODES, _EM_ITERATIONS, before_each)
+    ]
+    refined = [_solution(W, model) for model in models]
+    agreeing = _agreeing(W, starts, refined)
+    yield from (
+        _once_more(W, agreeing, before_each) if agreeing else _in_rounds(W, models, before_each)
+    )
 
 
 def _agreeing(W: Floats, starts: list[_Solution], refined: list[_Solution]) -> list[_Solution]:
@@ -139,37 +206,49 @@ def _agreeing(W: Floats, starts: list[_Solution], refined: list[_Solution]) -> l
     return [s for s, good in zip(solutions, kept, strict=True) if good]
 
 
-def _once_more(W: Floats, agreeing: list[_Solution], before_each: Callable[[], None]) -> _Mean:
-    """Return the mean of agreeing solutions and of those of EM-PPCA that starts from their mean."""
+def _once_more(
+    W: Floats, agreeing: list[_Solution], before_each: Callable[[], None]
+) -> Iterator[_Mean]:
+    """Yield the mean of agreeing solutions, and that with EM-PPCA that starts from their mean."""
     found = _mean(W, agreeing)
+    yield found
     modes = [K for K in _MODES_FROM_MEAN if K < W.shape[1]] or list(MODES[:1])
     models = list(_models(W, _in_one_frame(found), modes, _EM_ITERATIONS, before_each))
     solutions = agreeing + [_solution(W, model) for model in models]
     solutions += [_of_least_norm(W, model.Q, before_each, weighted=True) for model in models]
-    return _mean(W, solutions)._replace(spread=found.spread)
+    yield _mean(W, solutions)._replace(spread=found.spread)
 
 
-def _in_rounds(W: Floats, models: list[LinearModel], before_each: Callable[[], None]) -> _Mean:
-    """Return the mean of solutions for cameras of EM-PPCA, which starts from the mean each time.
+def _in_rounds(
+    W: Floats, models: list[LinearModel], before_each: Callable[[], None]
+) -> Iterator[_Mean]:
+    """Yield means of solutions for cameras of EM-PPCA, which starts from the mean each time.
 
     Left out: models with as many modes as points or more, which fit any cameras, and models with
     the fewest modes, which fit too little.
     """
-    modes = [K for K in MODES[1:] if K < W.shape[1]] or list(MODES[:1])
+    modes = _modes_in_rounds(W)
     several = [model for model in models if len(model.basis) - 1 in modes]
     for K in modes:
         model = fit_from_rigid(W, K, iterations=_EM_ITERATIONS, before_each=before_each)
         several.append(model)
     found = _mean(W, [_of_least_norm(W, model.Q, before_each) for model in several])
     spread = found.spread
+    yield found
     for iterations in _ROUNDS:
         models = list(_models(W, _in_one_frame(found), modes, iterations, before_each))
         found = _mean(W, [_of_least_norm(W, model.Q, before_each) for model in models])
+        yield found._replace(spread=spread)
     models = list(_models(W, _in_one_frame(found), modes, _LAST_ROUND, before_each))
     exact = [m for m in models if m.variance < _NO_NOISE_AT_LAST * float((W**2).mean())]
     last = exact[:1] or models  # modes grow in number: the first has the fewest
     found = _mean(W, [_of_least_norm(W, model.Q, before_each, weighted=True) for model in last])
-    return found._replace(spread=spread)
+    yield found._replace(spread=spread)
+
+
+def _modes_in_rounds(W: Floats) -> list[int]:
+    """Return the numbers of modes of `_in_rounds`."""
+    return [K for K in MODES[1:] if K < W.shape[1]] or list(MODES[:1])
 
 
 class _Mean(NamedTuple):
@@ -234,8 +313,11 @@ def image_scales(W: Floats) -> Floats:
     return np.ones(len(W)) if same else scales
 
 
-def _best_starts(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
-    """Return the cameras that allow shapes of the lowest nuclear norm, with these shapes."""
+def _best_starts(W: Floats, before_each: Callable[[], None]) -> tuple[list[_Solution], float]:
+    """Return the cameras that allow shapes of the lowest nuclear norm, with these shapes.
+
+    And the spread of the two with the lowest ones, which are of different cameras.
+    """
     most = min(2 * len(W), W.shape[1]) // 3
     cameras = [rigid_rotations(W)]
     cameras += [block_rotations(W, K) for K in sorted({min(K, most) for K in RANKS})]
@@ -243,7 +325,9 @@ def _best_starts(W: Floats, before_each: Callable[[], None]) -> list[_Solution]:
     for R in cameras:
         starts.append(_of_least_norm(W, rotation_from_camera(R.swapaxes(1, 2)), before_each))
         norms.append(np.linalg.svd(starts[-1].S.reshape(len(W), -1), compute_uv=False).sum())
-    return [s for s, norm in zip(starts, norms, strict=True) if norm <= _SAME_NORM * min(norms)]
+    order = np.argsort(norms)
+    spread = _mean(W, [starts[i] for i in order[:2]]).spread
+    return [starts[i] for i in range(len(starts)) if norms[i] <= _SAME_NORM * min(norms)], spread
 
 
 def _of_least_norm(

@@ -206,7 +206,7 @@ def test_the_large_training_reads_the_bag_that_is_made_for_it(tmp_path: Path) ->
     write_bag(bag, shared_reading.TOPIC, shared_reading.repeated_frames(60, 20))
     words = shared_reading.large_training(bag, 60, tmp_path)
     config = TrainingConfig.from_arguments(parser().parse_args(words))
-    dataset, _ = read_data(config, Reporter(True, lambda: False))
+    dataset = read_data(config, Reporter(True, lambda: False)).dataset
     assert dataset.visible.all() and dataset.points.shape == (60, 17, 2)
 
 
