@@ -23,7 +23,7 @@ from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout_file import read_layout
-from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
+from deep_nrsfm_ros.layouts.presets import BODY25B, COCO17, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
@@ -173,13 +173,17 @@ def test_people_read_verdict_file_and_how_to_use_it_in_short_lines(
 def test_keypoints_that_no_frame_shows_stay_guesses_of_the_start(
     tmp_path: Path, models: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    points, confidence = people()
-    np.save(tmp_path / "people.npy", np.dstack((points, confidence)))
-    words = ("--input", str(tmp_path / "people.npy"), "--keypoint-layout", "coco17", "--steps", "1")
-    assert in_process(*words, "--output", str(models), "--name", "mine", "--threads", "1") == 0
+    view = read_clip().session.views[0]
+    feet = [k for k, name in enumerate(BODY25B.keypoints) if "toe" in name or "heel" in name]
+    confidence = view.confidence.copy()
+    confidence[:, feet] = 0
+    np.save(tmp_path / "people.npy", np.dstack((view.points, confidence)))
+    words = ("--input", str(tmp_path / "people.npy"), "--keypoint-layout", "body25b")
+    words = (*words, "--object", "human25", "--steps", "1", "--threads", "1", "--name", "mine")
+    assert in_process(*words, "--output", str(models)) == 0
     said = capsys.readouterr()
     assert "right_heel" in said.err and "will only guess them, as 'human' does" in said.err
-    assert "and 3 more (their guesses rest on the start)" in said.out
+    assert "Rarely shown: " in said.out and "(their guesses rest on the start)" in said.out
     kept, human = load_model(models / "mine.safetensors"), load_model("human")
     np.testing.assert_array_equal(kept.error_covariance, human.error_covariance)
 
