@@ -38,6 +38,7 @@ Floats = NDArray[Any]
 _Lifted = tuple[Floats, Floats, NDArray[np.bool_]]
 
 _MOST_FRAMES = 2000
+_SHARE_OF_SPEAKERS = 0.8  # with it whole people are lifted as by the start; see docs/devlog
 _MOST_NAMES = 3  # keypoints that a sentence lists
 _NETWORK_ALONE = LiftingOptions(correction="none", test_time_rotations=1)
 _WITH_CORRECTION = LiftingOptions()
@@ -342,7 +343,11 @@ def _guessed(model: Model) -> str:
     if not rare:
         return ""
     more = f" and {len(rare) - _MOST_NAMES} more" if len(rare) > _MOST_NAMES else ""
-    said = "their guesses rest on the start" if "from" in model.provenance else "only guessed"
+    said = "only guessed"
+    if "from" in model.provenance:
+        said = "their guesses rest on the start"
+        if model.provenance["recipe"]["start_share"] < _SHARE_OF_SPEAKERS:
+            said += f"; --start-share {_SHARE_OF_SPEAKERS} keeps more of them"
     return f". Rarely shown: {', '.join(rare[:_MOST_NAMES])}{more} ({said})"
 
 
