@@ -23,7 +23,7 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
 from deep_nrsfm_ros.reporting.page import Training, write_report
 from deep_nrsfm_ros.training.config import TrainingConfig
-from deep_nrsfm_ros.training.distributed import rank
+from deep_nrsfm_ros.training.distributed import own_share, rank
 from deep_nrsfm_ros.training.handedness_check import handedness_warning
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
@@ -245,16 +245,18 @@ def main(argv: Sequence[str] | None = None) -> None:
         should_stop = stop_with_parent(should_stop)
     reporter = (SilentReporter if rank() else Reporter)(arguments.json_progress, should_stop)
     try:
+        state = "finished"
         if result := run(parse(arguments, reporter.say), reporter, should_stop):
             report_end(result, reporter)
-            if result.state == "cancelled":
-                sys.exit(CANCELLED)
+            state = result.state
     except CancelledError:
-        reporter.end("cancelled", "nothing had been learned; nothing was written")
-        sys.exit(CANCELLED)
+        state = "cancelled"
+        reporter.end(state, "nothing had been learned; nothing was written")
     except (ValueError, OSError) as error:
         reporter.end("failed", str(error))
         sys.exit(2)
+    if state == "cancelled" and own_share().size == 1:  # torchrun takes it for a crash
+        sys.exit(CANCELLED)
 
 
 if __name__ == "__main__":
