@@ -18,9 +18,11 @@ import pytest
 import rclpy
 
 from deep_nrsfm_ros.commands import demo, lift, models, replay, train
+from deep_nrsfm_ros.commands.demo.first_look import write_keypoints
 from deep_nrsfm_ros.data.bags import Frame, write_bag
 from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.layouts.presets import BODY25B, COCO17
+from deep_nrsfm_ros.model_files.model_file import load_model, save_model
 from deep_nrsfm_ros.node.lifter import LifterNode
 from docs.generate import parameter_names
 from test.node.conftest import own_domain
@@ -86,6 +88,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"name: dog\nkeypoints: [{names}]\nedges: [[left_hip, left_knee]]\n"
         "handedness: {left: left_hip, right: right_hip, up: nose, front: left_knee}\n"
     )
+    write_keypoints(read_clip(), folder / "demo_output")
+    models = folder / "ros/deep_nrsfm_ros/models"
+    models.mkdir(parents=True)
+    for name in ("first", "mine"):  # that an earlier command of the page has trained
+        save_model(models / f"{name}.safetensors", load_model("human"))
     return folder
 
 
@@ -113,7 +120,10 @@ def test_a_documented_command_runs(
 
 @pytest.mark.usefixtures("nodes")
 @pytest.mark.parametrize("command", LIFTERS)
-def test_a_documented_lifter_starts(command: str) -> None:
+def test_a_documented_lifter_starts(
+    folder: Path, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_HOME", str(folder / "ros"))
     rclpy.init(args=[word.replace("$PWD", str(ROOT)) for word in LIFTERS[command]])
     try:
         node = LifterNode()
