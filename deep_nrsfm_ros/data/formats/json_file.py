@@ -131,7 +131,7 @@ class JsonReader:
             return True
         if isinstance(value, dict) and key is not None and any(k in value for k in _OBJECTS):
             return self._element(value, DefaultFrame(key), key)  # AlphaPose: image -> people
-        if isinstance(value, dict) and key is not None and _names_a_frame(key, value):
+        if not is_element and isinstance(value, dict) and key and _names_a_frame(key, value):
             return self._element(value, DefaultFrame(key), key)
         if is_element and isinstance(value, dict) and "keypoints" in value and key:
             return self._element(value, DefaultFrame(key), key)
