@@ -19,9 +19,9 @@ from deep_nrsfm_ros.training.same_name import CUT_OFF
 COLUMNS = ("model", "object", "keypoints", "judged", "date")
 BETTER, AS_GOOD, ALONE, DOUBTFUL, NOT_JUDGED = "better", "as_good", "alone", "doubtful", "-"
 EXPLANATION = (
-    "judged: whether the model was better than the one at hand at its training, or as good, "
+    "judged: whether the model was better than the one at hand at its training (as_good: alike), "
     "without labels; alone = no other model had its keypoints; - = not judged. Models of one "
-    "object are in this order: better, as good, alone, not judged, doubtful. Your newest model "
+    "object are in this order: better, as_good, alone, not judged, doubtful. Your newest model "
     "has file, data, reason and errors below it; --details shows them for all. "
     "Errors on the data of a training compare models of these data alone. A date with ~ is that of "
     "the file, since the model does not record the day of its training"

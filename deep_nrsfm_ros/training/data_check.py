@@ -17,7 +17,7 @@ from deep_nrsfm_ros.lifting.layout_fit import MAX_OBJECTS, better_layout, fit_la
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import Finding, Size, check, find_sentinel, pose, quality
-from deep_nrsfm_ros.model_files.model_file import load_model
+from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.training.layout_choice import PEOPLE, in_words
 
 Floats = NDArray[np.floating[Any]]
@@ -115,11 +115,18 @@ def sentences(findings: Iterable[SourceFinding]) -> list[str]:
     return said
 
 
-def never_seen(dataset: Dataset) -> str:
-    """Return a sentence on the keypoints that no frame shows; "" if each is shown."""
+def never_seen(dataset: Dataset, start: Model | None = None) -> str:
+    """Return a sentence on the keypoints that no frame shows; "" if each is shown.
+
+    Args:
+        dataset: the frames of a training.
+        start: the model that it starts from, whose guesses remain; None: it has none.
+    """
     times_visible = zip(dataset.layout.keypoints, dataset.visible.sum(0), strict=True)
     missing = [name for name, times in times_visible if not times]
-    return f"no frame shows {', '.join(missing)}: the model will only guess them" if missing else ""
+    as_start = f", as {start.name!r} does" if start else ""
+    sentence = f"no frame shows {', '.join(missing)}: the model will only guess them{as_start}"
+    return sentence if missing else ""
 
 
 def is_copy(dataset: Dataset, other: Dataset) -> bool:

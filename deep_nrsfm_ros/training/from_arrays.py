@@ -114,8 +114,9 @@ def train(
     sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
     if sufficiency.refusal:
         raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
-    missing = "" if origin else layout.warning  # a start passes its handedness on
-    unseen = never_seen(curated.dataset)
+    # A start passes its handedness on to a layout without one.
+    missing = layout.warning if layout.handedness or not origin else ""
+    unseen = never_seen(curated.dataset, origin)
     found = sentences(findings)
     for warning in (missing, unseen, *found, *curated.warnings, *sufficiency.warnings):
         if warning:

@@ -244,11 +244,11 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
     name = rival.name if rival is not None and old else ""
     verdict = _verdict(new, old)
     figures = f"{_on(frames)}: {_shown(new, old, name)}"
-    if not model.layout.handedness and old is None:
-        figures += f", which says nothing of depth. {MIRRORED_AS_A_WHOLE.format(model.name)}"
-    elif model.layout.warning and old is None:
-        figures += f". But {model.layout.warning}"
     figures += _guessed(model)
+    if old is None and not model.layout.handedness:
+        figures += f". These figures say nothing of depth: {MIRRORED_AS_A_WHOLE.format(model.name)}"
+    elif old is None and model.layout.warning:
+        figures += f". But {model.layout.warning}"
     beside = f" beside model {name!r}" if name else ""
     reason = ""
     if worse := worse_figures(new, old):
@@ -261,7 +261,10 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         reason = sides
     if reason:
         verdict, reason = DOUBTFUL, f"{reason}. Judged{beside} {figures}"
-    summary = f"the new model {_IN_SENTENCES[verdict].format(name, *_gains(new, old))}"
+    in_sentence = _IN_SENTENCES[verdict].format(name, *_gains(new, old))
+    if verdict == ALONE:
+        in_sentence = f"has no other to compare with{_side_in_words(model.layout, new)}"
+    summary = f"the new model {in_sentence}"
     summary += f". Judged {figures}"
     return Judgement(reason, summary, new, name, old, verdict)
 
@@ -269,11 +272,11 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
 _IN_SENTENCES = {
     BETTER: "is better than model {!r}: it fits {}, and mirrors {} frames",
     AS_GOOD: "is as good as model {!r}: both fit alike, and it mirrors no more frames",
-    ALONE: "has no other to compare with: nothing shows that it mirrors frames",
+    ALONE: "has no other to compare with",
     DOUBTFUL: "is doubtful",
 }
 MIRRORED_AS_A_WHOLE = (
-    "The layout names no handedness, so the whole may be a mirror image: look at it from the side "
+    "the layout names no handedness, so the whole may be a mirror image: look at it from the side "
     "(replay FILE --model {} --html look.html), or name a handedness and train again"
 )
 """What is said of a model whose depth nothing decides."""
@@ -297,6 +300,22 @@ def _gains(new: Figures, old: Figures | None) -> tuple[str, str]:
     return fit, "fewer" if fewer else "no more"
 
 
+def _side_in_words(layout: KeypointLayout, figures: Figures) -> str:
+    """Return what is known of mirrored frames of a model that has no other to compare with."""
+    if not layout.handedness:
+        return ", and may be mirrored as a whole"
+    if layout.warning:
+        return ", and its handedness contradicts the names of its keypoints"
+    if _is_side_known(figures):
+        return ": nothing shows that it mirrors frames"
+    return ", and nothing tells whether it mirrors frames"
+
+
+def _is_side_known(figures: Figures) -> bool:
+    """Return whether neighbours or the front tell which frames are mirrored."""
+    return not (math.isnan(figures.mirrored_share) and math.isnan(figures.front_disagreement))
+
+
 def _on(frames: Split) -> str:
     """Return on which frames models are compared."""
     count = len(frames.held_out)
@@ -310,10 +329,9 @@ def _shown(new: Figures, old: Figures | None, name: str) -> str:
     values = [
         (each, getattr(new, each), getattr(old, each) if old else math.nan) for each in _SHOWN
     ]
-    is_known = not math.isnan(new.mirrored_share) or not math.isnan(new.front_disagreement)
     texts = []
     for each, value, other in values:
-        if each == "wrong_sides" and not is_known:
+        if each == "wrong_sides" and not _is_side_known(new):
             texts.append("whether frames are mirrored cannot be told here")
         elif not math.isnan(value):
             beside = "" if math.isnan(other) else f" ({name}: {percent(other)})"

@@ -254,7 +254,7 @@ def _describe(
     # A start passes its handedness on to a layout without one.
     if dataset.layout.warning and (dataset.layout.handedness or not start):
         reporter.warn(dataset.layout.warning)
-    if unseen := never_seen(dataset):
+    if unseen := never_seen(dataset, start):
         reporter.warn(unseen)
     reporter.say(f"{len(dataset)} frames of {len(dataset.layout)} keypoints ({dataset.source})")
 

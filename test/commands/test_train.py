@@ -23,7 +23,7 @@ from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout_file import read_layout
-from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN25
+from deep_nrsfm_ros.layouts.presets import BODY25B, COCO17, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
@@ -168,6 +168,41 @@ def test_people_read_verdict_file_and_how_to_use_it_in_short_lines(
     assert file == f"  model {models / 'mine.safetensors'}" and report.startswith("  report ")
     assert "not in use before you choose it: lift FILE --model" in use and "/lifter model" in use
     assert "{" not in said.out and "the new model is doubtful" not in said.err
+
+
+def test_keypoints_that_no_frame_shows_stay_guesses_of_the_start(
+    tmp_path: Path, models: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    view = read_clip().session.views[0]
+    feet = [k for k, name in enumerate(BODY25B.keypoints) if "toe" in name or "heel" in name]
+    confidence = view.confidence.copy()
+    confidence[:, feet] = 0
+    np.save(tmp_path / "people.npy", np.dstack((view.points, confidence)))
+    words = ("--input", str(tmp_path / "people.npy"), "--keypoint-layout", "body25b")
+    words = (*words, "--object", "human25", "--steps", "1", "--threads", "1", "--name", "mine")
+    assert in_process(*words, "--output", str(models)) == 0
+    said = capsys.readouterr()
+    assert "right_heel" in said.err and "will only guess them, as 'human' does" in said.err
+    assert "Rarely shown: " in said.out and "(their guesses rest on the start)" in said.out
+    kept, human = load_model(models / "mine.safetensors"), load_model("human")
+    np.testing.assert_array_equal(kept.error_covariance, human.error_covariance)
+
+
+def test_hands_of_both_sides_are_doubtful_unless_their_side_is_said(
+    tmp_path: Path, models: Path, in_process: RunTraining, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    shapes = centre(rng.standard_normal((21, 3)) + 0.3 * rng.standard_normal((300, 21, 3)))
+    np.save(tmp_path / "hands.npy", 100 * (shapes @ random_cameras(300, rng)) + [320, 240])
+    words = ("--input", str(tmp_path / "hands.npy"), "--object", "hand21", "--steps", "5")
+    said = {}
+    for side in ("", "palms"):
+        more = ("--hands", side) if side else ()
+        assert in_process(*words, *more, "--output", str(models), *QUICK) == 0
+        said[side] = capsys.readouterr()
+    assert "look like those of the other side" in said[""].err
+    assert said[""].out.startswith("finished: the new model is doubtful: 4")
+    assert "look like those of the other side" not in said["palms"].err + said["palms"].out
 
 
 @pytest.mark.parametrize("how", ["SIGTERM", "end of standard input"])

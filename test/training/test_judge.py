@@ -281,9 +281,26 @@ def test_the_whole_may_be_mirrored_where_a_layout_names_no_handedness(
     parts = [dataclasses.replace(part, layout=nameless) for part in frames]
     model = dataclasses.replace(good, layout=nameless)
     text = str(judge(Split(*parts), model, None))
-    assert "which says nothing of depth" in text and "may be a mirror image" in text
+    assert text.startswith(
+        "the new model has no other to compare with, and may be mirrored as a whole"
+    )
+    assert "These figures say nothing of depth" in text and "may be a mirror image" in text
     assert "replay FILE --model good --html look.html" in text and "handedness" in text
     assert "mirror image" not in str(judge(Split(*parts), model, good))  # its start knows the side
+
+
+def test_a_handedness_against_the_names_is_said_again_at_the_end(
+    frames: Split, good: Model
+) -> None:
+    names = ("right_wing", "left_wing", *good.layout.keypoints[2:])
+    four = ("right_wing", "left_wing", names[2], names[3])
+    layout = dataclasses.replace(
+        good.layout, name="bird", keypoints=names, edges=(), handedness=(four,), reference=None
+    )
+    parts = [dataclasses.replace(part, layout=layout) for part in frames]
+    model = dataclasses.replace(good, layout=layout)
+    text = str(judge(Split(*parts), model, None))
+    assert "its handedness has left: right_wing and right: left_wing" in text
 
 
 def test_frames_of_few_keypoints_do_not_tell_a_side(
