@@ -18,9 +18,11 @@ import pytest
 import rclpy
 
 from deep_nrsfm_ros.commands import demo, lift, models, replay, train
+from deep_nrsfm_ros.commands.demo.first_look import write_keypoints
 from deep_nrsfm_ros.data.bags import Frame, write_bag
 from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.layouts.presets import BODY25B, COCO17
+from deep_nrsfm_ros.model_files.model_file import load_model, save_model
 from deep_nrsfm_ros.node.lifter import LifterNode
 from docs.generate import parameter_names
 from test.node.conftest import own_domain
@@ -59,6 +61,7 @@ LINES = sorted(
         for line in re.findall(r"^ {4,}(?!\|)(.*)$", page.read_text("utf-8"), re.MULTILINE)
     }
 )
+MODELS = Path("ros/deep_nrsfm_ros/models")
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +89,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"name: dog\nkeypoints: [{names}]\nedges: [[left_hip, left_knee]]\n"
         "handedness: {left: left_hip, right: right_hip, up: nose, front: left_knee}\n"
     )
+    write_keypoints(read_clip(), folder / "demo_output")
+    models = folder / MODELS
+    models.mkdir(parents=True)
+    for name in ("first", "mine"):  # that an earlier command of the page has trained
+        save_model(models / f"{name}.safetensors", load_model("human"))
     return folder
 
 
@@ -101,11 +109,11 @@ def test_a_documented_command_runs(
 ) -> None:
     name, words = FILES[command]
     words = [word.replace("~", str(folder)) for word in words]
-    steps = ["--steps", "1"] if name == "train" else []
+    more = {"train": ["--steps", "1"], "lift": ["--models-dir", str(folder / MODELS)]}.get(name, [])
     bag = "body25" if "body25" in words else "coco17"
     monkeypatch.setenv("ROS_HOME", str(folder / "ros"))
     monkeypatch.chdir(folder / bag if "my_bag" in words else folder)
-    PROGRAMS[name]([*words, *steps])
+    PROGRAMS[name]([*words, *more])
     for option in ("--output", "--html"):
         if option in words:
             assert Path(words[words.index(option) + 1]).exists()
@@ -113,8 +121,11 @@ def test_a_documented_command_runs(
 
 @pytest.mark.usefixtures("nodes")
 @pytest.mark.parametrize("command", LIFTERS)
-def test_a_documented_lifter_starts(command: str) -> None:
-    rclpy.init(args=[word.replace("$PWD", str(ROOT)) for word in LIFTERS[command]])
+def test_a_documented_lifter_starts(folder: Path, command: str) -> None:
+    words = [word.replace("$PWD", str(ROOT)) for word in LIFTERS[command]]
+    if "model:=mine" in words:
+        words += ["-p", f"models_dir:={folder / MODELS}"]
+    rclpy.init(args=words)
     try:
         node = LifterNode()
         given = dict(re.findall(r"-p ([\w.]+):=(\S+)", command))

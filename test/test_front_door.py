@@ -225,6 +225,15 @@ def test_arrays_are_checked_as_files_are(
         assert judgement["doubtful"] and re.search(complaint, judgement["reason"])
 
 
+def test_each_sequence_is_checked_by_itself() -> None:
+    points, confidence = in_layout(HUMAN25, 60)
+    views = np.concatenate([points, points * [1, -1] + [0, 720], points])
+    recipe = Recipe(steps=1, learning_rate=1e-7, batch=4)
+    given = (views, np.tile(confidence, (3, 1)))
+    with pytest.warns(UserWarning, match="frames 60 to 119: .* upside down"):
+        train(*given, layout=HUMAN25, recipe=recipe, sequence_starts=(0, 60, 120))
+
+
 def test_arrays_in_another_layout_are_refused() -> None:
     with pytest.raises(ValueError, match="poor fit as human25: is it body25"):
         train(*in_layout(BODY25, 60), layout=HUMAN25)

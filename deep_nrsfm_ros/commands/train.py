@@ -282,21 +282,22 @@ def main(argv: Sequence[str] | None = None) -> None:
     if arguments.json_progress:
         should_stop = stop_with_parent(should_stop)
     reporter = (SilentReporter if rank() else Reporter)(arguments.json_progress, should_stop)
+    code = 0
     try:
         if result := run(parse(arguments, reporter.say), reporter, should_stop):
             report_end(result, reporter)
             if result.state == "cancelled":
-                sys.exit(CANCELLED)
-            has_faults = result.judgement is not None and bool(result.judgement.faults)
-            # torchrun takes any other code than 0 for a crash.
-            if has_faults and not arguments.force and own_share().size == 1:
-                sys.exit(EXIT_DOUBTFUL)
+                code = CANCELLED
+            elif result.judgement and result.judgement.faults and not arguments.force:
+                code = EXIT_DOUBTFUL
     except CancelledError:
         reporter.end("cancelled", "nothing had been learned; nothing was written")
-        sys.exit(CANCELLED)
+        code = CANCELLED
     except (ValueError, OSError) as error:
         reporter.end("failed", str(error))
         sys.exit(2)
+    if code and own_share().size == 1:  # torchrun takes any other code than 0 for a crash
+        sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ class SourceFinding(NamedTuple):
     """Something that looks wrong in one source of the data.
 
     Attributes:
-        source: name of the bag or file.
+        source: name of the bag or file, or of a part of an array; "" for all data.
         finding: what looks wrong in it.
     """
 
@@ -108,10 +108,11 @@ def sentences(findings: Iterable[SourceFinding]) -> list[str]:
     kinds: dict[str, list[SourceFinding]] = {}
     for each in findings:
         kinds.setdefault(_NUMBER.sub("#", str(each.finding)), []).append(each)
-    return [
-        f"{in_words(dict.fromkeys(each.source for each in kind))}: {kind[0].finding}"
-        for kind in kinds.values()
-    ]
+    said = []
+    for kind in kinds.values():
+        sources = in_words(dict.fromkeys(each.source for each in kind if each.source))
+        said.append(f"{sources}: {kind[0].finding}" if sources else str(kind[0].finding))
+    return said
 
 
 def never_seen(dataset: Dataset, start: Model | None = None) -> str:

@@ -110,17 +110,15 @@ def factorise(
     needed = math.nan
     try:
         needed = seconds_at_most(points, before_each)
-        on_message(
-            f"classic factorisations of all {len(points)} frames come first and take up to about "
-            f"{_rounded(needed)} s here; few_frames 0 leaves them out"
-        )
+        on_message(_beginning(len(points), needed, most_seconds))
         found.append(consensus(points, before_each, found.append))
     except _TrainingStoppedError:
         return Factorised()
     except _TimeIsUpError:
         minutes = _minutes_for(needed if needed > most_seconds else 2 * most_seconds)
-        on_message(_cut_short(most_seconds, needed, minutes, anything=bool(found)))
-        return Factorised(_believed(found), minutes)
+        shapes = _believed(found)
+        on_message(_cut_short(most_seconds, needed, minutes, anything=shapes is not None))
+        return Factorised(shapes, minutes)
     return Factorised(_believed(found))
 
 
@@ -137,6 +135,20 @@ def _minutes_for(seconds: float) -> float:
 def _rounded(seconds: float) -> int:
     """Return whole seconds, to a precision that an estimate has."""
     return max(1, round(seconds) if seconds < 20 else round(seconds / 5) * 5)
+
+
+def _beginning(frames: int, needed: float, most: float) -> str:
+    """Return a sentence on factorisations that begin: the seconds they need, and at most have."""
+    limit = ""
+    if needed > most:
+        limit = (
+            f"; the time limit leaves them {most:.0f} s, --minutes {_minutes_for(needed):g} "
+            "(train.minutes) would be enough"
+        )
+    return (
+        f"classic factorisations of all {frames} frames come first and take up to about "
+        f"{_rounded(needed)} s here{limit}; few_frames 0 leaves them out"
+    )
 
 
 def _cut_short(spent: float, needed: float, minutes: float, *, anything: bool) -> str:

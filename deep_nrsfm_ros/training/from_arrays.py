@@ -7,6 +7,7 @@ import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,17 +21,27 @@ from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation, from_arrays
-from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale, find_origin, looks_normalised
+from deep_nrsfm_ros.lifting.sanity import confidence_scale, find_origin, looks_normalised
 from deep_nrsfm_ros.model_files.find_layout import layout_of
 from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
 from deep_nrsfm_ros.model_files.model_file import Model, check_name, load_model, load_once
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, Recipe
-from deep_nrsfm_ros.training.data_check import SERIOUS, WRONG_LAYOUT, check_objects, never_seen
+from deep_nrsfm_ros.training.data_check import (
+    WRONG_LAYOUT,
+    SourceFinding,
+    check_objects,
+    never_seen,
+    sentences,
+    serious,
+)
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.progress import Progress
+
+
+_MOST_SEQUENCES = 50  # that are checked one by one: each takes up to a second
 
 
 def train(
@@ -97,7 +108,7 @@ def train(
     starts = np.array(sequence_starts, np.int64)
     visible = seen.confidence > 0
     data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
-    findings = _findings(points, confidence, seen, layout)
+    findings = _findings(points, confidence, seen, data)
     curated = curate(data)
     origin = _origin(start, layout)
     sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
@@ -106,7 +117,8 @@ def train(
     # A start passes its handedness on to a layout without one.
     missing = layout.warning if layout.handedness or not origin else ""
     unseen = never_seen(curated.dataset, origin)
-    for warning in (missing, unseen, *map(str, findings), *curated.warnings, *sufficiency.warnings):
+    found = sentences(findings)
+    for warning in (missing, unseen, *found, *curated.warnings, *sufficiency.warnings):
         if warning:
             warnings.warn(warning, stacklevel=2)
     rival = origin or _shipped(layout)
@@ -123,8 +135,7 @@ def train(
     model = finish(trainer, name, layout, curated.dataset.source)
     if origin:
         model = inherit(model, origin)
-    faults = [str(finding) for finding in findings if finding.code in SERIOUS]
-    judgement = judge(frames, model, rival, faults)
+    judgement = judge(frames, model, rival, serious(findings))
     on_message(str(judgement))
     if judgement.doubtful:
         warnings.warn(str(judgement), stacklevel=2)
@@ -134,28 +145,35 @@ def train(
 
 
 def _findings(
-    points: ArrayLike, confidence: ArrayLike | None, seen: Observation, layout: KeypointLayout
-) -> list[Finding]:
-    """Return what looks wrong in the arrays.
+    points: ArrayLike, confidence: ArrayLike | None, seen: Observation, data: Dataset
+) -> list[SourceFinding]:
+    """Return what looks wrong in the arrays; each of several sequences is checked by itself.
 
     Args:
         points: as given.
         confidence: as given.
         seen: the observation of them.
-        layout: of the keypoints.
+        data: the dataset of it.
 
     Raises:
         ValueError: another layout fits clearly better.
     """
     given = np.ones(np.shape(points)[:-1]) if confidence is None else np.asarray(confidence, float)
-    findings = confidence_scale(given) + find_origin(np.asarray(points), given)
+    whole = confidence_scale(given) + find_origin(np.asarray(points), given)
+    findings = [SourceFinding("", finding) for finding in whole]
     # Only fractions of an image's size have units of their own for x and y.
     is_normalised = looks_normalised(seen.points, seen.confidence > 0)
-    for finding in check_objects(seen.points, seen.confidence, layout, layout):
-        if finding.code == WRONG_LAYOUT:
-            raise ValueError(str(finding))
-        if finding.code != "normalised" or is_normalised:
-            findings.append(finding)
+    starts = data.sequence_starts if len(data.sequence_starts) <= _MOST_SEQUENCES else ()
+    for first, end in pairwise([*(starts if len(starts) else [0]), len(data)]):
+        part = f"frames {first} to {end - 1}" if len(starts) > 1 else ""
+        rows = slice(first, end)
+        for finding in check_objects(
+            seen.points[rows], seen.confidence[rows], data.layout, data.layout
+        ):
+            if finding.code == WRONG_LAYOUT:
+                raise ValueError(f"{part}: {finding}" if part else str(finding))
+            if finding.code != "normalised" or is_normalised:
+                findings.append(SourceFinding(part, finding))
     return findings
 
 

@@ -123,12 +123,15 @@ SAME_MISFIT = 1.02
 
 The new model is then better: the frames that it has learned, it fits more closely.
 """
-MOST_FOLDED = 0.75
-"""Share of opposed frames of a model that mirrors about half of them, as a folded one does.
+MOST_FOLDED = 0.9
+"""Share of opposed frames up to which one of both models may be folded, which mirrors some frames.
 
-Above it one of both models is the mirror image of the other as a whole. Steady bones do not tell
-which, and a model that was trained on from the other has not turned it by learning.
+Above it one of both is the mirror image of the other as a whole. Only the front that the layout
+names tells which: not steady bones, and not neighbours, which are mirrored as well. And a model
+that was trained on from the other has not turned it by learning.
 """
+MOST_BEHIND = 0.5
+"""Share of frames whose front is behind, above which a model is mirrored as a whole."""
 LOOSER_BONES = 2.5
 """Times the other's variation of bones above which a model has fitted its keypoints too closely.
 
@@ -391,12 +394,15 @@ def _worse(new: Figures, old: Figures | None) -> list[str]:
     is_opposed = _or_zero(new.opposed) > MOST_OPPOSED
     if _or_zero(new.turned) > MOST_FOLDED:
         return ["turned"]
+    is_whole = _or_zero(new.opposed) > MOST_FOLDED
+    if is_whole and not _or_zero(old.front_disagreement) > MOST_BEHIND:
+        return ["opposed"]
     less = any(known[name] > values[name] + MORE_WRONG_SIDES for name in both)
     if less and (is_opposed or old.wrong_sides > MOST_MIRRORED):
         return []
     bones, other_bones = _or_zero(new.bone_variation), _or_zero(old.bone_variation)
     if is_opposed:
-        is_folded = new.opposed < MOST_FOLDED and bones < STEADIER_BONES * other_bones
+        is_folded = not is_whole and bones < STEADIER_BONES * other_bones
         return [] if is_folded else ["opposed"]
     if _or_zero(new.turned) > MORE_WRONG_SIDES:  # too few for the mean of the bones to tell whose
         return ["turned"]

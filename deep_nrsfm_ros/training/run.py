@@ -310,6 +310,11 @@ def _train(
         Checkpointing(checkpoint),
     )
     group.close()
+    if trainer.minutes_needed and trainer.end_reason:
+        reporter.warn(
+            "the factorisations of the few frames were cut short: give --minutes "
+            f"{trainer.minutes_needed:g} (train.minutes), or leave it out, for a better model"
+        )
     return trainer
 
 

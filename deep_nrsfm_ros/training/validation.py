@@ -59,7 +59,7 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
             KeypointMap(source, target)
         except ValueError as error:
             raise ValueError(
-                f"{str(error).rstrip('.')}; set {names('keypoint_layout')} to the layout of the "
+                f"{error}; set {names('keypoint_layout')} to the layout of the "
                 f"recorded keypoints, for which {source.name!r} is taken now, or {names('object')}"
             ) from None
     config.layout_loss.check(target, names)

@@ -719,6 +719,27 @@ def test_doubts_about_depth_are_said_in_the_report_and_at_the_end(
     assert "warning: no depth in mine" in capsys.readouterr().err
 
 
+def test_a_model_whose_factorisations_were_cut_short_says_what_would_help(
+    tmp_path: Path,
+    models: Path,
+    in_process: RunTraining,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from deep_nrsfm_ros.training import few_frames
+
+    monkeypatch.setattr(few_frames, "seconds_at_most", lambda *_: 130.0)
+    limits = ("--minutes", "0.005", "--steps", "2000")
+    words = ("--bag", str(write_paws(tmp_path)), "--object", "numbered", *limits, *QUICK)
+    assert in_process(*words, "--output", str(models)) == 0
+    wanted = "were cut short: give --minutes 3.5 (train.minutes), or leave it out"
+    said = capsys.readouterr().err
+    assert said.index("take up to about 130 s here") < said.index("warning: the factorisations")
+    assert wanted in said
+    assert wanted in (models / "mine.html").read_text()
+    assert load_model(models / "mine.safetensors").provenance["factorisation_needs_minutes"] == 3.5
+
+
 def test_a_report_that_cannot_be_written_costs_no_model(
     arguments: list[str],
     models: Path,

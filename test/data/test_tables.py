@@ -16,6 +16,7 @@ import pytest
 from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
 from deep_nrsfm_ros.data.read_options import ReadOptions
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, MEDIAPIPE33
 
 PARTS = ("nose", "left_ear", "right_ear", "tail_base")
@@ -244,3 +245,32 @@ def test_trc_of_sports2d(tmp_path: Path) -> None:
 def test_counts_of_keypoints_are_those_of_the_layout(tmp_path: Path) -> None:
     with pytest.raises(KeypointFileError, match="it names 4 keypoints, coco17 has 17"):
         read(tmp_path / "a.csv", landmarks(VALUES, PARTS), layout=COCO17)
+
+
+def test_the_coordinate_may_come_before_the_name(tmp_path: Path) -> None:
+    head = [f"{c}_{part}" for part in PARTS for c in ("x", "y", "conf")]
+    text = rows(head, *VALUES.reshape(5, -1).tolist()).replace("nan", "")
+    assert_mouse(read(tmp_path / "a.csv", text))
+
+
+@pytest.mark.parametrize("prefix", ["kp", "Keypoint_", "landmark "])
+def test_numbered_names_are_no_names(prefix: str, tmp_path: Path) -> None:
+    head = [f"{prefix}{i}_{c}" for i in range(len(PARTS)) for c in ("x", "y", "conf")]
+    text = rows(head, *VALUES.reshape(5, -1).tolist()).replace("nan", "")
+    found = read(tmp_path / "a.csv", text)
+    assert found.layout is None
+    np.testing.assert_allclose(found.points, np.nan_to_num(VALUES[..., :2]), rtol=1e-5)
+    own = KeypointLayout("mouse", PARTS)
+    assert read(tmp_path / "a.csv", text, fallback=own).layout == own
+    known = KeypointLayout("numbers", tuple(f"{prefix}{i}" for i in range(len(PARTS))))
+    named = read(tmp_path / "a.csv", text, fallback=known)
+    assert named.layout and named.layout.keypoints == known.keypoints
+    assert "its objects have 4 keypoints; the keypoint layout coco17 has 17" in (
+        complaint(tmp_path / "a.csv", text, fallback=COCO17)
+    )
+
+
+def complaint(path: Path, text: str, **options: Any) -> str:
+    with pytest.raises(KeypointFileError) as error:
+        read(path, text, **options)
+    return str(error.value)

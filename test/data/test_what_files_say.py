@@ -17,7 +17,7 @@ from deep_nrsfm_ros.data.formats.json_items import JsonItem, json_items
 from deep_nrsfm_ros.data.formats.names import layout_of_names, misspelt, preset_spelling
 from deep_nrsfm_ros.data.keypoint_files import KeypointFileError, read_keypoints
 from deep_nrsfm_ros.data.read_options import ReadOptions
-from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN17, LAYOUTS
 from deep_nrsfm_ros.lifting.sanity import check
 
 Q = len(COCO17)
@@ -639,3 +639,37 @@ def test_confidence_of_0_to_100_is_doubted(tmp_path: Path) -> None:
         assert [f.code for f in found.findings] == ["confidence-scale"]
         assert "up to 90: it must be 0 to 1" in found.findings[0].message
         assert (found.confidence == 1).all()
+
+
+def test_landmarks_of_mediapipe_say_their_layout(tmp_path: Path) -> None:
+    rows = np.reshape(person(q=33), (33, 3)).tolist()
+    landmarks = [{"x": x / 640, "y": y / 640, "visibility": c} for x, y, c in rows]
+    frames = [{"pose_landmarks": landmarks}] * 3
+    size = {"image_size": (640, 640)}
+    for options in (size, {**size, "fallback": HUMAN17}):
+        found = read(tmp_path / "a.json", frames, **options)
+        assert found.layout is LAYOUTS["mediapipe33"] and len(found) == 3
+    with pytest.raises(KeypointFileError, match="have 33 keypoints; the keypoint layout coco17"):
+        read(tmp_path / "a.json", frames, **size, layout=COCO17)
+    hand = read(tmp_path / "b.json", [{"landmarks": landmarks[:21]}] * 3, **size)
+    assert hand.layout is None
+
+
+def test_frames_by_name_or_number(tmp_path: Path) -> None:
+    points = np.reshape(person(), (Q, 3)).tolist()
+    named = dict(zip(COCO17.keypoints, points, strict=True))
+    found = read(tmp_path / "a.json", {str(i): named for i in (3, 1, 2)})
+    assert found.layout is COCO17 and found.frames.numbers.tolist() == [1, 2, 3]
+    rows = read(tmp_path / "b.json", {f"image_{i}": {"keypoints": person()} for i in (0, 1)})
+    assert len(rows) == 2 and rows.layout is None
+    with pytest.raises(KeypointFileError, match=r"nor of a script of your own .*`skeleton`"):
+        read(tmp_path / "c.json", {"skeleton": {"keypoints": ["nose"]}})
+
+
+def test_points_relative_to_one_of_them_are_named(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).uniform(-200, 200, (9, Q, 2))
+    values[:, 0] = 0
+    np.save(tmp_path / "a.npy", values)
+    lines = [json.dumps({"people": [{"keypoints": row}]}) for row in values.tolist()]
+    for found in (read_keypoints(tmp_path / "a.npy"), read(tmp_path / "a.jsonl", "\n".join(lines))):
+        assert [finding.code for finding in found.findings] == ["origin"]

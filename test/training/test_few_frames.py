@@ -45,8 +45,10 @@ def agreed(points: np.ndarray, spread: float = 0.01) -> Consensus:
 
 
 def test_the_factorisation_of_few_frames_is_right(figure: Any) -> None:
-    known = factorise(store(figure), preset()).shapes
+    said: list[str] = []
+    known = factorise(store(figure), preset(), on_message=said.append).shapes
     assert known is not None
+    assert "time limit" not in said[0]
     assert shape_errors(known.shapes, figure.shapes[:FRAMES]).proper < 0.1
 
 
@@ -158,6 +160,9 @@ def test_the_best_shapes_until_then_are_kept_where_the_time_is_up(
     assert found.shapes.solutions == 1
     assert found.minutes_needed == 2  # of which they have two thirds
     assert f"of all {FRAMES} frames come first and take up to about 75 s here" in said[0]
+    assert (
+        "; the time limit leaves them 0 s, --minutes 2 (train.minutes) would be enough" in said[0]
+    )
     assert "the network learns the less exact shapes that they found until then" in said[-1]
     assert "they need up to about 75 s here: give --minutes 2 (train.minutes)" in said[-1]
 
@@ -178,7 +183,10 @@ def test_shapes_without_agreement_are_not_taught_where_the_time_is_up(
 ) -> None:
     cut_short(monkeypatch, results=1, needed=75)
     monkeypatch.setattr(few_frames, "MAX_SPREAD", 0.001)
-    assert factorise(store(figure), preset(), most_seconds=0.05).shapes is None
+    said: list[str] = []
+    found = factorise(store(figure), preset(), on_message=said.append, most_seconds=0.05)
+    assert found.shapes is None
+    assert "the network learns without them" in said[-1]
 
 
 def test_a_third_of_a_time_limit_is_left_for_the_steps(

@@ -184,6 +184,8 @@ def test_the_rule(change: dict[str, float], worse: list[str]) -> None:
     [
         ({"opposed": 1.0, "bone_variation": 0.01}, ["opposed"]),  # steady bones do not tell whose
         ({"opposed": 0.5, "bone_variation": 0.01}, []),
+        ({"opposed": 1.0, "mirrored_share": 0.0}, ["opposed"]),  # its neighbours are mirrored, too
+        ({"opposed": 1.0, "front_disagreement": 0.2}, ["opposed"]),
         ({"opposed": 1.0, "turned": 1.0, "bone_variation": 0.01}, ["turned"]),
         ({"opposed": 0.0, "turned": 1.0, "bone_variation": 0.01}, ["turned"]),
     ],

@@ -122,3 +122,16 @@ def test_a_layout_without_handedness_is_a_warning_unless_a_start_passes_its_own_
     assert validate(coco.with_start(save(tmp_path / "m.safetensors", COCO17)), COMMAND_LINE) == ""
     numbered = config.with_options({"object": "numbered", "keypoint_layout": ""})
     assert "'numbered' names no handedness" in validate(numbered, PARAMETERS)
+
+
+def test_layouts_without_a_common_name_are_refused_with_both_remedies(
+    config: TrainingConfig, tmp_path: Path
+) -> None:
+    (tmp_path / "fly.yaml").write_text("{name: fly, keypoints: [a, b, c, d, e, f, g, h]}")
+    values = {"object": str(tmp_path / "fly.yaml"), "keypoint_layout": "coco17"}
+    remedies = (
+        r"'fly' has a, b, c, d, e, f, \.\.\.; set train\.keypoint_layout to the layout of the "
+        r"recorded keypoints, for which 'coco17' is taken now, or train\.object"
+    )
+    with pytest.raises(ValueError, match=remedies):
+        validate(config.with_options(values), PARAMETERS)

@@ -20,7 +20,12 @@ from deep_nrsfm_ros.data.formats.frame_numbers import (
     series_of,
     stamps_of,
 )
-from deep_nrsfm_ros.data.formats.names import NAMED_BY_INPUT, contradiction, layout_of_names
+from deep_nrsfm_ros.data.formats.names import (
+    NAMED_BY_INPUT,
+    are_numbers,
+    contradiction,
+    layout_of_names,
+)
 from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
@@ -448,8 +453,10 @@ class DetectionsBuilder:
         """Return the layout of the keypoints; None if nothing says it."""
         options = self.options
         names = self._names.get(category, self._names.get(None))
+        if names and are_numbers(names) and not self._knows(names):
+            names = None
         if names is None:
-            layout = self._preset
+            layout = self._preset or self._of_mediapipe()
         else:
             try:
                 layout = layout_of_names(names)
@@ -466,6 +473,19 @@ class DetectionsBuilder:
                 "the file"
             )
         return options.layout
+
+    def _knows(self, names: Sequence[str]) -> bool:
+        """Return whether the layout that the options name has a keypoint of these names."""
+        layout = self.options.layout or self.options.fallback
+        return layout is not None and not set(names).isdisjoint(layout.keypoints)
+
+    def _of_mediapipe(self) -> KeypointLayout | None:
+        """Return the layout of MediaPipe's landmarks; None if the objects are no such landmarks.
+
+        A layout that the options name goes before it.
+        """
+        is_pose = self.is_mediapipe and {q for _, q in self._groups} == {_MEDIAPIPE}
+        return LAYOUTS["mediapipe33"] if is_pose and self.options.layout is None else None
 
     def _group(self, layout: KeypointLayout | None) -> _Group:
         """Return the objects with the number of keypoints of the layout; count the others."""

@@ -31,7 +31,8 @@ from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS
 
 EXPECTED = (
     "neither COCO (`annotations`, or a list of results), OpenPose (`people`), MMPose "
-    "(`instance_info`), AlphaPose nor MediaPipe (`landmarks`)"
+    "(`instance_info`), AlphaPose, MediaPipe (`landmarks`) nor of a script of your own (a list "
+    'with an object a frame, {"nose": [x, y, confidence], ...})'
 )
 _KEYPOINTS = (
     *("keypoints", "pose_keypoints_2d", "pose_keypoints", "joints", "landmarks", "landmark"),
@@ -130,6 +131,8 @@ class JsonReader:
             return True
         if isinstance(value, dict) and key is not None and any(k in value for k in _OBJECTS):
             return self._element(value, DefaultFrame(key), key)  # AlphaPose: image -> people
+        if not is_element and isinstance(value, dict) and key and _names_a_frame(key, value):
+            return self._element(value, DefaultFrame(key), key)
         if is_element and isinstance(value, dict) and "keypoints" in value and key:
             return self._element(value, DefaultFrame(key), key)
         return False
@@ -346,6 +349,12 @@ class JsonReader:
             except ValueError:
                 return
             self._builder.name_keypoints(ordered)
+
+
+def _names_a_frame(key: str, value: Mapping[str, Any]) -> bool:
+    """Return whether a key of a document is the name of the frame whose object is its value."""
+    has_number = any(character.isdigit() for character in key)
+    return bool(_named_points(value)) or has_number and any(name in value for name in _KEYPOINTS)
 
 
 def _is_frame(key: str | None, value: Any, document: DefaultFrame) -> bool:

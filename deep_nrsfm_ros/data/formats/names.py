@@ -28,6 +28,10 @@ _DATASETS = {
 }
 """Datasets of MMPose -> presets."""
 _ALIKE = 0.7  # of the letters of two names: knie and knee have 0.75, hip and hand 0.3
+_COUNTED = re.compile(
+    r"(kp|kpt|keypoint|key_?point|point|pt|joint|landmark|lm|marker|p|k|j)[_ .-]?(\d{1,4})",
+    re.IGNORECASE,
+)
 _SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _ALIASES = {
     "sho": "shoulder",
@@ -62,6 +66,15 @@ def layout_of_names(names: Sequence[str]) -> KeypointLayout:
                 return LAYOUTS[name]
     unique = keypoints if len(set(keypoints)) == len(keypoints) else tuple(names)
     return KeypointLayout(NAMED_BY_INPUT, unique)
+
+
+def are_numbers(names: Sequence[str]) -> bool:
+    """Return whether names only count the keypoints: kp0, kp1, ... or point_1, point_2, ..."""
+    found = [_COUNTED.fullmatch(name) for name in names]
+    marks = {match[1].lower() for match in found if match}
+    numbers = [int(match[2]) for match in found if match]
+    is_series = numbers in (list(range(len(names))), list(range(1, len(names) + 1)))
+    return None not in found and len(marks) == 1 and is_series
 
 
 def preset_spelling(name: str) -> str:

@@ -38,7 +38,8 @@ _KEYPOINT = (
 )
 _EXPECTED = (
     "neither of DeepLabCut (rows scorer, bodyparts, coords), nor with a landmark a row (columns "
-    "frame, landmark, x, y), nor with a column for each coordinate (nose_x, nose_y, ...)"
+    "frame, landmark, x, y), nor with a column for each coordinate (nose_x, nose_y, ... or "
+    "x_nose, y_nose, ...)"
 )
 _UNIQUE = "single"  # individual of DeepLabCut that has the unique bodyparts
 _DECIMAL_COMMA = re.compile(r"^(\s*[-+]?\d+),(\d+)")
@@ -351,10 +352,13 @@ def _coordinate_columns(
             time = i
         after = re.fullmatch(r"(.+)[_. -]([A-Za-z]+)", cell)
         before = re.fullmatch(r"([xyzvcs])_?(\d+)", name)
+        prefix = re.fullmatch(r"([A-Za-z]+)[_. -](.+)", cell)
         if after and after[2].lower() in _COORDINATES:
             columns.append(("", after[1], after[2].lower()))
         elif before:
             columns.append(("", before[2], before[1]))
+        elif prefix and prefix[1].lower() in _COORDINATES:
+            columns.append(("", prefix[2], prefix[1].lower()))
         else:
             columns.append(("", "", ""))
     places: dict[str, dict[str, int]] = {}
