@@ -179,8 +179,8 @@ def test_keypoints_that_no_frame_shows_stay_guesses_of_the_start(
     confidence[:, feet] = 0
     np.save(tmp_path / "people.npy", np.dstack((view.points, confidence)))
     words = ("--input", str(tmp_path / "people.npy"), "--keypoint-layout", "body25b")
-    words = (*words, "--object", "human25", "--steps", "1", "--threads", "1", "--name", "mine")
-    assert in_process(*words, "--output", str(models)) == 0
+    more = ("--object", "human25", "--steps", "1", "--threads", "1", "--name", "mine")
+    assert in_process(*words, *more, "--output", str(models)) == 0
     said = capsys.readouterr()
     assert "right_heel" in said.err and "will only guess them, as 'human' does" in said.err
     assert (
