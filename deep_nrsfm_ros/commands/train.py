@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train a model from bags and files of 2D keypoints, or motion capture: one model file out.
 
-Exit code 0: the training has ended, or was cancelled; 2: the input or an option is at fault; 3: the
-model is written, and is doubtful since its data looks wrong (--force: 0).
+Exit code 0: the training has ended; 2: the input or an option is at fault; 3: the model is written,
+and is doubtful since its data looks wrong (--force: 0); 130: the training was stopped before its
+end.
 """
 
 from __future__ import annotations

@@ -217,10 +217,12 @@ def judge(
             more frames, or other options, would not help.
     """
     judgement = compare(frames, model, rival)
+    if sides := mixed_sides(frames.training, MIXED):
+        faults = (*faults, sides)
     if not faults:
         return judgement
     reason = f"its data looks wrong: {'; '.join(faults)}. Mend it and train again"
-    return judgement._replace(reason=reason, faults=tuple(faults))
+    return judgement._replace(reason=reason, verdict=DOUBTFUL, faults=tuple(faults))
 
 
 def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
@@ -258,8 +260,6 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
             reason += _fronts_in_words(comparison.fronts(model))
         else:
             reason += f"; {_advice(model, name)} would help"
-    if sides := mixed_sides(frames.training, MIXED):  # more frames would not help
-        reason = sides
     if reason:
         verdict, reason = DOUBTFUL, f"{reason}. Judged{beside} {figures}"
     in_sentence = _IN_SENTENCES[verdict].format(name, *_gains(new, old))
@@ -333,7 +333,7 @@ def _shown(new: Figures, old: Figures | None, name: str) -> str:
     texts = []
     for each, value, other in values:
         if each == "wrong_sides" and not _is_side_known(new):
-            texts.append("whether frames are mirrored cannot be told here")
+            texts.append("neither other views nor a front tell which frames are mirrored")
         elif not math.isnan(value):
             beside = "" if math.isnan(other) else f" ({name}: {percent(other)})"
             texts.append(_SHOWN[each].format(percent(value)) + beside)

@@ -347,5 +347,6 @@ def test_hands_of_both_sides_are_doubtful(
 
     monkeypatch.setattr(module, "mixed_sides", lambda data, least: f"mixed above {least}")
     judgement = judge(frames, good, good)
-    assert judgement.doubtful and judgement.reason.startswith("mixed above 0.3. Judged")
+    assert judgement.reason == "its data looks wrong: mixed above 0.3. Mend it and train again"
+    assert judgement.doubtful and judgement.faults == ("mixed above 0.3",)
     assert judgement.verdict == "doubtful"
