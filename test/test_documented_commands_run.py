@@ -21,6 +21,7 @@ from deep_nrsfm_ros.commands import demo, lift, models, replay, train
 from deep_nrsfm_ros.commands.demo.first_look import write_keypoints
 from deep_nrsfm_ros.data.bags import Frame, write_bag
 from deep_nrsfm_ros.data.clip import read_clip
+from deep_nrsfm_ros.data.virtual_hands import virtual_hands
 from deep_nrsfm_ros.layouts.presets import BODY25B, COCO17
 from deep_nrsfm_ros.model_files.model_file import load_model, save_model
 from deep_nrsfm_ros.node.lifter import LifterNode
@@ -71,10 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     view = read_clip().session.views[0]
     people = np.dstack([view.points, view.confidence])[:40]
     (folder / "people.json").write_text(str(people.tolist()))
-    angles = np.linspace(-2.4, -0.8, 5)  # of five fingers, spread above the wrist
-    fingers = np.outer(np.arange(1, 5), np.exp(1j * angles)).T.ravel()
-    hand = 250 + 40 * np.stack([fingers.real, fingers.imag], -1)
-    hands = np.vstack([[[250.0, 250.0]], hand]) + np.arange(5)[:, None, None]
+    hands = virtual_hands(60).points + np.float32(300)
     np.savez(folder / "hands.npz", points=hands)
     order = [BODY25B.keypoints.index(name) for name in COCO17.keypoints]
     for name, q in (("coco17", order), ("body25", list(range(25)))):
