@@ -46,6 +46,7 @@ _FACE = ("nose", "left_eye", "right_eye")
 _SEEN = 0.5  # confidence of a face that is seen
 _TURNED = 0.3  # cosine between the front of a person and the camera's axis: less is a profile
 _MIN_FACES = 5  # people, which are too few for a verdict on left and right
+_MIN_FACE_SHARE = 0.05  # of the people: fewer faces may be wrong keypoints of people from behind
 _MIN_FOCAL = 10.0  # pixels; a smaller focal length belongs to normalised coordinates
 _MIN_REPEATS = 3  # points on one spot that may be a sentinel
 _MARKED = 0.001  # fraction of points on a spot such as (-1, -1) that is more than chance
@@ -341,7 +342,8 @@ def facing(
         return []
     front = rotations[:, 2, 0]
     seen = (confidence[:, face] >= least).all(1) & (np.abs(front) > _TURNED)
-    if seen.sum() < _MIN_FACES or (away := (front[seen] > 0).mean()) <= _NEARLY_ALL:
+    enough = max(_MIN_FACES, _MIN_FACE_SHARE * len(rotations))
+    if seen.sum() < enough or (away := (front[seen] > 0).mean()) <= _NEARLY_ALL:
         return []
     people = f"{away:.0%} of the {seen.sum()} people whose face is seen"
     up = _up_in_image(rotations[seen])

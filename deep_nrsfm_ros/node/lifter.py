@@ -768,8 +768,8 @@ class LifterNode(Node):
             )
         inputs, topics = parameter_bridge.read(self, InputOptions), self._keypoint_topics.topics
         layout = inputs.keypoint_layout
-        if layout == AUTO:
-            layout = self._pipeline.detector.name if self._pipeline.detector else MODEL_ORDER
+        if layout == AUTO and self._pipeline.detector:
+            layout = self._pipeline.detector.name
         lifter = LifterInput(
             topic=topics[0] if len(topics) == 1 else "",
             keypoint_layout=self._sandbox.layout("keypoint_layout", layout),

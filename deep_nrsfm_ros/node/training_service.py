@@ -43,7 +43,7 @@ def check_keypoint_counts(config: TrainingConfig) -> None:
             so a training of them would fail as soon as they are read.
     """
     data, (source, _) = config.data, find_layouts(config, PARAMETERS)
-    if not source.keypoints or data.inputs:
+    if not (data.keypoint_layout and source.keypoints) or data.inputs:
         return
     reason = ""
     for path in map(Path.expanduser, data.bags):

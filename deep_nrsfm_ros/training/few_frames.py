@@ -81,9 +81,13 @@ def factorise(
         most_seconds: after which they are cut short, and their best shapes until then are returned.
     """
     recipe, p = preset.recipe, frames.points.shape[1]
-    if not MIN_FRAMES <= len(frames) <= recipe.few_frames or recipe.steps < MIN_STEPS:
+    if not MIN_FRAMES <= len(frames) <= recipe.few_frames or p < 4 or not recipe.cycle:
         return Factorised()
-    if p < 4 or not recipe.cycle:
+    if recipe.steps < MIN_STEPS:
+        on_message(
+            f"fewer than {MIN_STEPS} steps (steps): without the classic factorisations that teach "
+            "a network of so few frames, and often mirrored in part for that"
+        )
         return Factorised()
     batch = frames.batch(torch.arange(len(frames), device=frames.device))
     points, mask = batch.points.cpu().numpy(), batch.mask.cpu().numpy()

@@ -562,7 +562,7 @@ class Judge:
         return self._lifted[key][1]
 
     def _opposed(self, model: Model, other: Model, *, corrected: bool = False) -> float:
-        """Return the share of all frames of which `other` has the mirror image."""
+        """Return the share of all frames of which `other` has the mirror image; 0 for one alone."""
         S, _, visible = self._lift(model, corrected=corrected)
         T, residual, also_visible = self._lift(other, corrected=corrected)
         both, sound = visible & also_visible, np.isfinite(residual)
@@ -570,7 +570,8 @@ class Judge:
         if not tells.any():
             return 0.0
         aligned = align(_unit(S, both)[tells], _unit(T, both)[tells], allow_reflection=True)
-        return float(aligned.mirrored.sum() / sound.sum())
+        count = int(aligned.mirrored.sum())
+        return count / int(sound.sum()) if count > 1 else 0.0
 
     def fronts(self, model: Model) -> list[tuple[Tetrahedron, float]]:
         """Return each four of the data's handedness that counts, with its share of frames behind.

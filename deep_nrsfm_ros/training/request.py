@@ -14,7 +14,7 @@ from deep_nrsfm_ros.data.bag_files import open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.keypoint_files import is_bag
-from deep_nrsfm_ros.messages.options import MODEL_ORDER
+from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
 from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, check_name
@@ -50,8 +50,9 @@ class TrainingOptions:
     )
     keypoint_layout: str = option(
         "",
-        "order of the keypoints in the bags; empty = that of the parameter keypoint_layout, or "
-        "where that is 'model', the layout of train.object if it is set",
+        "order of the keypoints in the bags; empty = that of the parameter keypoint_layout; where "
+        "that is 'model', the layout of train.object if it is set; where it is 'auto' and no "
+        "message has shown it yet, the layout that fits the recording best",
     )
     from_: str = option(
         "",
@@ -105,7 +106,7 @@ class LifterInput:
     Attributes:
         topic: its topic, "" where it listens to none or to several.
         keypoint_layout: order of the keypoints in its messages, as `find_layout` takes it; "model"
-            is that of `model`.
+            is that of `model`, "auto" not yet known.
         model: file of its present model.
         min_confidence: keypoints of less confidence count as missing, 0 to 1.
         mapping: field mapping (.yaml) of its messages, or "".
@@ -223,12 +224,14 @@ def choose_layouts(options: TrainingOptions, lifter: LifterInput) -> tuple[str, 
     """Return the layouts of the bags and of the new model, each as `find_layout` takes it.
 
     What `options` leaves empty follows from the lifter's input and model. The layout of the bags is
-    "" where the new model is "numbered".
+    "" where the new model is "numbered", or where the training finds it.
     """
     start = "" if options.from_ == FROM_NONE else options.from_
     target = options.object or start or str(lifter.model)
     if options.keypoint_layout or target == NUMBERED:
         return options.keypoint_layout, target
+    if lifter.keypoint_layout == AUTO:
+        return "", target
     if lifter.keypoint_layout == MODEL_ORDER:
         return options.object or str(lifter.model), target
     return lifter.keypoint_layout, target

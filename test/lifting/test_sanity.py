@@ -240,3 +240,13 @@ def test_which_mirror_it_is(mirror: np.ndarray, expected: str) -> None:
     assert finding.code == "handedness" and expected in finding.message
     hidden = pose(np.tile(mirror @ upright, (N, 1, 1)), 0 * seen, HUMAN17)
     assert [f.code for f in hidden] == ["orientation"] * ("left" not in expected)
+
+
+def test_few_faces_of_many_people_say_nothing_of_left_and_right() -> None:
+    upright = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], np.float32)
+    away = np.tile(np.diag([1, 1, -1]) @ upright, (200, 1, 1))
+    seen = np.zeros((200, len(HUMAN17)))
+    seen[:9] = 1  # wrong keypoints of people from behind
+    assert not pose(away, seen, HUMAN17)
+    seen[:11] = 1
+    assert [f.code for f in pose(away, seen, HUMAN17)] == ["handedness"]

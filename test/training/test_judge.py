@@ -239,6 +239,26 @@ def test_frames_that_a_training_has_turned_are_seen_beside_its_start_alone(
     assert math.isnan(comparison.figures(good, good).turned)
 
 
+@pytest.mark.parametrize(("turned", "counted"), [(1, 0), (2, 2)])
+def test_a_single_frame_that_is_turned_does_not_count(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch, turned: int, counted: int
+) -> None:
+    comparison = Judge(Split(frames.training, frames.held_out[:100]))
+    lift = comparison._lift
+
+    def some_mirrored(model: Model, **options: bool) -> Any:
+        S, residual, visible = lift(model, **options)
+        if model.name == "tuned" and options.get("corrected"):
+            S = S.copy()
+            S[:turned, :, 2] *= -1
+        return S, residual, visible
+
+    monkeypatch.setattr(comparison, "_lift", some_mirrored)
+    tuned = dataclasses.replace(good, name="tuned")
+    sound = np.isfinite(lift(good, corrected=True)[1]).sum()
+    assert comparison._opposed(tuned, good, corrected=True) * sound == pytest.approx(counted)
+
+
 def test_standings_have_the_best_first_and_doubtful_ones_last(
     frames: Split, good: Model, bad: Model
 ) -> None:

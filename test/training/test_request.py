@@ -155,6 +155,8 @@ def test_an_object_that_is_no_preset_starts_from_its_present_model(tmp_path: Pat
         ({"object": "human17", "keypoint_layout": "body25"}, "model", ("body25", "human17")),
         ({"keypoint_layout": "body25"}, "coco17", ("body25", str(MODEL))),
         ({"object": "numbered"}, "coco17", ("", "numbered")),
+        ({}, "auto", ("", str(MODEL))),
+        ({"keypoint_layout": "body25"}, "auto", ("body25", str(MODEL))),
     ],
 )
 def test_layouts_are_those_of_the_parameters_or_of_the_lifter(
