@@ -16,6 +16,9 @@ from std_srvs.srv import Trigger
 
 from deep_nrsfm_ros.data.bag_files import BagError, BagFile, open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
@@ -42,16 +45,20 @@ def check_keypoint_counts(config: TrainingConfig) -> None:
         ValueError: the messages have another number of keypoints than their layout in every bag,
             so a training of them would fail as soon as they are read.
     """
-    data, (source, _) = config.data, find_layouts(config, PARAMETERS)
-    if not (data.keypoint_layout and source.keypoints) or data.inputs:
+    data, (source, target) = config.data, find_layouts(config, PARAMETERS)
+    if not source.keypoints or data.inputs:
         return
+    counts = [len(source)]
+    if not data.keypoint_layout:  # the training takes the layout that fits
+        counts += {len(layout) for layout in LAYOUTS.values() if _maps(layout, target)}
     reason = ""
     for path in map(Path.expanduser, data.bags):
         if not opens_quickly(path):
             return
         try:
             with closing(open_bag(path)) as bag:
-                wrong = _wrong_count(bag, data, len(source))
+                complaints = [_wrong_count(bag, data, count) for count in counts]
+                wrong = complaints[0] if all(complaints) else ""
         except BagError:  # the training leaves it out
             continue
         if not wrong:
@@ -61,6 +68,15 @@ def check_keypoint_counts(config: TrainingConfig) -> None:
         raise ValueError(
             f"{reason}; set {PARAMETERS('keypoint_layout')}, which stands for {source.name!r} now"
         )
+
+
+def _maps(layout: KeypointLayout, target: KeypointLayout) -> bool:
+    """Return whether keypoints of one layout can be those of another."""
+    try:
+        KeypointMap(layout, target)
+    except ValueError:
+        return False
+    return True
 
 
 def _wrong_count(bag: BagFile, data: DataConfig, keypoints: int) -> str:

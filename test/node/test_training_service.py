@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -217,6 +218,13 @@ def test_bags_of_another_number_of_keypoints_are_refused_at_once(
     # A bag that fits is enough: the training leaves out the messages of the other, and counts them.
     both = (tmp_path / "fingers", models / "joints")
     check_keypoint_counts(TrainingConfig(DataConfig(both), object="human17"))
+    # Where no layout is named the training finds it: 17 keypoints may be coco17.
+    write_bag(tmp_path / "people", 20, 17)
+    people = DataConfig((tmp_path / "people",))
+    check_keypoint_counts(TrainingConfig(people, object="human25"))
+    named = dataclasses.replace(people, keypoint_layout="human25")
+    with pytest.raises(ValueError, match="17 keypoints"):
+        check_keypoint_counts(TrainingConfig(named, object="human25"))
 
 
 PAW = KeypointLayout("paw", ("heel", "toe_1", "toe_2", "toe_3", "toe_4"))
