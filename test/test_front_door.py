@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ import pytest
 import deep_nrsfm_ros
 from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros import KeypointLayout, Lifted, Lifter, Model, Recipe, load_model, train
+from deep_nrsfm_ros.data.clip import read_clip
+from deep_nrsfm_ros.data.virtual_hands import virtual_hands
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN25
 from deep_nrsfm_ros.model_files.model_file import ModelFileError, save_model
@@ -237,3 +240,27 @@ def test_each_sequence_is_checked_by_itself() -> None:
 def test_arrays_in_another_layout_are_refused() -> None:
     with pytest.raises(ValueError, match="poor fit as human25: is it body25"):
         train(*in_layout(BODY25, 60), layout=HUMAN25)
+
+
+def test_arrays_are_mapped_to_the_object_and_hands_to_right_ones() -> None:
+    view = read_clip().session.views[0]
+    recipe = Recipe(steps=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = train(
+            view.points, view.confidence, layout="body25b", object="human25", recipe=recipe
+        )
+    assert model.layout == HUMAN25
+    start = load_model("human").network.L  # a start of the same keypoints keeps its whitening
+    np.testing.assert_array_equal(model.network.L, start)
+
+    hands = virtual_hands(60).points
+    both_sides = "look like those of the other side"
+    with pytest.warns(UserWarning, match=both_sides):
+        train(hands, layout="hand21", recipe=recipe)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=f".*{both_sides}")
+        warnings.filterwarnings("ignore", message=f"(?!.*{both_sides})")
+        train(hands, layout="hand21", hands="right", recipe=recipe)
+    with pytest.raises(ValueError, match="hands is 'both'; it is one of right, left, palms"):
+        train(hands, layout="hand21", hands="both", recipe=recipe)

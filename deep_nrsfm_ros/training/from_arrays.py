@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike
 
 from deep_nrsfm_ros.data.curation import Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.data.hands import SIDES, as_right_hands
 from deep_nrsfm_ros.data.held_out import split
 from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.extras import require_extra
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation, from_arrays
 from deep_nrsfm_ros.lifting.sanity import confidence_scale, find_origin, looks_normalised
@@ -49,6 +51,8 @@ def train(
     confidence: ArrayLike | None = None,
     *,
     layout: KeypointLayout | str | Path | Sequence[str],
+    object: KeypointLayout | str | Path | Sequence[str] | None = None,
+    hands: str = "",
     name: str = "trained",
     start: Model | str | Path = "",
     recipe: Recipe | None = None,
@@ -74,7 +78,13 @@ def train(
         confidence: (f, p) from 0, which is missing, to 1, or booleans of visibility. None: all
             keypoints are visible.
         layout: keypoint layout of the points, as an object, by the name of a preset or a layout
-            file ("coco17"), or a list of the keypoints' names; it is the model's too.
+            file ("coco17"), or a list of the keypoints' names.
+        object: layout of the model, in the same forms; the points are mapped to it by name. For
+            people "human25": such a model has the keypoints of `human`, keeps most of its weights,
+            and needs few steps. None: that of the points.
+        hands: what is known of recorded hands, which must all be right ones: "right"; "left", which
+            are mirrored; "palms" where each shows its palm, so that left ones are seen and
+            mirrored. "": nothing.
         name: name of the model.
         start: model to start from, its name or its file. "" is a model that comes with the package
             and has most keypoints of the layout, if there is one; "none" is random weights.
@@ -103,12 +113,20 @@ def train(
     from deep_nrsfm_ros.training.setup import Setup
 
     check_name("name", name)
+    if hands not in ("", *SIDES):
+        raise ValueError(f"hands is {hands!r}; it is one of {', '.join(SIDES)}")
     layout = layout_of("layout", layout, name)
     seen = from_arrays(points, confidence, layout)
     starts = np.array(sequence_starts, np.int64)
     visible = seen.confidence > 0
     data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
     findings = _findings(points, confidence, seen, data)
+    if object is not None:
+        layout = layout_of("object", object, name)
+        mapped, weight = KeypointMap(data.layout, layout)(seen.points, seen.confidence)
+        data = Dataset(mapped, weight > 0, layout, "arrays", sequence_starts=starts)
+    if hands:
+        data = as_right_hands(data, hands)
     curated = curate(data)
     origin = _origin(start, layout)
     sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)

@@ -450,6 +450,7 @@ def _advice(model: Model, rival: str) -> str:
         advice.insert(0, f"more time (--minutes {minutes:g}, train.minutes, or no limit)")
     if "from" in model.provenance:
         advice.append("fewer steps")
+        advice.append("a larger share of the start (--start-share, train.start_share)")
     else:
         advice.append(f"a start from {rival or 'a model of such an object'} (--from, train.from)")
     if model.layout.edges and model.layout.handedness:

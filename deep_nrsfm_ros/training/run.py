@@ -156,7 +156,7 @@ def _train_and_save(
     model, path, note = _save(config, model, old, judgement)
     if rival and rival.name == path.stem:
         rival = dataclasses.replace(rival, name=f"{rival.name}{BEFORE}")
-    state, message = _ending(trainer, path, model, checkpoint)
+    state, message = _ending(trainer, path, model, checkpoint, config.output.name)
     if judgement and not judgement.doubtful:
         give_up_unfinished(config.output.folder, config.output.name)
     return TrainingResult(
@@ -318,11 +318,14 @@ def _train(
     return trainer
 
 
-def _ending(trainer: Trainer, path: Path, model: Model, checkpoint: Path) -> tuple[str, str]:
+def _ending(
+    trainer: Trainer, path: Path, model: Model, checkpoint: Path, name: str
+) -> tuple[str, str]:
     """Return the state and the message with which the training ends; remove a used checkpoint."""
     if not trainer.end_reason:
         message = f"{path} holds what was learned so far"
-        return "cancelled", message + (", --resume goes on" if checkpoint.exists() else "")
+        goes_on = f", --resume --name {name} goes on"
+        return "cancelled", message + (goes_on if checkpoint.exists() else "")
     checkpoint.unlink(missing_ok=True)
     message, steps = str(path), trainer.preset.recipe.steps
     if trainer.step < steps:

@@ -365,7 +365,7 @@ def test_a_cancelled_screening_keeps_a_model_and_goes_on(
     with monkeypatch.context() as cancelled:
         cancelled.setattr(train, "stop_on_signals", stop_after(6))
         assert in_process(*words) == 130
-    assert "--resume goes on" in capsys.readouterr().out
+    assert "--resume --name mine goes on" in capsys.readouterr().out
     assert assert_lifts(models / "mine.safetensors").provenance["step"] == 5
     assert in_process(*words, "--resume") == 0
     assert "is screened" in capsys.readouterr().err

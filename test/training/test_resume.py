@@ -116,7 +116,7 @@ def test_a_cancelled_training_goes_on_with_nothing_but_its_name(folder: Folder, 
             break
     process.send_signal(signal.SIGTERM)
     cancelled = lines_of(process)[-1]
-    assert "--resume goes on" in cancelled["message"], cancelled
+    assert "--resume --name mine goes on" in cancelled["message"], cancelled
     found = read_record(folder.models, "mine")
     assert found is not None and found.saved and not found.running
     assert found.config is not None
