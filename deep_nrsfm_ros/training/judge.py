@@ -404,7 +404,9 @@ def _worse(new: Figures, old: Figures | None) -> list[str]:
     if is_opposed:
         is_folded = not is_whole and bones < STEADIER_BONES * other_bones
         return [] if is_folded else ["opposed"]
-    if _or_zero(new.turned) > MORE_WRONG_SIDES:  # too few for the mean of the bones to tell whose
+    # Frames that the start mirrors may turn. Others are too few for the mean of the bones to tell.
+    mended = max(old.wrong_sides - new.wrong_sides, 0.0)
+    if _or_zero(new.turned) > mended + MORE_WRONG_SIDES:
         return ["turned"]
     worse = ["bone_variation"] if bones > LOOSER_BONES * other_bones else []
     return worse + (["misfit"] if new.misfit > SAME_MISFIT * old.misfit else [])

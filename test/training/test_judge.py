@@ -259,6 +259,13 @@ def test_a_single_frame_that_is_turned_does_not_count(
     assert comparison._opposed(tuned, good, corrected=True) * sound == pytest.approx(counted)
 
 
+def test_frames_that_the_start_mirrors_may_turn() -> None:
+    start = GOOD._replace(mirrored_share=0.019)
+    tuned = start._replace(mirrored_share=0.009, turned=0.013)
+    assert worse_figures(tuned, start) == []
+    assert worse_figures(tuned._replace(turned=0.016), start) == ["turned"]
+
+
 def test_standings_have_the_best_first_and_doubtful_ones_last(
     frames: Split, good: Model, bad: Model
 ) -> None:
