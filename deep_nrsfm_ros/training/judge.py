@@ -389,7 +389,9 @@ def _worse(new: Figures, old: Figures | None) -> list[str]:
         return [name for name in shares if values.get(name, 0.0) > MOST_MIRRORED]
     known = _known(old)
     both = [name for name in shares if name in values and name in known]
-    if worse := [name for name in both if values[name] > known[name] + MORE_WRONG_SIDES]:
+    worse = [name for name in both if values[name] > known[name] + MORE_WRONG_SIDES]
+    # A figure may rise where the other shows that as many were mirrored before.
+    if worse and new.wrong_sides > old.wrong_sides + MORE_WRONG_SIDES:
         return worse
     is_opposed = _or_zero(new.opposed) > MOST_OPPOSED
     if _or_zero(new.turned) > MOST_FOLDED:

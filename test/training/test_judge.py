@@ -266,6 +266,13 @@ def test_frames_that_the_start_mirrors_may_turn() -> None:
     assert worse_figures(tuned._replace(turned=0.016), start) == ["turned"]
 
 
+def test_one_figure_of_wrong_sides_may_rise_where_the_other_was_as_high() -> None:
+    start = GOOD._replace(mirrored_share=0.017, front_disagreement=0.0)
+    assert worse_figures(start._replace(mirrored_share=0.0, front_disagreement=0.015), start) == []
+    worse = start._replace(mirrored_share=0.0, front_disagreement=0.023)
+    assert worse_figures(worse, start) == ["front_disagreement"]
+
+
 def test_standings_have_the_best_first_and_doubtful_ones_last(
     frames: Split, good: Model, bad: Model
 ) -> None:
