@@ -226,20 +226,21 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
     page = write_page(result, reporter)
     lines += [f"report {page}"] if page else []
     if not reporter.as_json and result.state == "finished":  # else the lifter says it
-        lines.append(_how_to_use(result.path))
+        is_doubtful = judgement is not None and judgement.doubtful
+        lines.append(_how_to_use(result.path, is_doubtful=is_doubtful))
     message = ("; " if reporter.as_json else "\n  ").join(lines)
     if not reporter.as_json:
         message = message.replace(". Judged ", "\n  judged ")
     reporter.end(result.state, message, model=str(result.path), report=page, **values)
 
 
-def _how_to_use(path: Path) -> str:
+def _how_to_use(path: Path, *, is_doubtful: bool) -> str:
     """Return how a model is put in use."""
     known = path.parent.resolve() == default_models_dir().resolve()
     name = path.stem if known else str(path)
+    use = "not in use, but you can look at what it lifts" if is_doubtful else "use it"
     return (
-        f"not in use before you choose it: lift FILE --model {name}, or in a lifter: "
-        f"ros2 param set /lifter model {path.stem}"
+        f"{use}: lift FILE --model {name}, or in a lifter: ros2 param set /lifter model {path.stem}"
     )
 
 

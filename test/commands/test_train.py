@@ -167,7 +167,8 @@ def test_people_read_verdict_file_and_how_to_use_it_in_short_lines(
     assert verdict.startswith("finished: the new model is doubtful: ") and len(verdict) < 700
     assert figures.startswith("  judged beside model 'human' on ") and len(figures) < 400
     assert file == f"  model {models / 'mine.safetensors'}" and report.startswith("  report ")
-    assert "not in use before you choose it: lift FILE --model" in use and "/lifter model" in use
+    assert "not in use, but you can look at what it lifts: lift FILE --model" in use
+    assert "ros2 param set /lifter model" in use
     assert "{" not in said.out and "the new model is doubtful" not in said.err
 
 
