@@ -32,7 +32,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter, check_min_visible
 from deep_nrsfm_ros.lifting.options import GravityOptions, LiftingOptions
-from deep_nrsfm_ros.lifting.sanity import Finding, Size, is_person
+from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL, Finding, Size, is_person
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.model_files.find_layout import find_layout
@@ -40,8 +40,6 @@ from deep_nrsfm_ros.model_files.model_file import Model, load_model
 
 _NODE_ONLY_OPTIONS = ("input_type", "topics", "bags_dir", "max_objects", "min_score")
 """Options of the node's input that mean nothing for a file."""
-_EXIT_DOUBTFUL = 3
-"""Exit code of an answer that looks wrong."""
 
 
 class Camera(NamedTuple):
@@ -308,8 +306,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     for finding in summary.findings:
         warn(str(finding))
     if summary.findings and not args.force:
-        warn(f"the answer is doubtful: exit code {_EXIT_DOUBTFUL} (--force: 0)")
-        sys.exit(_EXIT_DOUBTFUL)
+        warn(f"the answer is doubtful: exit code {EXIT_DOUBTFUL} (--force: 0)")
+        sys.exit(EXIT_DOUBTFUL)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.hands import SIDES
 from deep_nrsfm_ros.data.keypoint_files import KINDS
 from deep_nrsfm_ros.data.read_options import ReadOptions
+from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -31,7 +32,6 @@ from deep_nrsfm_ros.reporting.page import Training, write_report
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.distributed import own_share, rank
 from deep_nrsfm_ros.training.handedness_check import handedness_warning
-from deep_nrsfm_ros.training.job import EXIT_DOUBTFUL
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments

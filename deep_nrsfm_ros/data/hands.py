@@ -69,6 +69,12 @@ def palms_as_right_hands(points: Float32) -> Float32:
     return np.where(left[:, None, None], mirrored(points), points)
 
 
+def check_side(option: str, side: str) -> None:
+    """Raise ValueError unless `side`, given by `option`, is one of `SIDES` or "", unknown."""
+    if side not in ("", *SIDES):
+        raise ValueError(f"{option} is {side!r}; it is one of {', '.join(SIDES)}")
+
+
 def as_right_hands(hands: Dataset, side: str) -> Dataset:
     """Return a dataset of hands as right hands.
 

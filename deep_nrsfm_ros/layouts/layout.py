@@ -18,7 +18,8 @@ Edge = tuple[str, str]
 Tetrahedron = tuple[str, str, str, str]
 TRUNK = ("neck", "mid_hip")
 """Reference pair of people."""
-_SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
+SIDE_WORDS = {"left": "left", "l": "left", "right": "right", "r": "right"}
+"""Words in the names of keypoints -> their side."""
 _FIELDS = {
     "edge": "edges",
     "rigid pair": "rigid",
@@ -198,5 +199,5 @@ class KeypointLayout:
 def _side(keypoint: str) -> str:
     """Return "left" or "right" where the name of a keypoint has it as a word or letter, else ""."""
     words = re.split(r"[\W_]+|(?<=[a-z])(?=[A-Z])", keypoint)
-    found = {_SIDES[word.lower()] for word in words if word.lower() in _SIDES}
+    found = {SIDE_WORDS[word.lower()] for word in words if word.lower() in SIDE_WORDS}
     return found.pop() if len(found) == 1 else ""

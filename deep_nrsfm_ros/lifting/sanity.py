@@ -63,6 +63,10 @@ _SHORTEST, _LONGEST = 100_000, 3600 * _SECOND  # ns between frames: 10 kHz to on
 _UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": _SECOND}
 
 
+EXIT_DOUBTFUL = 3
+"""Exit code of a program whose answer rests on data that looks wrong."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """Something that looks wrong in the input or in the answer.

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from deep_nrsfm_ros.data.curation import Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.hands import SIDES, as_right_hands
+from deep_nrsfm_ros.data.hands import as_right_hands, check_side
 from deep_nrsfm_ros.data.held_out import split
 from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.extras import require_extra
@@ -113,8 +113,7 @@ def train(
     from deep_nrsfm_ros.training.setup import Setup
 
     check_name("name", name)
-    if hands not in ("", *SIDES):
-        raise ValueError(f"hands is {hands!r}; it is one of {', '.join(SIDES)}")
+    check_side("hands", hands)
     layout = layout_of("layout", layout, name)
     seen = from_arrays(points, confidence, layout)
     starts = np.array(sequence_starts, np.int64)

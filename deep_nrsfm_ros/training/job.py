@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL
 from deep_nrsfm_ros.training.config import TrainingConfig
 
 Value = str | int | float | None
@@ -22,9 +23,6 @@ Value = str | int | float | None
 ACTIVE = ("starting", "reading", "curating", "training")
 ENDED = ("finished", "failed", "cancelled")
 TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
-
-EXIT_DOUBTFUL = 3
-"""Exit code of a training that has ended with a model of data that looks wrong, as of `lift`."""
 
 _OUTPUT_TAIL = 10  # lines
 _KILL_TIMEOUT = 0.5  # s, from SIGKILL to the end of the process

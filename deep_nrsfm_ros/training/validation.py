@@ -9,7 +9,7 @@ from pathlib import Path
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.bag_files import BagError, open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
-from deep_nrsfm_ros.data.hands import SIDES
+from deep_nrsfm_ros.data.hands import check_side
 from deep_nrsfm_ros.data.keypoint_files import is_bag
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.extras import require_extra
@@ -140,8 +140,7 @@ def _check_data(config: TrainingConfig, names: OptionNames) -> None:
             f"{names('image_width')} is {data.image_width} and {names('image_height')} is "
             f"{data.image_height}: the size of the image needs both"
         )
-    if data.hands not in ("", *SIDES):
-        raise ValueError(f"{names('hands')} is {data.hands!r}; it is one of {', '.join(SIDES)}")
+    check_side(names("hands"), data.hands)
     default = DataConfig()
     of_the_other = _OF_BAGS if data.cmu else _OF_CMU
     for name in of_the_other:

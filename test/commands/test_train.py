@@ -25,11 +25,11 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout_file import read_layout
 from deep_nrsfm_ros.layouts.presets import BODY25B, COCO17, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 from deep_nrsfm_ros.training import judge, run
 from deep_nrsfm_ros.training.config import TrainingConfig
-from deep_nrsfm_ros.training.job import EXIT_DOUBTFUL
 from deep_nrsfm_ros.training.record import find_records, read_record
 from deep_nrsfm_ros.training.trainer import Trainer
 from test.fixtures.forked_python import TRAINING, ForkedPython

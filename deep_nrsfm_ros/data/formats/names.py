@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from difflib import SequenceMatcher
 from functools import cache
 
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import SIDE_WORDS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 
 NAMED_BY_INPUT = "names_of_the_input"
@@ -32,7 +32,6 @@ _COUNTED = re.compile(
     r"(kp|kpt|keypoint|key_?point|point|pt|joint|landmark|lm|marker|p|k|j)[_ .-]?(\d{1,4})",
     re.IGNORECASE,
 )
-_SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _ALIASES = {
     "sho": "shoulder",
     "elb": "elbow",
@@ -86,9 +85,12 @@ def preset_spelling(name: str) -> str:
     bare = [rest, _ALIASES.get(rest, rest)]
     if sides:
         candidates = [f"{sides[0]}_{name}" for name in bare]
-    elif rest[:1] in _SIDES:  # lshoulder
+    elif rest[:1] in SIDE_WORDS:  # lshoulder
         part = rest[1:]
-        candidates = [*bare, *(f"{_SIDES[rest[0]]}_{p}" for p in (part, _ALIASES.get(part, part)))]
+        candidates = [
+            *bare,
+            *(f"{SIDE_WORDS[rest[0]]}_{p}" for p in (part, _ALIASES.get(part, part))),
+        ]
     else:
         candidates = bare
     return next((candidate for candidate in candidates if candidate in known), name)
@@ -98,8 +100,8 @@ def _words(name: str) -> tuple[list[str], str]:
     """Return the sides in a name, and the rest of it: ["left"], "small_toe" of LSmallToe."""
     words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])([A-Z][a-z])", r"\1\3_\2\4", name).lower()
     parts = [part for part in re.split(r"[^a-z0-9]+", words) if part]
-    sides = [_SIDES[part] for part in parts if part in _SIDES]
-    return sides, "_".join(part for part in parts if part not in _SIDES)
+    sides = [SIDE_WORDS[part] for part in parts if part in SIDE_WORDS]
+    return sides, "_".join(part for part in parts if part not in SIDE_WORDS)
 
 
 def misspelt(names: Collection[str], wanted: Sequence[str]) -> dict[str, str]:
