@@ -129,7 +129,7 @@ def mixed_sides(hands: Dataset, least: float = _SOME) -> str:
         f"{100 * share:.0f} % of the hands look like those of the other side: if left and right "
         "hands are mixed, the model learns a mirrored depth, and no figure shows it. Say what they "
         "are: --hands palms (each shows its palm: left ones are mirrored), right or left; in "
-        "Python sort them by deep_nrsfm_ros.data.hands"
+        "Python by the argument hands"
     )
 
 

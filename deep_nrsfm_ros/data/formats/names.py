@@ -87,10 +87,8 @@ def preset_spelling(name: str) -> str:
         candidates = [f"{sides[0]}_{name}" for name in bare]
     elif rest[:1] in SIDE_WORDS:  # lshoulder
         part = rest[1:]
-        candidates = [
-            *bare,
-            *(f"{SIDE_WORDS[rest[0]]}_{p}" for p in (part, _ALIASES.get(part, part))),
-        ]
+        side = SIDE_WORDS[rest[0]]
+        candidates = [*bare, *(f"{side}_{p}" for p in (part, _ALIASES.get(part, part)))]
     else:
         candidates = bare
     return next((candidate for candidate in candidates if candidate in known), name)
