@@ -23,6 +23,7 @@ from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.hands import SIDES
 from deep_nrsfm_ros.data.keypoint_files import KINDS
 from deep_nrsfm_ros.data.read_options import ReadOptions
+from deep_nrsfm_ros.data.varied_images import ImageVariation
 from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.network import Architecture
@@ -158,7 +159,8 @@ def parser() -> argparse.ArgumentParser:
     )
     # Time plays no role in a training, so --rate would have no effect.
     add_arguments(parser, ReadOptions, without=("rate",))
-    for config in (Recipe, LayoutLossWeights, Limits, Architecture, Normaliser, Curation):
+    parts = (Recipe, LayoutLossWeights, Limits, Architecture, Normaliser, Curation, ImageVariation)
+    for config in parts:
         add_arguments(parser, config)
     return parser
 

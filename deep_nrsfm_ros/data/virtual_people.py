@@ -47,6 +47,10 @@ FACE = ((0.02, 0.05), (0.01, 0.04), (0.028, 0.038), (0.0, 0.04), (0.08, 0.13), (
 """Ranges in metres of the numbers of `FaceShape`, in their order."""
 FACE_KEYPOINTS = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")
 """Keypoints that some detectors lack altogether; the network then sees less of the head's pose."""
+FEET_KEYPOINTS = tuple(
+    f"{side}_{part}" for part in ("big_toe", "small_toe", "heel") for side in ("left", "right")
+)
+"""Keypoints of the feet below the ankles, which detectors with the keypoints of COCO lack."""
 _PARTS = (
     ("root", ("hipjoint",)),
     ("hipjoint", ("femur",)),

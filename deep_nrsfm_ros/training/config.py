@@ -21,6 +21,7 @@ from typing import Any
 from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
 from deep_nrsfm_ros.data.keypoint_files import recordings
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS
+from deep_nrsfm_ros.data.varied_images import ImageVariation
 from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
@@ -114,6 +115,7 @@ class TrainingConfig:
         rival: model file that the new model is compared with, or ""; see `judge`.
         architecture, normaliser, recipe: the parts of a preset.
         layout_loss: weights of the losses that the layout defines.
+        variation: which CMU images lack parts of the body, and which are mirrored.
         curation: which frames and keypoints are left out.
         limits: when the training ends before its last step, and which state it keeps.
         output: folder and name of the model, threads.
@@ -128,6 +130,7 @@ class TrainingConfig:
     normaliser: Normaliser = field(default_factory=Normaliser)
     recipe: Recipe = field(default_factory=Recipe)
     layout_loss: LayoutLossWeights = field(default_factory=LayoutLossWeights)
+    variation: ImageVariation = field(default_factory=ImageVariation)
     curation: Curation = field(default_factory=Curation)
     limits: Limits = field(default_factory=Limits)
     output: OutputConfig = field(default_factory=OutputConfig)

@@ -19,6 +19,7 @@ from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.resolve_layout import NameCheck, check_names
 from deep_nrsfm_ros.data.share import Share
 from deep_nrsfm_ros.data.sufficiency import Sufficiency, assess_sufficiency
+from deep_nrsfm_ros.data.varied_images import varied
 from deep_nrsfm_ros.data.virtual_people import read_virtual_people
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -103,7 +104,8 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
     data = config.data
     source, target = find_layouts(config, COMMAND_LINE)
     if data.cmu:
-        return ReadData(read_split(_selection(data, data.cmu), target, reporter.reading), "")
+        images = read_split(_selection(data, data.cmu), target, reporter.reading)
+        return ReadData(varied(images, config.variation), "")
     options = ReadOptions(
         topic=data.topic,
         min_confidence=data.min_confidence,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from contextlib import closing
 from pathlib import Path
 
@@ -63,6 +64,8 @@ def validate(config: TrainingConfig, names: OptionNames) -> str:
                 f"recorded keypoints, for which {source.name!r} is taken now, or {names('object')}"
             ) from None
     config.layout_loss.check(target, names)
+    if config.data.cmu:
+        config.variation.check(target, names)
     check_limb_exchange(config.recipe.limb_exchange, names("limb_exchange"))
     if config.recipe.limb_exchange > 0:
         try:
@@ -113,7 +116,8 @@ def find_layouts(
 
 def _check_ranges(config: TrainingConfig, names: OptionNames) -> None:
     """Raise ValueError for the first option outside its range."""
-    for part in (*config.preset, config.layout_loss, config.curation, config.limits):
+    parts = (config.layout_loss, config.variation, config.curation, config.limits)
+    for part in (*config.preset, *parts):
         for field, _, option in options(type(part)):
             option.check(names(field.name), getattr(part, field.name))
     for field, _, option in options(ReadOptions):
@@ -147,6 +151,10 @@ def _check_data(config: TrainingConfig, names: OptionNames) -> None:
         if getattr(data, name) != getattr(default, name):
             kind = "motion capture" if data.cmu else "bags and files"
             raise ValueError(f"{names(name)} has no effect on {kind}: leave it out")
+    if not data.cmu:
+        for name, value in dataclasses.asdict(config.variation).items():
+            if value:
+                raise ValueError(f"{names(name)} has no effect on bags and files: leave it out")
     for field in ("bags", "inputs"):
         for path in getattr(data, field):
             if not path.expanduser().exists():

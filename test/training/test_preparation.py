@@ -15,6 +15,7 @@ from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.training import preparation
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.preparation import prepare, read_data
 from deep_nrsfm_ros.training.reporter import Reporter
@@ -152,3 +153,15 @@ def test_one_bad_file_is_left_out_and_named(
     both = ("--input", f"{tmp_path}/a.npz", "--bag", f"{tmp_path}/bag", "--object", "human17")
     with pytest.raises(ValueError, match="have 12 frames; at most 10"):
         read(*both, "--max-frames", "10")
+
+
+def test_images_of_motion_capture_are_varied(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preparation, "read_split", lambda *_: people(600))
+    words = ("--cmu", "folder", "--object", "human17")
+    plain, changed = read(*words), read(*words, "--hidden-feet", "0.5", "--mirrored-images", "0.5")
+    toe = HUMAN17.index("left_big_toe")
+    assert plain.visible.all()
+    assert changed.visible[:, toe].mean() == pytest.approx(0.5, abs=0.05)
+    was_mirrored = (changed.points[:, 0] != plain.points[:, 0]).any(1)
+    assert was_mirrored.mean() == pytest.approx(0.5, abs=0.05)
+    assert changed.source == "made up; hidden_feet 0.5, mirrored_images 0.5"

@@ -70,6 +70,12 @@ def test_a_name_that_is_no_plain_file_name_is_refused(config: TrainingConfig, na
             "--virtual-people has no effect on bags",
             "train.virtual_people has",
         ),
+        (
+            {"hidden_face": 0.2},
+            "--hidden-face has no effect on bags",
+            "train.hidden_face has no effect on bags",
+        ),
+        ({"mirrored_images": 2.0}, "--mirrored-images is 2", "train.mirrored_images is 2"),
         ({"steps": 0}, "--steps is 0: .* with --from", "train.steps is 0"),
         ({"object": "cmu31"}, "share 0 keypoints", "share 0 keypoints"),
         ({"object": "numbered"}, "leave out --keypoint-layout", "leave out train.keypoint_layout"),
