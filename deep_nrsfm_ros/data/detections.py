@@ -15,7 +15,7 @@ from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.data.openpose import largest
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
-from deep_nrsfm_ros.lifting.sanity import Finding
+from deep_nrsfm_ros.lifting.sanity import Finding, Size
 
 _GHOST = 0.5  # of the best score in a frame: an object below it is not chosen for its size
 
@@ -48,6 +48,8 @@ class Detections:
         scores: (m,) float32, score of the object in the detector's own scale; None = all 1.
         layout: layout in which the keypoints are given; None = nothing says it.
         usual_layout: layout that is usual in a file of this format, without `layout`; None = none.
+        image_size: width and height of all images in pixels, as the source gives them; None =
+            it gives none, or several.
         warnings: sentences about what was left out of the source.
         findings: what looks wrong in the source.
     """
@@ -62,6 +64,7 @@ class Detections:
     scores: NDArray[np.float32] = None  # type: ignore[assignment]
     layout: KeypointLayout | None = None
     usual_layout: KeypointLayout | None = None
+    image_size: Size | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

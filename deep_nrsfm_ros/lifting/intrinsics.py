@@ -6,6 +6,7 @@ Source: the lens models of sensor_msgs/CameraInfo, as OpenCV defines them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -19,6 +20,9 @@ RATIONAL = "rational_polynomial"
 EQUIDISTANT = "equidistant"
 COEFFICIENTS = {PLUMB_BOB: (0, 4, 5), RATIONAL: (0, 4, 5, 8), EQUIDISTANT: (0, 4)}
 """Numbers of coefficients that each lens model may have; those left out are 0."""
+
+MAX_FIELD_OF_VIEW = 150.0
+"""Largest angle of view in degrees; wider lenses are far from a pinhole."""
 
 _MAX_STEPS = 20  # of Newton's method; a usual lens takes 5, the border of a fisheye more
 _TOLERANCE = 1e-9  # last step in the plane z = 1, or in radians, of a search that has converged
@@ -58,6 +62,29 @@ class Intrinsics:
             raise ValueError(f"camera has a number that is not finite: {self}")
         if min(self.focal) <= 0:
             raise ValueError(f"focal length is {min(self.focal)}; it must be above 0 pixels")
+
+    @classmethod
+    def from_field_of_view(cls, degrees: float, size: tuple[int, int]) -> Intrinsics:
+        """Return a camera without distortion whose principal point is the middle of the image.
+
+        Args:
+            degrees: angle of view of the image's width, also of an upright image.
+            size: width and height of the whole image in pixels.
+
+        Raises:
+            ValueError: the angle is not above 0 and at most `MAX_FIELD_OF_VIEW`, or a side of the
+                image is not above 0.
+        """
+        if not 0 < degrees <= MAX_FIELD_OF_VIEW:
+            raise ValueError(
+                f"field of view is {degrees:g} degrees; it must be above 0 and at most "
+                f"{MAX_FIELD_OF_VIEW:g}"
+            )
+        width, height = size
+        if min(size) <= 0:
+            raise ValueError(f"image is {width} x {height}; both sides must be above 0 pixels")
+        focal = width / 2 / math.tan(math.radians(degrees) / 2)
+        return cls((focal, focal), (width / 2, height / 2))
 
     def rays(self, pixels: NDArray[np.floating]) -> Array:
         """Return the intersections (..., 2) of the pixels' rays with the plane z = 1.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.body.person_height import trunk_length
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
+from deep_nrsfm_ros.lifting.intrinsics import MAX_FIELD_OF_VIEW, Intrinsics
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,40 @@ class LiftingOptions:
                 f"{TRUNK[1]}: set reference_length"
             )
         return ""
+
+
+@dataclass(frozen=True)
+class FieldOfViewOptions:
+    """Field of view."""
+
+    field_of_view: float = option(
+        0.0,
+        "horizontal angle of view in degrees (of the width of the whole image, upright or not) of "
+        "a camera that is not calibrated: with the size of the image (image_width, image_height) "
+        "it takes the place of a CameraInfo, so that objects are lifted to their places in the "
+        "optical frame; 0 = unknown, 60 to 70 typical of webcams and of phones held sideways, 40 "
+        "to 50 of phones held upright, 90 wide; a diagonal of 78 in a data sheet is 70 here, at "
+        "16:9; if it is wrong, distances are off in proportion to the focal length, rotations "
+        "hardly",
+        low=0.0,
+        high=MAX_FIELD_OF_VIEW,
+        read_only=True,
+    )
+
+    def intrinsics(self, image_size: tuple[int, int] | None) -> Intrinsics | None:
+        """Return the camera of an image of that width and height in pixels; None: unknown.
+
+        Raises:
+            ValueError: the field of view is known, and the size of the image is not.
+        """
+        if not self.field_of_view:
+            return None
+        if image_size is None:
+            raise ValueError(
+                f"field_of_view is {self.field_of_view:g} and needs the size of the image: set "
+                "image_width and image_height"
+            )
+        return Intrinsics.from_field_of_view(self.field_of_view, image_size)
 
 
 @dataclass(frozen=True)

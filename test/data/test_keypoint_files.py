@@ -119,6 +119,31 @@ def test_every_kind_gives_the_same_people(kind: str, tmp_path: Path, seen: Detec
     assert found.layout == COCO17 and not found.warnings
 
 
+@pytest.mark.parametrize(
+    ("sizes", "expected"),
+    [
+        ([(640, 480), (640, 480)], (640, 480)),
+        ([(640, 480), (480, 640)], None),
+        ([(640, 480), None], None),
+        ([(640, 0), (640, 0)], None),
+        ([(640, 10**400)], None),
+        ([("640", 480.0)], None),
+        ([], None),
+    ],
+)
+def test_coco_says_the_size_of_all_its_images(
+    tmp_path: Path, seen: Detections, sizes: list[Any], expected: Any
+) -> None:
+    images = [
+        {"id": i, **(dict(zip(("width", "height"), size, strict=True)) if size else {})}
+        for i, size in enumerate(sizes)
+    ]
+    people = [{"image_id": 0, "keypoints": triples(seen)[0]}]
+    path = tmp_path / "people.json"
+    path.write_text(json.dumps({"images": images, "annotations": people}))
+    assert read_keypoints(path, OPTIONS).image_size == expected
+
+
 def test_coco_results_without_images(tmp_path: Path, seen: Detections) -> None:
     rows = triples(seen)
     results = [

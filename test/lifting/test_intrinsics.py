@@ -38,6 +38,23 @@ def test_pixels_lead_back_to_their_rays(lens: str, ray: tuple[float, float]) -> 
     np.testing.assert_allclose(camera(lens).rays(there), ray, atol=1e-7)
 
 
+def test_a_field_of_view_is_that_of_the_width_of_the_image() -> None:
+    for size in ((1280, 720), (720, 1280)):
+        rough = Intrinsics.from_field_of_view(90, size)
+        width, height = size
+        edges = rough.rays(np.array([(0, height / 2), (width, height / 2), (width / 2, height)]))
+        np.testing.assert_allclose(edges, [(-1, 0), (1, 0), (0, height / width)], atol=1e-12)
+    assert Intrinsics.from_field_of_view(69.4, (1920, 1080)).focal[0] == pytest.approx(1386.4, 1e-3)
+
+
+@pytest.mark.parametrize("degrees", [0, -60, 150.1, 180, float("nan")])
+def test_no_camera_has_such_a_field_of_view(degrees: float) -> None:
+    with pytest.raises(ValueError, match=r"field of view is .* must be above 0 and at most 150"):
+        Intrinsics.from_field_of_view(degrees, (640, 480))
+    with pytest.raises(ValueError, match="image is 640 x 0"):
+        Intrinsics.from_field_of_view(60, (640, 0))
+
+
 def explicit(lens: str, distortion: tuple[float, ...], x: float, y: float) -> tuple[float, float]:
     """Return the bent point by OpenCV's documentation, letter by letter."""
     r = np.hypot(x, y)

@@ -30,7 +30,13 @@ from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
 from deep_nrsfm_ros.lifting.observation import to_observation
-from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale, find_origin, looks_normalised
+from deep_nrsfm_ros.lifting.sanity import (
+    Finding,
+    Size,
+    confidence_scale,
+    find_origin,
+    looks_normalised,
+)
 
 NO_KEYPOINTS = "have no keypoints"
 _ROWS = 1024  # by which arrays grow at least
@@ -155,6 +161,11 @@ class DetectionsBuilder:
         self._preset: KeypointLayout | None = None
         self._categories: dict[Any, str] = {}
         self._has_scores = False
+        self._image_sizes: set[Size | None] = set()
+
+    def image_size(self, size: Size | None) -> None:
+        """Add width and height in pixels of an image; None: the input lists it without them."""
+        self._image_sizes.add(size)
 
     def frame(
         self,
@@ -339,6 +350,7 @@ class DetectionsBuilder:
             scores=scores,
             layout=layout,
             usual_layout=COCO17 if self.is_coco and points.shape[1] == len(COCO17) else None,
+            image_size=next(iter(self._image_sizes)) if len(self._image_sizes) == 1 else None,
             warnings=(*self.warnings, *self.reasons()),
             findings=tuple(self._findings.values()),
         )

@@ -45,6 +45,7 @@ _SCORES = ("keypoint_scores", "keypoints_scores", "keypoint_score", "scores", "c
 _IDENTITY = ("person_id", "track_id", "idx", "instance_id")
 _SCORE = ("score", "bbox_score", "confidence")
 _BESIDE = {*_FRAME, *_IDENTITY, *_SCORE, *TIMES}
+_MAX_SIDE = 1_000_000  # pixels of an image; a larger number is no size
 _FEWEST = 3  # keypoints of an object without a field that names them
 _CONFIDENCE = ("visibility", "score", "confidence", "presence", "likelihood")
 
@@ -326,6 +327,9 @@ class JsonReader:
             number if isinstance(number, int) else None,
             listed=True,
         )
+        width, height = image.get("width"), image.get("height")
+        known = all(isinstance(side, int) and 0 < side <= _MAX_SIDE for side in (width, height))
+        self._builder.image_size((width, height) if known else None)
 
     def _category(self, category: Any) -> None:
         """Read an entry of `categories`."""
