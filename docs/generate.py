@@ -23,7 +23,12 @@ from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.layout_file import FIELDS, HANDEDNESS
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
-from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
+from deep_nrsfm_ros.lifting.options import (
+    FieldOfViewOptions,
+    GravityOptions,
+    HistoryOptions,
+    LiftingOptions,
+)
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.field_mapping import NEGATIVE, NORMALISED, PIXELS, FieldMapping
 from deep_nrsfm_ros.messages.options import InputOptions
@@ -46,6 +51,7 @@ _GROUPS: tuple[tuple[str, type, str], ...] = (
     ("Model and input", InputOptions, ""),
     ("Lifting", LiftingOptions, ""),
     ("Camera", CameraOptions, ""),
+    ("Field of view", FieldOfViewOptions, ""),
     ("Fixed frame", TargetOptions, ""),
     ("Measured depth", DepthOptions, "depth."),
     ("Lifting over time", HistoryOptions, "history."),

@@ -31,7 +31,7 @@ from deep_nrsfm_ros.data.resolve_layout import check_names, resolve_layout
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter, check_min_visible
-from deep_nrsfm_ros.lifting.options import GravityOptions, LiftingOptions
+from deep_nrsfm_ros.lifting.options import FieldOfViewOptions, GravityOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL, Finding, Size, is_person
 from deep_nrsfm_ros.messages.mapping_file import read_mapping
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
@@ -46,7 +46,7 @@ class Camera(NamedTuple):
     """What the options say of the camera.
 
     Attributes:
-        intrinsics: of the camera; None: not given.
+        intrinsics: of the camera, or of its field of view; None: not given.
         image_size: width and height of the image in pixels; None: unknown.
     """
 
@@ -103,6 +103,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the keypoints are those of the rectified image, to which CameraInfo's P belongs",
     )
+    add_arguments(parser, FieldOfViewOptions)
     add_arguments(parser, ReadOptions)
     add_arguments(parser, InputOptions, without=_NODE_ONLY_OPTIONS)
     add_arguments(parser, LiftingOptions)
@@ -143,6 +144,11 @@ def check_options(args: argparse.Namespace, model: Model) -> None:
         )
     if args.rectified and not args.intrinsics:
         raise ValueError("--rectified has no effect without --intrinsics: it chooses P there")
+    if _field_of_view(args) and args.intrinsics:
+        raise ValueError(
+            "--field-of-view and --intrinsics contradict each other: leave --field-of-view out, "
+            "the file says more"
+        )
     check_min_visible("--min-visible", lifting.min_visible, model)
     if "noise" in args and lifting.correction == "none":
         raise ValueError("--noise has no effect with --correction none: leave one out")
@@ -155,8 +161,31 @@ def check_options(args: argparse.Namespace, model: Model) -> None:
         )
 
 
-def read_camera(args: argparse.Namespace) -> Camera:
-    """Return the camera; raise ValueError if its file cannot be read or contradicts the options."""
+def _field_of_view(args: argparse.Namespace) -> float:
+    """Return the field of view of the command line in degrees; 0: unknown."""
+    return override(FieldOfViewOptions(), args).field_of_view
+
+
+def read_camera(args: argparse.Namespace, detections: Detections) -> Camera:
+    """Return the camera of detections; raise ValueError if nothing says the size of its image."""
+    angle = _field_of_view(args)
+    if not angle:
+        return _camera_of_options(args)
+    size = _camera_of_options(args).image_size or detections.image_size
+    if size is None:
+        raise ValueError(
+            f"--field-of-view {angle:g} needs the size of the image, which {args.input} does not "
+            "say: give --image-width and --image-height"
+        )
+    return Camera(Intrinsics.from_field_of_view(angle, size), size)
+
+
+def _camera_of_options(args: argparse.Namespace) -> Camera:
+    """Return what the options and the camera file say, without the field of view.
+
+    Raises:
+        ValueError: the file cannot be read or contradicts the options.
+    """
     size = override(InputOptions(), args).image_size
     if not args.intrinsics:
         return Camera(None, size)
@@ -201,7 +230,7 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
         override(ReadOptions(), args),
         min_confidence=inputs.min_confidence,
         mapping=read_mapping(Path(args.mapping).expanduser()) if args.mapping else None,
-        image_size=read_camera(args).image_size,
+        image_size=_camera_of_options(args).image_size,
         layout=layout,
         fallback=None if is_person(model.layout) else model.layout,
     )
@@ -229,7 +258,7 @@ def lift_objects(
 ) -> Recording:
     """Return the recording of the objects, lifted with the options of the command line."""
     lifter = Lifter(model, override(LiftingOptions(), args))
-    intrinsics = read_camera(args).intrinsics
+    intrinsics = read_camera(args, detections).intrinsics
     over_time = OverTime(args.smooth, override(GravityOptions(), args).direction)
     with progress("lifting") as on_progress:
         return lift_recording(detections, source, lifter, on_progress, intrinsics, over_time)
@@ -246,7 +275,8 @@ def summary_of(
     Raises:
         ValueError: nothing in it is lifted.
     """
-    camera, min_visible = read_camera(args), override(LiftingOptions(), args).min_visible
+    camera = read_camera(args, recording.detections)
+    min_visible = override(LiftingOptions(), args).min_visible
     summary = summarise(recording, model, *camera, min_visible)
     summary = dataclasses.replace(summary, findings=(*findings, *summary.findings))
     if not summary.total:
@@ -257,6 +287,18 @@ def summary_of(
             f"none of {summary.total} objects is lifted: {summary.left_out_text}{found}"
         )
     return summary
+
+
+def camera_hint(args: argparse.Namespace, model: Model, detections: Detections) -> str:
+    """Return what the user can say of the camera of people; "" if they say it, or have none."""
+    camera = read_camera(args, detections)
+    if camera.intrinsics or not is_person(model.layout):
+        return ""
+    known = camera.image_size or detections.image_size
+    return (
+        "hint: say the camera's field of view, even roughly, and people are lifted more "
+        "accurately: --field-of-view 65 (webcams, phones held sideways)"
+    ) + ("" if known else " --image-width W --image-height H")
 
 
 def _no_object(path: Path, frames: int) -> str:
@@ -303,6 +345,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"{args.output}: {summary.figures_text}")
     if summary.left_out_text:
         print(f"left out: {summary.left_out_text}")
+    if not summary.findings and (hint := camera_hint(args, model, detections)):
+        note(hint)
     for finding in summary.findings:
         warn(str(finding))
     if summary.findings and not args.force:

@@ -31,7 +31,7 @@ from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
-from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.options import FieldOfViewOptions, LiftingOptions
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.reporting.player import (
@@ -107,6 +107,7 @@ def check_output_options(args: argparse.Namespace) -> None:
     if not live:
         return
     unused = [option for option in given_options(args, ReadOptions) if option != "--topic"]
+    unused += given_options(args, FieldOfViewOptions)
     unused += ["--objects"] * (args.objects != "all") + ["--rectified"] * args.rectified
     if unused:
         raise ValueError(f"{', '.join(unused)} has no effect here: it needs a recording")
@@ -132,7 +133,8 @@ def read_recording(
         for finding in summary_of(args, model, recording, findings).findings:
             warn(str(finding))
         return recording, f"lifted with model {model.name}"
-    if unused := given_options(args, LiftingOptions):
+    unused = given_options(args, FieldOfViewOptions) + given_options(args, LiftingOptions)
+    if unused:
         raise ValueError(
             f"{', '.join(unused)} has no effect on the lifted points of a bag, which are shown as "
             "recorded: add --lift-again, or leave it out"

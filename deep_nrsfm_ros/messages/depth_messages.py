@@ -116,8 +116,8 @@ def read_depth_image(message: Any, size: Size | None) -> DepthImage:
     height, width, step = int(message.height), int(message.width), int(message.step)
     if size is not None and (width, height) != tuple(size):
         raise MessageError(
-            f"depth image is {width} x {height} and camera_info says {size[0]} x {size[1]}: the "
-            "depth must be registered to the image of the keypoints (depth aligned to colour)"
+            f"depth image is {width} x {height} and the camera's image {size[0]} x {size[1]}: "
+            "the depth must be registered to the image of the keypoints (depth aligned to colour)"
         )
     form, unit = known
     form = (">" if message.is_bigendian else "<") + form

@@ -46,15 +46,15 @@ class InputOptions:
     )
     image_width: int = option(
         0,
-        "width of the image in pixels, by which normalised keypoints (0 to 1) are multiplied; 0 = "
-        "unknown, 640 typical",
+        "width of the image in pixels, by which normalised keypoints (0 to 1) are multiplied, and "
+        "which field_of_view needs; 0 = unknown, 640 typical",
         low=0,
         high=1000000,
     )
     image_height: int = option(
         0,
-        "height of the image in pixels, by which normalised keypoints (0 to 1) are multiplied; 0 = "
-        "unknown, 480 typical",
+        "height of the image in pixels, by which normalised keypoints (0 to 1) are multiplied, and "
+        "which field_of_view needs; 0 = unknown, 480 typical",
         low=0,
         high=1000000,
     )

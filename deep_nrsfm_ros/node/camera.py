@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscription to the CameraInfo of the camera that the keypoints come from."""
+"""The camera that the keypoints come from: its CameraInfo, or its field of view."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from sensor_msgs.msg import CameraInfo
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.observation import MessageError
+from deep_nrsfm_ros.lifting.options import FieldOfViewOptions
 from deep_nrsfm_ros.messages.camera_info import read_camera_info
 from deep_nrsfm_ros.messages.field_mapping import Size
 
@@ -23,6 +24,7 @@ _STREAM = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _TYPE = "sensor_msgs/msg/CameraInfo"
 _LOOK_PERIOD = 2.0  # seconds between two looks at the topics
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_UNKNOWN_VIEW = FieldOfViewOptions()
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,8 @@ class CameraOptions:
     camera_info: str = option(
         "",
         "topic of the camera's sensor_msgs/CameraInfo: objects are lifted to their positions in "
-        "the optical frame, and only once a CameraInfo has been received; empty = objects are "
-        "centred on their keypoints",
+        "the optical frame, and only once a CameraInfo has been received; empty = they are so by "
+        "field_of_view, or else centred on their keypoints",
         read_only=True,
     )
     rectified: bool = option(
@@ -51,61 +53,83 @@ class CameraOptions:
     tf_prefix: str = option(
         "",
         "prefix of the frames of objects on /tf; the name of a frame is the prefix and the "
-        "identity of the object (see ~/objects); needs camera_info; empty = no frames",
+        "identity of the object (see ~/objects); needs camera_info or field_of_view; empty = no "
+        "frames",
         read_only=True,
     )
     camera_height: float = option(
         0.0,
         "height in metres of the camera above the floor that people stand on: the lowest keypoint "
         "of each, averaged over seconds, says how large and how far away it is, whatever its "
-        "height; needs camera_info and the direction of gravity (gravity.* or target_frame), and "
-        "is wrong for people on steps or whose feet are hidden; 0 = unknown, 1.4 typical",
+        "height; needs camera_info or field_of_view and the direction of gravity (gravity.* or "
+        "target_frame), and is wrong for people on steps or whose feet are hidden; 0 = unknown, "
+        "1.4 typical",
         low=0.0,
         high=100.0,
         read_only=True,
     )
 
 
-class CameraInfoSubscription:
-    """Keeps the last CameraInfo.
+class Camera:
+    """Keeps the intrinsics of the last CameraInfo, or those of the field of view.
 
     Attributes:
-        enabled: whether the options name a topic.
-        intrinsics: of the camera; None before the first usable message, and if not enabled.
+        enabled: whether the options name a topic or a field of view.
+        intrinsics: of the camera; None before the first usable CameraInfo, and if not enabled.
         frame: frame_id of the camera, "" if unknown.
         size: width and height of the image in pixels, None if unknown.
     """
 
-    def __init__(self, node: Node, options: CameraOptions) -> None:
-        """Subscribe to the topic of the options.
+    def __init__(
+        self,
+        node: Node,
+        options: CameraOptions,
+        view: FieldOfViewOptions = _UNKNOWN_VIEW,
+        image_size: Size | None = None,
+    ) -> None:
+        """Subscribe to the topic of the options, if they name one.
+
+        Args:
+            node: subscribes.
+            options: name the topic.
+            view: field of view, where there is no topic.
+            image_size: width and height in pixels that the parameters give; see `set_image_size`.
 
         Raises:
-            ValueError: `tf_prefix` or `rectified` without `camera_info`.
+            ValueError: an option needs another one, or two contradict each other.
         """
+        if options.camera_info and view.field_of_view:
+            raise ValueError(
+                f"field_of_view is {view.field_of_view:g} and camera_info is "
+                f"{options.camera_info!r}, whose CameraInfo says it too: leave field_of_view out"
+            )
         if options.rectified and not options.camera_info:
             raise ValueError(
                 "rectified is true without camera_info: it chooses between the two cameras of a "
                 "CameraInfo; set camera_info to its topic, or leave rectified out"
             )
-        if options.tf_prefix and not options.camera_info:
+        self.enabled = bool(options.camera_info or view.field_of_view)
+        if options.tf_prefix and not self.enabled:
             raise ValueError(
-                f"tf_prefix is {options.tf_prefix!r} without camera_info: a frame needs a place; "
-                "set camera_info to the topic of the camera's CameraInfo, or leave tf_prefix empty"
+                f"tf_prefix is {options.tf_prefix!r} without camera_info or field_of_view: a frame "
+                "needs a place; set camera_info to the topic of the camera's CameraInfo, or leave "
+                "tf_prefix empty"
             )
-        if options.camera_height and not options.camera_info:
+        if options.camera_height and not self.enabled:
             raise ValueError(
-                f"camera_height is {options.camera_height:g} without camera_info: the floor gives "
-                "the size of objects that have a place; set camera_info, or leave it out"
+                f"camera_height is {options.camera_height:g} without camera_info or field_of_view: "
+                "the floor gives the size of objects that have a place; set one, or leave it out"
             )
-        self.enabled = bool(options.camera_info)
         self.intrinsics: Intrinsics | None = None
+        self._view = view
         self.frame = ""
         self.size: Size | None = None
         self._rectified = options.rectified
         self._topic = ""
         self._problem = ""
         self._node, self._silence, self._looked = node, "", -math.inf
-        if not self.enabled:
+        self.set_image_size(image_size)
+        if not options.camera_info:
             return
         for qos in (_STREAM, _LATCHED):
             subscription = node.create_subscription(
@@ -117,6 +141,15 @@ class CameraInfoSubscription:
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             )
             self._topic = subscription.topic_name
+
+    def set_image_size(self, size: Size | None) -> None:
+        """Set width and height in pixels, which the intrinsics of a field of view depend on.
+
+        Raises:
+            ValueError: there is a field of view, and no size.
+        """
+        if self._view.field_of_view:
+            self.intrinsics, self.size = self._view.intrinsics(size), size
 
     def require_intrinsics(self) -> Intrinsics | None:
         """Return the intrinsics, None if not enabled.
@@ -135,6 +168,9 @@ class CameraInfoSubscription:
             return "none: objects are centred"
         if self.intrinsics is None:
             return self._missing()
+        if angle := self._view.field_of_view:
+            focal = f"focal length {self.intrinsics.focal[0]:.1f} pixels"
+            return f"field of view {angle:g} degrees, {focal}"
         return f"{self.intrinsics.lens}, focal length {self.intrinsics.focal[0]:.1f} pixels"
 
     def _missing(self) -> str:
@@ -163,7 +199,7 @@ class CameraInfoSubscription:
         known = f"; CameraInfo is published on {', '.join(found)}: set camera_info" if found else ""
         return (
             f"has not been received: nobody publishes it{known or '; start the camera driver'}, or "
-            "leave camera_info empty to lift without places"
+            "leave camera_info empty to lift without places, or by a field_of_view"
         )
 
     def _receive(self, message: CameraInfo) -> None:

@@ -31,7 +31,7 @@ from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.depth_messages import read_depth_image, read_depth_points, read_range
 from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import Header, read_stamp
-from deep_nrsfm_ros.node.camera import CameraInfoSubscription
+from deep_nrsfm_ros.node.camera import Camera
 from deep_nrsfm_ros.node.message_types import decoder, message_class
 
 IMAGE, POINTS, RANGE = "image", "points", "range"
@@ -54,8 +54,8 @@ class DepthOptions:
         "",
         "topic of measured depth, seen by the keypoints' camera; it sets place and size of an "
         "object in metres, so that most confident keypoints have the measured depth; without depth "
-        "at a message, an object keeps the size that its identity has had; needs camera_info; "
-        "empty = no depth",
+        "at a message, an object keeps the size that its identity has had; needs camera_info or "
+        "field_of_view; empty = no depth",
         read_only=True,
     )
     type_: str = option(
@@ -110,7 +110,7 @@ class DepthSubscription:
             "" if neither.
     """
 
-    def __init__(self, node: Node, options: DepthOptions, camera: CameraInfoSubscription) -> None:
+    def __init__(self, node: Node, options: DepthOptions, camera: Camera) -> None:
         """Subscribe.
 
         Raises:
@@ -118,8 +118,9 @@ class DepthSubscription:
         """
         if not camera.enabled:
             raise ValueError(
-                f"depth.topic is {options.topic!r} without camera_info: depth is compared with "
-                "objects at their places; set camera_info to the topic of the CameraInfo"
+                f"depth.topic is {options.topic!r} without camera_info or field_of_view: depth is "
+                "compared with objects at their places; set camera_info to the topic of the "
+                "CameraInfo"
             )
         self._node, self._options, self._camera = node, options, camera
         kind = TYPES[options.type_]

@@ -4,9 +4,9 @@
 For every message on `keypoints` the node publishes, with the header of that message,
 
 - ~/points: n objects (rows) of p keypoints (columns): x right, y down, z forward, and confidence.
-  Positions in the camera's optical frame if its CameraInfo is known, else centred on the keypoints
-  of each object; the layout's reference pair has the length of the parameter reference_length;
-  NaN where an object is not lifted.
+  Positions in the camera's optical frame if its CameraInfo or its field of view is known, else
+  centred on the keypoints of each object; the layout's reference pair has the length of the
+  parameter reference_length; NaN where an object is not lifted.
 - ~/camera_rotation: from the axes of the first object to those of the camera, or of target_frame;
   not published if the first object is not lifted. The axes are x front, y left, z up if the layout
   has a handedness.
@@ -56,7 +56,12 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap, TooFewSharedError
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Observation
-from deep_nrsfm_ros.lifting.options import GravityOptions, HistoryOptions, LiftingOptions
+from deep_nrsfm_ros.lifting.options import (
+    FieldOfViewOptions,
+    GravityOptions,
+    HistoryOptions,
+    LiftingOptions,
+)
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.detections_3d import Lifted3D
@@ -78,7 +83,7 @@ from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.model_files.path_sandbox import PathSandbox
 from deep_nrsfm_ros.node import parameter_bridge, publishing
 from deep_nrsfm_ros.node.bodies import BodyOptions, BodyPublishers, Scene
-from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
+from deep_nrsfm_ros.node.camera import Camera, CameraOptions
 from deep_nrsfm_ros.node.depth import DepthOptions, DepthSubscription
 from deep_nrsfm_ros.node.detections_3d import DetectionsPublisher
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
@@ -158,6 +163,7 @@ class LifterNode(Node):
         inputs = parameter_bridge.declare(self, InputOptions)
         parameter_bridge.declare(self, LiftingOptions)
         self._camera_options = parameter_bridge.declare(self, CameraOptions)
+        self._view = parameter_bridge.declare(self, FieldOfViewOptions)
         self._target_options = parameter_bridge.declare(self, TargetOptions)
         parameter_bridge.declare(self, HistoryOptions, _HISTORY)
         parameter_bridge.declare(self, SmoothingOptions, _SMOOTHING)
@@ -233,7 +239,7 @@ class LifterNode(Node):
         self._unused: frozenset[str] = frozenset()
 
         self._frame_id, self._last_frame = camera.frame_id, ""
-        self._camera = CameraInfoSubscription(self, camera)
+        self._camera = Camera(self, camera, self._view, self._pipeline.image_size)
         self._gravity = GravityDirection(self, self._gravity_sources)
         depth = self._depth_options
         self._depth = DepthSubscription(self, depth, self._camera) if depth.topic else None
@@ -654,6 +660,8 @@ class LifterNode(Node):
     def _build_pipeline(self, changes: Sequence[Parameter]) -> Pipeline:
         """Return the pipeline for the parameters after `changes`; raise ValueError if invalid."""
         inputs = parameter_bridge.read(self, InputOptions, changes=changes)
+        if not self._camera_options.camera_info:
+            self._view.intrinsics(inputs.image_size)
         self._training_parameters(changes)
         parameter_bridge.read(self, GravityOptions, _GRAVITY, changes)
         # A file is read only when its parameter is set: it may have been deleted since.
@@ -733,6 +741,7 @@ class LifterNode(Node):
             self._auto, self._chosen = search, None
             self._stream.restart(search=search)
         self._pipeline = self._proposed
+        self._camera.set_image_size(self._pipeline.image_size)
         self._up = parameter_bridge.read(self, GravityOptions, _GRAVITY).direction
         for warning in self._unused_options(changes):
             self.get_logger().warning(warning)

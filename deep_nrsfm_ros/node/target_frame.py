@@ -30,7 +30,8 @@ class TargetOptions:
         "",
         "frame in which points, markers, objects and joints are given, such as map, odom or "
         "base_link, with z up, so that the direction against gravity is known too; needs "
-        "camera_info, and /tf (tf2_msgs) or camera_pose; empty = the camera's optical frame",
+        "camera_info or field_of_view, and /tf (tf2_msgs) or camera_pose; empty = the camera's "
+        "optical frame",
         read_only=True,
     )
     camera_pose: tuple[float, ...] = option(
@@ -72,8 +73,9 @@ class TargetFrame:
             return
         if not positioned:
             raise ValueError(
-                f"target_frame is {self.name!r} without camera_info: only an object with a place "
-                "has one in another frame; set camera_info to the topic of the CameraInfo"
+                f"target_frame is {self.name!r} without camera_info or field_of_view: only an "
+                "object with a place has one in another frame; set camera_info to the topic of the "
+                "CameraInfo"
             )
         if self._pose is None:
             try:

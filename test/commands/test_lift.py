@@ -161,6 +161,51 @@ def lift(folder: Path, layout: str, *options: str, **arrays: np.ndarray) -> int:
     return 0
 
 
+WIDE_AND_HIGH = ("--image-width", str(IMAGE[0]), "--image-height", str(IMAGE[1]))
+VIEW = ("--field-of-view", "65.24")  # 2 atan(640 / 1000), as of the camera file
+
+
+def test_a_field_of_view_is_as_good_as_a_camera_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lift(tmp_path, "coco17", "--intrinsics", str(tmp_path / "camera.yaml")) == 0
+    with np.load(tmp_path / "out.npz") as file:
+        expected = file["shapes"]
+    assert "hint" not in capsys.readouterr().err
+    assert lift(tmp_path, "coco17", *VIEW, *WIDE_AND_HIGH) == 0
+    with np.load(tmp_path / "out.npz") as file:
+        np.testing.assert_allclose(file["shapes"], expected, atol=1e-3)
+    assert "hint" not in capsys.readouterr().err
+    assert lift(tmp_path, "coco17", "--field-of-view", "0") == 0
+    assert "--field-of-view 65 (webcams, phones held sideways) --image-width W" in (
+        capsys.readouterr().err
+    )
+    assert lift(tmp_path, "coco17", *WIDE_AND_HIGH) == 0
+    assert capsys.readouterr().err.endswith("--field-of-view 65 (webcams, phones held sideways)\n")
+
+
+def test_a_coco_file_says_the_size_that_a_field_of_view_needs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lift(tmp_path, "coco17", *VIEW, *WIDE_AND_HIGH) == 0
+    with np.load(tmp_path / "out.npz") as file:
+        expected = file["shapes"]
+    points, confidence = in_layout(COCO17)
+    values = np.concatenate([points, confidence[..., None]], -1).reshape(len(points), -1).tolist()
+    size = dict(zip(("width", "height"), IMAGE, strict=True))
+    content = {
+        "images": [{"id": i, **size} for i in range(len(points))],
+        "annotations": [{"image_id": i, "keypoints": row} for i, row in enumerate(values)],
+    }
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    main([str(tmp_path / "coco.json"), *VIEW, "--output", str(tmp_path / "out.npz")])
+    with np.load(tmp_path / "out.npz") as file:
+        np.testing.assert_allclose(file["shapes"], expected, atol=1e-3)
+    capsys.readouterr()
+    main([str(tmp_path / "coco.json"), "--output", str(tmp_path / "out.npz")])
+    assert capsys.readouterr().err.endswith("--field-of-view 65 (webcams, phones held sideways)\n")
+
+
 @pytest.mark.parametrize("layout", ["coco17", "human17"])
 def test_the_layout_is_found(
     layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -262,6 +307,9 @@ SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
         ({}, ("--image-width", "640"), 2, "--image-height is 0: the size of the image needs both"),
         ({}, ("--min-visible", "40"), 2, "--min-visible is 40, but model 'human' has 25 keypoi"),
         ({}, ("--rectified",), 2, "--rectified has no effect without --intrinsics"),
+        ({}, VIEW, 2, "keypoints.npz does not say: give --image-width and --image-height"),
+        ({}, ("--field-of-view", "151"), 2, "field_of_view is 151.0; it must be at least 0 and at"),
+        ({}, (*VIEW, "--intrinsics", "a.yaml"), 2, "leave --field-of-view out"),
         ({}, ("--correction", "none", "--noise", "0.1"), 2, "--noise has no effect"),
         (
             {},

@@ -88,10 +88,15 @@ def test_answers_are_shown_as_they_were_recorded(
         (["keypoints"], "--html FILE, --serve, or both"),
         (["--html", "page.html"], "--html needs a BAG"),
         (["--serve", "--rate", "25"], "--rate has no effect here: it needs a recording"),
+        (["--serve", "--field-of-view", "65"], "--field-of-view has no effect here: it needs a"),
         (["--serve", "--objects", "largest"], "--objects has no effect here: it needs a rec"),
         (["nowhere", "--html", "page.html"], "nowhere does not exist"),
         (["keypoints", "--html", "no/page.html"], "no/page.html"),
         (["keypoints", "--html", "page.html", "--model", "cmu31"], "has 25 keypoints"),
+        (
+            ["answered", "--html", "page.html", "--field-of-view", "65"],
+            "--field-of-view has no effect on the lifted points of a bag",
+        ),
         (
             ["answered", "--html", "page.html", "--model", "cmu31", "--keypoint-layout", "human25"],
             "name the model that lifted",

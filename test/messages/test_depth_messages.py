@@ -104,7 +104,7 @@ def test_holes_and_the_outside_have_no_depth() -> None:
     ("message", "reason"),
     [
         (image(scene(), "16UC1", encoding="rgb8"), "encoding is 'rgb8'; expected 16UC1"),
-        (image(scene()[:, :20], "32FC1"), "20 x 30 and camera_info says 40 x 30"),
+        (image(scene()[:, :20], "32FC1"), "20 x 30 and the camera's image 40 x 30"),
         (image(scene(), "32FC1", data=b"123"), "do not fit into the 3 bytes"),
         (image(scene(), "32FC1", step=7), "do not fit"),
     ],

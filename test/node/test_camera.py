@@ -18,9 +18,11 @@ from std_msgs.msg import Header
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.options import FieldOfViewOptions
 from deep_nrsfm_ros.messages import serialised
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
 from deep_nrsfm_ros.node.body_messages import FrameMessages
+from deep_nrsfm_ros.node.camera import Camera, CameraOptions
 from deep_nrsfm_ros.node.transforms import object_frames
 from deep_nrsfm_ros.nrsfm.geometry import quaternion
 from test.fixtures.tf_messages import STORE, serialise_frames
@@ -93,6 +95,31 @@ def test_objects_are_at_their_place_once_camera_info_is_heard(
     assert client.exchange(publisher, keypoints("other")[0]).header.frame_id == "other"
 
 
+def test_a_field_of_view_gives_objects_their_place_without_camera_info(
+    start_lifter: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    size = {"image_width": 640, "image_height": 480}
+    start_lifter(field_of_view=65.0, frame_id="optical", **size)
+    client = connect()
+    publisher = client.publisher(PointCloud2)
+    message, pixels = keypoints()
+    focal = 320 / np.tan(np.radians(65) / 2)
+    status = f"field of view 65 degrees, focal length {focal:.1f} pixels"
+    client.wait_for_health(lambda _, v: v["camera"] == status)
+    answer = client.exchange(publisher, message)
+    assert answer.header.frame_id == "optical"
+    ray = Intrinsics((focal, focal), (320.0, 240.0)).rays(pixels).mean(1)[0]
+    x, y, z = place(answer)
+    assert z > 0.5 and (x / z, y / z) == pytest.approx(ray, abs=0.05)
+
+    assert "set image_width and image_height" in client.set_parameters(image_width=0)
+    assert "read-only" in client.set_parameters(field_of_view=90.0)
+    assert client.set_parameters(image_width=1280, image_height=960) == ""
+    client.wait_for_health(lambda _, v: v["camera"].endswith(f"{2 * focal:.1f} pixels"))
+    x, y, _ = place(client.exchange(publisher, message))
+    assert x < -0.1 and y < -0.1  # left of the middle and above it
+
+
 def test_a_camera_that_is_not_calibrated_is_reported(
     start_lifter: Callable[..., Any], connect: Callable[..., Any]
 ) -> None:
@@ -117,6 +144,11 @@ def test_a_camera_that_is_not_calibrated_is_reported(
     [
         ({"tf_prefix": "person_"}, "tf_prefix is 'person_' without camera_info"),
         ({"rectified": True}, "rectified is true without camera_info"),
+        ({"field_of_view": 65.0}, "field_of_view is 65 and needs the size of the image: set image"),
+        (
+            {"field_of_view": 65.0, "camera_info": "camera_info"},
+            "camera_info is 'camera_info', whose CameraInfo says it too: leave field_of_view out",
+        ),
         pytest.param(
             {"tf_prefix": "person_", "camera_info": "camera_info"},
             "tf2_msgs is missing; install it (apt install ros-jazzy-tf2-msgs)",
@@ -126,12 +158,23 @@ def test_a_camera_that_is_not_calibrated_is_reported(
         ),
     ],
 )
-def test_options_that_need_camera_info_are_refused_without_it(
+def test_options_that_need_others_or_contradict_them_are_refused(
     start_lifter: Callable[..., Any], parameters: dict[str, Any], reason: str
 ) -> None:
     lifter = start_lifter(listens=False, **parameters)
     assert lifter.process.wait(60) == 1
     assert reason in lifter.log and "Traceback" not in lifter.log
+
+
+def test_what_needs_a_place_is_content_with_a_field_of_view() -> None:
+    node: Any = None
+    options = CameraOptions(tf_prefix="person_", camera_height=1.4)
+    camera = Camera(node, options, FieldOfViewOptions(90.0), (640, 480))
+    assert camera.enabled and camera.size == (640, 480)
+    found = camera.require_intrinsics()
+    assert found and found.focal == pytest.approx((320, 320))
+    with pytest.raises(ValueError, match="tf_prefix is 'person_' without camera_info or field_of"):
+        Camera(node, options)
 
 
 def placed() -> Lifted:

@@ -22,7 +22,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.decoding import POINT_FIELDS, POINT_STEP, pack_points
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.unused_options import unused_depth
-from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
+from deep_nrsfm_ros.node.camera import Camera, CameraOptions
 from deep_nrsfm_ros.node.depth import DepthOptions, DepthSubscription
 from test.fixtures.standing_person import standing_person
 from test.node.conftest import Client, LifterProcess, lifters, own_domain, write_models
@@ -133,7 +133,7 @@ def test_the_nearest_depth_within_the_tolerance_is_used() -> None:
     ("message", "reason"),
     [
         (image(encoding="rgb8"), "encoding is 'rgb8'; expected 16UC1"),
-        (image(width=320), "depth image is 320 x 480 and camera_info says 640 x 480"),
+        (image(width=320), "depth image is 320 x 480 and the camera's image 640 x 480"),
         (image(data=array("B")), "do not fit into the 0 bytes"),
         (image(frame="depth_optical"), "is in frame 'depth_optical' and the keypoints are in 'opt"),
     ],
@@ -210,7 +210,7 @@ def test_a_cloud_and_a_range_give_the_place_too() -> None:
 
 def test_depth_without_a_camera_is_refused() -> None:
     node: Any = None
-    camera = CameraInfoSubscription(node, CameraOptions())
+    camera = Camera(node, CameraOptions())
     with pytest.raises(ValueError, match=r"depth.topic is '/depth' without camera_info"):
         DepthSubscription(node, DepthOptions("/depth"), camera)
 

@@ -19,6 +19,7 @@ from lifecycle_msgs.srv import (
     GetAvailableTransitions,
     GetState,
 )
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
 from deep_nrsfm_ros.messages.decoding import POINT_CLOUD
@@ -183,6 +184,26 @@ def test_the_model_is_released(domain: int, models: Path) -> None:
             assert entities == [*node.publishers, *node.services, *node.timers, *node.guards]
             assert not [*node.subscriptions]
         assert lifecycle.state == "finalized"
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def test_the_size_of_the_image_may_be_set_side_by_side_before_it_is_needed(
+    domain: int, models: Path
+) -> None:
+    words = ["managed:=true", "model:=person", f"models_dir:={models}", "field_of_view:=90"]
+    rclpy.init(args=["--ros-args", *(w for text in words for w in ("-p", text))])
+    try:
+        node = lifter.LifterNode()
+        lifecycle: Any = node._lifecycle
+        lifecycle.trigger_configure()
+        assert lifecycle.state == "unconfigured" and "set image_width and" in lifecycle.problem
+        for name, value in (("image_width", 640), ("image_height", 480)):
+            assert node.set_parameters([Parameter(name, value=value)])[0].successful
+        lifecycle.trigger_configure()
+        assert lifecycle.state == "inactive" and node._camera.size == (640, 480)
+        assert not node.set_parameters([Parameter("image_width", value=0)])[0].successful
         node.destroy_node()
     finally:
         rclpy.try_shutdown()

@@ -11,7 +11,7 @@ import pytest
 
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.serialised import Header
-from deep_nrsfm_ros.node.camera import CameraInfoSubscription, CameraOptions
+from deep_nrsfm_ros.node.camera import Camera, CameraOptions
 from deep_nrsfm_ros.node.target_frame import TargetFrame, TargetOptions
 from test.node.test_publishing import lifted
 
@@ -108,7 +108,7 @@ def test_what_cannot_be_is_refused(
 def test_a_height_without_a_camera_is_refused() -> None:
     options = CameraOptions(camera_height=1.4)
     with pytest.raises(ValueError, match="camera_height is 1.4 without camera_info"):
-        CameraInfoSubscription(NODE, options)
+        Camera(NODE, options)
 
 
 @pytest.mark.skipif(find_spec("tf2_msgs") is not None, reason="tf2_msgs is there")
