@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -122,7 +123,8 @@ LEGEND = {
     "in time": "smoothing before, own bones and steady depth: the default of node and lift; one "
     "person a stream, causal",
     "looking ahead": "lift --smooth both",
-    "intrinsics": "whether the lifter is given the camera's intrinsics",
+    "intrinsics": "whether the lifter is given the camera's intrinsics; a number: a camera without "
+    "distortion whose focal length is so many times the true one",
     MEDIAPIPE: "its own 3D (world landmarks) from the images, trained with 3D labels, smoothed",
     MEAN_SHAPE: "the mean of the motion capture that `human` was trained on, with the rotation and "
     "scale that fit the truth of each frame best",
@@ -134,17 +136,19 @@ _PICTURED = 10  # people of a picture
 
 
 class Choice(NamedTuple):
-    """Which people are lifted, by which keypoints.
+    """Which people are lifted, by which keypoints and cameras.
 
     Attributes:
         stride: every n-th trial or sequence only.
         scenes: names of the scenes; empty: all.
         without: names of `PARTS` that the detectors lack.
+        focal_errors: factors of the true focal length, for rows of cameras that are known roughly.
     """
 
     stride: int
     scenes: Sequence[str]
     without: Sequence[str]
+    focal_errors: Sequence[float] = ()
 
 
 class Errors(NamedTuple):
@@ -175,7 +179,7 @@ def benchmark(
         systems: name -> how the tracks are lifted.
         data: folder that holds cmu/ and scenes/.
         output: folder of results.
-        choice: of the scenes and their keypoints.
+        choice: of the scenes, their keypoints and cameras.
     """
     table = Table(
         "people",
@@ -188,16 +192,16 @@ def benchmark(
     mean = mean_person(data / "cmu")
     for scene, complete in people_scenes(data, output, choice.stride, choice.scenes):
         tracks = [without(track, choice.without) for track in complete]
-        for intrinsics in (True, False):
+        rough = {f"{x:g}": [rough_camera(t, x) for t in tracks] for x in choice.focal_errors}
+        for label, filmed in {"yes": tracks, **rough, "no": tracks}.items():
             for model, lifter in lifters.items():
                 for name, system in systems.items():
                     errors = [
-                        (t.view, lifting_errors(lifter, t, system, intrinsics=intrinsics))
-                        for t in tracks
+                        (t.view, lifting_errors(lifter, t, system, intrinsics=label != "no"))
+                        for t in filmed
                     ]
                     title = name if len(lifters) == 1 else f"{model}, {name}"
-                    labels = (scene, title, "yes" if intrinsics else "no")
-                    table.add(labels, figures(errors))
+                    table.add((scene, title, label), figures(errors))
         own = [(t, t.world_landmarks) for t in tracks if t.world_landmarks is not None]
         if own:
             errors = [(t.view, shape_errors(t, shapes, None)) for t, shapes in own]
@@ -220,6 +224,13 @@ def without(track: Track, parts: Sequence[str]) -> Track:
     layout = KeypointLayout(f"{track.layout.name}_part", tuple(names))
     points, confidence = track.points[:, at], track.confidence[:, at]
     return track._replace(layout=layout, points=points, confidence=confidence)
+
+
+def rough_camera(track: Track, factor: float) -> Track:
+    """Return a track whose camera has no distortion and `factor` times its focal length."""
+    fx, fy = track.intrinsics.focal
+    camera = track.intrinsics.without_lens()
+    return track._replace(intrinsics=replace(camera, focal=(factor * fx, factor * fy)))
 
 
 def lift_track(lifter: Lifter, track: Track, system: System, *, intrinsics: bool) -> Lifted:
@@ -487,6 +498,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="leave out the keypoints of these parts, as a detector that lacks them",
     )
     parser.add_argument(
+        "--focal-error",
+        nargs="+",
+        type=float,
+        default=[],
+        metavar="FACTOR",
+        help="add rows of a camera without distortion and with so many times the true focal length",
+    )
+    parser.add_argument(
         "--systems", nargs="+", default=list(SYSTEMS), choices=SYSTEMS, help="default: all"
     )
     add_arguments(parser, LiftingOptions)
@@ -497,7 +516,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         files = [find_model(name, model_folders(default_models_dir())) for name in args.models]
         lifters = {file.stem: Lifter(load_model(file), options) for file in files}
         systems = {name: SYSTEMS[name] for name in args.systems}
-        choice = Choice(args.stride, args.scenes, args.without)
+        choice = Choice(args.stride, args.scenes, args.without, args.focal_error)
         errors = benchmark(lifters, systems, args.data, args.output, choice)
         return [errors] if args.scenes else [errors, look_at(lifters, args.data, args.output)]
 

@@ -149,18 +149,24 @@ def test_the_program_prints_a_row_for_each_system(
 
     monkeypatch.setattr(people_scenes, "scenes", no_clip)
     chosen = ("frame by frame", "in time, gravity")
-    people.main(["--data", str(data), "--output", str(tmp_path / "out"), "--systems", *chosen])
+    out = tmp_path / "out"
+    words = ("--data", str(data), "--output", str(out), "--focal-error", "0.5", "--systems")
+    people.main([*words, *chosen])
     printed = capsys.readouterr().out
     assert "no rows of the pose2sim clip: no clip here" in printed
     rows = list(csv.DictReader((tmp_path / "out" / "people.csv").open()))
     systems = {(row["scene"], row["system"], row["intrinsics"]) for row in rows}
     names = ("shelf_dev", "CMU 03, 131", "CMU 03, 131, still")
-    known = ("yes", "no")
+    known = ("yes", "0.5", "no")
     assert systems == {
         *((scene, system, i) for scene in names for system in chosen for i in known),
         *((scene, "mean shape", "") for scene in names),
     }
     assert all(float(row["PA mm"]) > 0 for row in rows)
+    place = {(r["scene"], r["system"], r["intrinsics"]): r["place mm"] for r in rows}
+    for scene in names:  # half as far away, so half of 5 m off
+        true, rough = (float(place[scene, chosen[0], known]) for known in ("yes", "0.5"))
+        assert rough > true + 500
     seen = list(csv.DictReader((tmp_path / "out" / "people_without_truth.csv").open()))
     assert [row["scene"] for row in seen] == ["MPII, detector", "MPII, annotated"]
     assert (tmp_path / "out" / "people_MPII_detector.png").stat().st_size > 1000
