@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.data.dataset import Dataset
-from deep_nrsfm_ros.data.varied_images import ImageVariation, varied
+from deep_nrsfm_ros.data.varied_images import (
+    FARTHEST,
+    NEAREST,
+    ImageVariation,
+    in_perspective,
+    varied,
+)
 from deep_nrsfm_ros.data.virtual_people import FACE_KEYPOINTS, FEET_KEYPOINTS
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17, HUMAN25
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
 
 F = 4000
 
@@ -21,7 +28,7 @@ F = 4000
 def images() -> Dataset:
     """Return images of one person of random places."""
     rng = np.random.default_rng(0)
-    S = rng.standard_normal((F, len(HUMAN25), 3)).astype(np.float32)
+    S = centre(0.3 * rng.standard_normal((F, len(HUMAN25), 3))).astype(np.float32)
     visible = np.ones(S.shape[:2], bool)
     return Dataset(S[..., :2].copy(), visible, HUMAN25, "a test", S)
 
@@ -95,3 +102,36 @@ def test_a_layout_without_the_keypoints_is_refused(
     with pytest.raises(ValueError, match=complaint):
         variation.check(KeypointLayout.numbered(5))
     variation.check(HUMAN17)  # it has a nose and toes
+
+
+def test_a_lens_shows_near_parts_larger() -> None:
+    left_far, right_near = (-1, 0, 1), (1, 0, -1)
+    S = np.array([[left_far, right_near, (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]], float)
+    W = in_perspective(S[..., :2], S, np.array([4.0]))
+    expected = np.array([[-4 / 5, 0], [4 / 3, 0], [0, 1], [0, -1], [0, 0], [0, 0]])
+    np.testing.assert_allclose(W[0], expected - expected.mean(0), atol=1e-12)
+
+
+def test_the_camera_of_an_image_is_found() -> None:
+    rng = np.random.default_rng(1)
+    S = centre(rng.standard_normal((50, 9, 3)))
+    M = random_cameras(50, rng).astype(float)
+    depth = (S @ np.cross(M[..., 0], M[..., 1])[..., None])[..., 0]
+    expected = centre((S @ M) / (1 + depth / 5)[..., None])
+    np.testing.assert_allclose(in_perspective(S @ M, S, np.full(50, 5.0)), expected, atol=1e-9)
+
+
+def test_lenses_are_at_their_distances_in_a_share_of_the_images(images: Dataset) -> None:
+    after = varied(images, ImageVariation(perspective_images=0.25))
+    assert images.shapes is not None
+    changed = (after.points != images.points).any((1, 2))
+    assert changed.mean() == pytest.approx(0.25, abs=0.03)
+    near, far = (
+        in_perspective(images.points, images.shapes, np.full(F, metres))
+        for metres in (NEAREST, FARTHEST)
+    )
+    shifts = [np.linalg.norm(W - images.points, axis=(1, 2))[changed] for W in (far, near)]
+    shift = np.linalg.norm(after.points - images.points, axis=(1, 2))[changed]
+    assert (shift > 0.99 * shifts[0]).all()
+    assert (shift < 1.01 * shifts[1]).all()
+    assert after.visible.all()

@@ -28,7 +28,8 @@ def people(f: int = 60) -> Dataset:
     rng = np.random.default_rng(0)
     shapes = centre(rng.standard_normal((17, 3)) + 0.3 * rng.standard_normal((f, 17, 3)))
     points = np.repeat(shapes @ random_cameras(f, rng), 2, axis=0).astype(np.float32)
-    return Dataset(points, np.ones((2 * f, 17), bool), HUMAN17, "made up")
+    truth = np.repeat(shapes, 2, axis=0).astype(np.float32)
+    return Dataset(points, np.ones((2 * f, 17), bool), HUMAN17, "made up", truth)
 
 
 @pytest.mark.parametrize(
