@@ -92,6 +92,8 @@ def check_objects(
         fits = fit_layouts(*sample, model, [layout])
         better = better_layout(fits, layout, float(np.nanmedian(lifted.residual)))
         poor = [better] if better else poor
+    if poor and any(finding.code == "normalised" for finding in findings):
+        poor = [finding for finding in poor if finding.code == WRONG_LAYOUT]  # that is its cause
     return findings + (poor or pose(lifted.rotations, sample[1], layout))
 
 

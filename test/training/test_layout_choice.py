@@ -12,6 +12,7 @@ import pytest
 from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros.commands.train import parser
 from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
+from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN17, HUMAN25, LAYOUTS
@@ -86,6 +87,43 @@ def test_each_bag_and_file_is_taken_by_itself(
     assert "0.npz, 1.npz, 2.npz and 2 more: keypoint layout coco17: " in said
     assert "bag, bag: keypoint layout human17: " in said
     assert "other, b.npy, other: keypoint layout body25: " in said
+
+
+def test_files_of_one_form_share_a_layout(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    body, keypoints = len(COCO17), list[Path]()
+    for i, view in enumerate(read_clip().session.views):
+        data = np.concatenate([view.points, view.confidence[..., None]], -1)[:, :body]
+        keypoints.append(tmp_path / f"{i}.npy")
+        np.save(keypoints[-1], data)
+    read("--input", keypoints[1])  # alone it is taken for a layout that is nearly the same
+    assert "1.npy: keypoint layout posetrack18_17: " in capsys.readouterr().err
+    found = read("--input", tmp_path)
+    said = capsys.readouterr().err
+    assert "0.npy, 1.npy, 2.npy and 1 more: keypoint layout coco17: it fits" in said
+    assert found.detector_layout == "coco17" and "ambiguous" not in said
+
+
+def test_normalised_files_have_the_layout_of_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, confidence = in_layout(BODY25)
+    wide = points * np.array([1, 3]) / (3 * np.max(points))
+    for i in range(3):
+        np.savez(tmp_path / f"{i}.npz", points=wide * (1 - 0.1 * i), confidence=confidence)
+    read("--input", tmp_path)
+    said = capsys.readouterr().err
+    alone = "keypoint layout body25: a guess, since the keypoints are normalised; "
+    assert "0.npz, 1.npz, 2.npz: " + alone in said
+    assert "poor fit" not in said and "ambiguous" not in said
+    write(tmp_path / "pixels.npz", BODY25)
+    found = read("--input", tmp_path)
+    assert found.detector_layout == "body25"
+    (fault,) = found.faults
+    assert fault.startswith("0.npz, 1.npz, 2.npz: ") and "they are normalised" in fault
+    said = capsys.readouterr().err
+    assert "2.npz and 1 more: keypoint layout body25: it fits with residual 0.0" in said
 
 
 def test_the_layout_that_the_user_names_is_kept(
