@@ -222,9 +222,11 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
     lines = [result.message]
     if judgement := result.judgement:
         values["judgement"] = "doubtful" if judgement.doubtful else "better"
-        lines = [str(judgement), f"model {result.message}"]
+        # The lifter shows the last line where warnings may be out of sight.
+        said = str(judgement) if reporter.as_json else judgement.brief
+        lines = [said, f"model {result.message}"]
         if judgement.doubtful:
-            reporter.warnings.append(str(judgement))  # for the page; the last line says it as well
+            reporter.warnings.append(judgement.brief)  # for the page; the last line says it as well
     page = write_page(result, reporter)
     lines += [f"report {page}"] if page else []
     if not reporter.as_json and result.state == "finished":  # else the lifter says it

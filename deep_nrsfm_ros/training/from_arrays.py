@@ -34,7 +34,6 @@ from deep_nrsfm_ros.training.data_check import (
     check_objects,
     never_seen,
     sentences,
-    serious,
 )
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
@@ -152,10 +151,10 @@ def train(
     model = finish(trainer, name, layout, curated.dataset.source)
     if origin:
         model = inherit(model, origin)
-    judgement = judge(frames, model, rival, serious(findings))
-    on_message(str(judgement))
+    judgement = judge(frames, model, rival, findings)
+    on_message(judgement.brief)
     if judgement.doubtful:
-        warnings.warn(str(judgement), stacklevel=2)
+        warnings.warn(judgement.brief, stacklevel=2)
     date = time.strftime("%Y-%m-%d", time.gmtime())
     model.provenance.update(date=date, judgement=judgement.record())
     return model

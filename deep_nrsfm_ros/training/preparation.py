@@ -34,7 +34,6 @@ from deep_nrsfm_ros.training.data_check import (
     check_objects,
     is_copy,
     sentences,
-    serious,
 )
 from deep_nrsfm_ros.training.distributed import own_share
 from deep_nrsfm_ros.training.layout_choice import (
@@ -87,12 +86,12 @@ class ReadData(NamedTuple):
         dataset: in the layout of the model.
         detector_layout: value of the lifter's `keypoint_layout` for the detector that gave the
             keypoints; "" where that is the layout of the model, or unknown.
-        faults: a sentence for each thing that looks wrong in it, so that a model of it is doubtful.
+        findings: what looks wrong in it, source by source.
     """
 
     dataset: Dataset
     detector_layout: str
-    faults: tuple[str, ...] = ()
+    findings: tuple[SourceFinding, ...] = ()
 
 
 def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
@@ -133,7 +132,7 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
             "read (max_frames); name fewer files, or allow more"
         )
     detector = detector_layout(config, [part.layout for part in parts])
-    return ReadData(dataset, detector, tuple(serious(findings)))
+    return ReadData(dataset, detector, tuple(findings))
 
 
 def read_people(

@@ -773,8 +773,19 @@ def test_a_model_of_data_that_looks_wrong_is_doubtful(
     judgement = load_model(models / "mine.safetensors").provenance["judgement"]
     assert judgement["doubtful"] and judgement["faults"][0].startswith(fault)
     page = html.unescape((models / "mine.html").read_text())
-    assert judgement["reason"] in page and "<td>mine</td><td>doubtful</td>" in page
+    assert (
+        "its data looks wrong: a.npy: confidence up to" in page
+        and "<td>mine</td><td>doubtful</td>" in page
+    )
     assert in_process(*words, *few, FORCE) == 0
+    said = capsys.readouterr()
+    assert said.err.count(" divide it by 100") == 1 and "divide" not in said.out
+    verdict, figures, *_ = said.out.splitlines()
+    assert verdict.startswith(
+        "finished: the new model is doubtful: its data looks wrong: a.npy: con"
+    )
+    assert verdict.endswith(". Mend it as the warnings say, and train again") and len(verdict) < 170
+    assert figures.startswith("  judged beside model 'human' on the ") and "image error" in figures
     np.save(tmp_path / "a.npy", percent / [1, 1, 100])
     assert in_process(*words, *few) == 0
     assert "looks wrong" not in capsys.readouterr().err.split("curating")[-1]
