@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deep_nrsfm_ros.data.bags import TooManyFramesError, keypoint_count, read_bags
+from deep_nrsfm_ros.data.bags import TooManyFramesError, check_confidence, keypoint_count, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
 from deep_nrsfm_ros.data.detections import Detections
@@ -408,10 +408,12 @@ def _check_bag(
     found = check_objects(
         dataset.points, dataset.visible, target, target, size, may_be_another=False
     )
+    found += check_confidence(path, len(layout), options)
     if is_chosen or not any(finding.code == "poor-fit" for finding in found):
         return found
     sample = sample_bag(path, dataclasses.replace(options, layout=layout))
-    return check_objects(sample.points, sample.confidence, layout, target, size)
+    scale = [finding for finding in found if finding.code == "confidence-scale"]
+    return scale + check_objects(sample.points, sample.confidence, layout, target, size)
 
 
 def _wrong_layout(path: Path, findings: list[Finding]) -> ValueError | None:

@@ -202,6 +202,15 @@ def test_a_bag_of_normalised_keypoints_becomes_pixels(tmp_path: Path) -> None:
     np.testing.assert_allclose(sized.dataset.points, points, rtol=1e-4, atol=0.01)
 
 
+@pytest.mark.parametrize("option", ["--bag", "--input"])
+def test_confidences_of_another_scale_in_a_bag_are_said(option: str, tmp_path: Path) -> None:
+    points, confidence = in_layout(COCO17)
+    write_bag(tmp_path / "percent", "/keypoints", frames(points, 100 * confidence))
+    write_bag(tmp_path / "right", "/keypoints", frames(points, confidence))
+    (fault,) = faults(read(option, tmp_path / "percent", option, tmp_path / "right"))
+    assert fault.startswith("percent: confidence up to ") and fault.endswith("divide it by 100")
+
+
 def test_a_file_that_is_read_twice_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
