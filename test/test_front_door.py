@@ -260,7 +260,7 @@ def test_arrays_are_mapped_to_the_object_and_hands_to_right_ones() -> None:
 
     hands = virtual_hands(60).points
     both_sides = "look like those of the other side"
-    with pytest.warns(UserWarning, match=f"{both_sides}.* by the argument hands: 'palms' .each"):
+    with pytest.warns(UserWarning, match=f"{both_sides}.* what they are .hands.: palms .each"):
         train(hands, layout="hand21", recipe=recipe)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=f".*{both_sides}")

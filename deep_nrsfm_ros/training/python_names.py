@@ -8,12 +8,8 @@ import re
 _TERMS = (
     (r", or name the value \(--missing-value=[^)]*\)", ""),
     (r"give the size of the image \(image_width and image_height\), or multiply", "multiply"),
-    (
-        r"Say what they are: --hands palms (\([^)]*\)), right or left; in Python by the argument "
-        "hands",
-        r"Say what they are by the argument hands: 'palms' \1, 'right' or 'left'",
-    ),
-    (r"name --object (\w+)", r"give object='\1'"),
+    (r"\(--hands, train.hands\)", "(hands)"),
+    (r"\(--object, train.object\)", "(object)"),
     (r"\(parameter keypoint_layout, option --keypoint-layout\)", "(layout)"),
     (r"lower --min-confidence", "the confidence"),
     (r"--min-confidence", "the confidence"),
