@@ -163,12 +163,14 @@ def test_people_read_verdict_file_and_how_to_use_it_in_short_lines(
     said = capsys.readouterr()
     shared_out = next(line for line in said.err.splitlines() if "are trained on;" in line)
     assert "later ones are held out to judge the model" in shared_out
-    verdict, figures, file, report, use = said.out.strip().splitlines()
+    verdict, figures, file, report, use, truth = said.out.strip().splitlines()
     assert verdict.startswith("finished: the new model is doubtful: ") and len(verdict) < 700
     assert figures.startswith("  judged beside model 'human' on ") and len(figures) < 400
     assert file == f"  model {models / 'mine.safetensors'}" and report.startswith("  report ")
     assert "not in use, but you can look at what it lifts: lift FILE --model" in use
     assert "ros2 param set /lifter model" in use
+    path = models / "mine.safetensors"
+    assert truth == f"  see how many mm it is off on the demo's person: demo --model {path}"
     assert "{" not in said.out and "the new model is doubtful" not in said.err
 
 
