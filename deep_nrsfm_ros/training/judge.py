@@ -324,9 +324,14 @@ def _side_in_words(layout: KeypointLayout, figures: Figures) -> str:
         return ", and may be mirrored as a whole"
     if layout.warning:
         return ", and its handedness contradicts the names of its keypoints"
-    if _is_side_known(figures):
-        return ": nothing shows that it mirrors frames"
-    return ", and nothing tells whether it mirrors frames"
+    if not _is_side_known(figures):
+        return ", and nothing tells whether it mirrors frames"
+    if math.isnan(figures.mirrored_share):
+        return (
+            ", and only the front that its layout names tells of mirrored frames, which is weak "
+            "evidence: too few frames show nearly the same shape from other sides"
+        )
+    return ": nothing shows that it mirrors frames"
 
 
 def _is_side_known(figures: Figures) -> bool:

@@ -108,6 +108,22 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
         assert not judgement.record()["doubtful"]
 
 
+def test_a_front_alone_is_weak_evidence(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deep_nrsfm_ros.training import judge as module
+
+    monkeypatch.setattr(module, "MIN_TESTED", 1.1)  # no frame has enough neighbours
+    alone = judge(frames, good, None)
+    assert not alone.doubtful and math.isnan(alone.figures.mirrored_share)
+    headline = (
+        "the new model has no other to compare with, and only the front that its layout names "
+        "tells of mirrored frames, which is weak evidence: "
+    )
+    assert str(alone).startswith(headline)
+    assert "weak evidence: too few" not in str(judge(frames, good, good))
+
+
 def test_mirrored_frames_are_seen_without_another_model(
     frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
