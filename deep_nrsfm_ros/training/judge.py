@@ -177,6 +177,7 @@ class Judgement(NamedTuple):
             figures on such data do not show it.
         shown: a sentence with a few figures of both; reason or summary ends with it.
         brief_reason: the reason, without the remedies of faults in the data; "": there are none.
+        repeated: the end of the summary that is the layout's warning.
     """
 
     reason: str
@@ -188,6 +189,7 @@ class Judgement(NamedTuple):
     faults: tuple[str, ...] = ()
     shown: str = ""
     brief_reason: str = ""
+    repeated: str = ""
 
     @property
     def doubtful(self) -> bool:
@@ -200,8 +202,10 @@ class Judgement(NamedTuple):
 
     @property
     def brief(self) -> str:
-        """Return the judgement as a sentence, for those who have read warnings of the faults."""
-        return str(self._replace(reason=self.brief_reason or self.reason))
+        """Return the judgement as a sentence, for those who have read the warnings."""
+        if self.doubtful:
+            return str(self._replace(reason=self.brief_reason or self.reason))
+        return self.summary.removesuffix(self.repeated)
 
     def record(self) -> dict[str, Any]:
         """Return the judgement for the provenance of the new model."""
@@ -263,12 +267,13 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         return Judgement(f"{error}; {_advice(model, '')} would help", "", unknown)
     name = rival.name if rival is not None and old else ""
     verdict = _verdict(new, old)
-    figures = f"{_on(frames)}: {_shown(new, old, name)}"
+    figures, repeated = f"{_on(frames)}: {_shown(new, old, name)}", ""
     figures += _guessed(model)
     if old is None and not model.layout.handedness:
         figures += f". These figures say nothing of depth: {MIRRORED_AS_A_WHOLE.format(model.name)}"
     elif old is None and model.layout.warning:
-        figures += f". But {model.layout.warning}"
+        repeated = f". But {model.layout.warning}"
+        figures += repeated
     beside = f" beside model {name!r}" if name else ""
     reason, shown = "", f"Judged{beside} {figures}"
     if worse := worse_figures(new, old):
@@ -284,7 +289,7 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         in_sentence = f"has no other to compare with{_side_in_words(model.layout, new)}"
     summary = f"the new model {in_sentence}"
     summary += f". Judged {figures}"
-    return Judgement(reason, summary, new, name, old, verdict, shown=shown)
+    return Judgement(reason, summary, new, name, old, verdict, shown=shown, repeated=repeated)
 
 
 _IN_SENTENCES = {

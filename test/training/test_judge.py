@@ -363,8 +363,10 @@ def test_a_handedness_against_the_names_is_said_again_at_the_end(
     )
     parts = [dataclasses.replace(part, layout=layout) for part in frames]
     model = dataclasses.replace(good, layout=layout)
-    text = str(judge(Split(*parts), model, None))
+    judgement = judge(Split(*parts), model, None)
+    text = str(judgement)
     assert "its handedness has left: right_wing and right: left_wing" in text
+    assert "left: right_wing" not in judgement.brief and "its handedness con" in judgement.brief
 
 
 def test_frames_of_few_keypoints_do_not_tell_a_side(
