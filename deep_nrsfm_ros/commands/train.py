@@ -22,8 +22,10 @@ from deep_nrsfm_ros.configuration import add_arguments
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.hands import SIDES
 from deep_nrsfm_ros.data.keypoint_files import KINDS
+from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.varied_images import ImageVariation
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.nrsfm.network import Architecture
@@ -222,28 +224,33 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
     lines = [result.message]
     if judgement := result.judgement:
         values["judgement"] = "doubtful" if judgement.doubtful else "better"
-        lines = [str(judgement), f"model {result.message}"]
+        # The lifter shows the last line where warnings may be out of sight.
+        said = str(judgement) if reporter.as_json else judgement.brief
+        lines = [said, f"model {result.message}"]
         if judgement.doubtful:
-            reporter.warnings.append(str(judgement))  # for the page; the last line says it as well
+            reporter.warnings.append(judgement.brief)  # for the page; the last line says it as well
     page = write_page(result, reporter)
     lines += [f"report {page}"] if page else []
     if not reporter.as_json and result.state == "finished":  # else the lifter says it
         is_doubtful = judgement is not None and judgement.doubtful
-        lines.append(_how_to_use(result.path, is_doubtful=is_doubtful))
+        lines += _next_steps(result.model.layout, result.path, is_doubtful=is_doubtful)
     message = ("; " if reporter.as_json else "\n  ").join(lines)
     if not reporter.as_json:
         message = message.replace(". Judged ", "\n  judged ")
     reporter.end(result.state, message, model=str(result.path), report=page, **values)
 
 
-def _how_to_use(path: Path, *, is_doubtful: bool) -> str:
-    """Return how a model is put in use."""
+def _next_steps(layout: KeypointLayout, path: Path, *, is_doubtful: bool) -> list[str]:
+    """Return how a model is put in use, and how it is measured if it lifts people."""
     known = path.parent.resolve() == default_models_dir().resolve()
     name = path.stem if known else str(path)
     use = "not in use, but you can look at what it lifts" if is_doubtful else "use it"
-    return (
+    lines = [
         f"{use}: lift FILE --model {name}, or in a lifter: ros2 param set /lifter model {path.stem}"
-    )
+    ]
+    if set(JOINTS) <= set(layout.keypoints):
+        lines.append(f"see how many mm it is off on the demo's person: demo --model {name}")
+    return lines
 
 
 def write_page(result: TrainingResult, reporter: Reporter) -> str:

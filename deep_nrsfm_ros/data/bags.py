@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from deep_nrsfm_ros.lifting.observation import (
     left_out_sentences,
     without_value,
 )
+from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale
 from deep_nrsfm_ros.messages.decoding import (
     MULTI_ARRAY,
     POINT_CLOUD,
@@ -37,6 +39,7 @@ from deep_nrsfm_ros.messages.decoding import (
     count_keypoints,
     may_omit_keypoints,
     pack_points,
+    read_confidence,
     read_observation,
 )
 from deep_nrsfm_ros.messages.serialised import MessageReader
@@ -46,7 +49,8 @@ STORAGES = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
 NO_SCORES = "gives no object a score (a field mapping can name it): leave out min_score"
 """Why `min_score` cannot act on a bag."""
 
-_SAMPLE = 256  # messages with objects of a topic that `keypoint_count` looks at
+_SAMPLE = 256  # messages with objects of a topic, or objects, that are looked at
+_STEP = 4  # messages next to each other are alike
 
 
 class TooManyFramesError(BagError):
@@ -221,6 +225,37 @@ def keypoint_count(paths: Sequence[Path], options: ReadOptions = DEFAULT_READ_OP
             f"no message in {names} tells how many keypoints there are; {reason or nobody}"
         )
     return max(counts) if may_omit else counts.most_common(1)[0][0]
+
+
+def check_confidence(
+    path: Path, keypoints: int, options: ReadOptions = DEFAULT_READ_OPTIONS
+) -> list[Finding]:
+    """Return whether the confidences in a bag are on another scale than 0 to 1.
+
+    `read_bags` cuts them off at 1. Some hundred objects at the beginning of the bag are looked at.
+
+    Args:
+        path: bag folder, or a single .db3 or .mcap file.
+        keypoints: of an object.
+        options: topic and mapping.
+
+    Raises:
+        BagError: the bag cannot be read, or has no such topic.
+    """
+    given, count = list[NDArray[np.floating]]([np.empty(0)]), 0
+    with closing(open_bag(path)) as bag:
+        for topic, input_type, decode in keypoint_topics(
+            bag, options.topic, options.mapping, keypoints
+        ):
+            for raw in islice(bag.sample(topic), None, None, _STEP):
+                with suppress(Exception):  # damaged bytes fail in many ways; read the others
+                    size = options.image_size or (1, 1)
+                    found = read_confidence(decode(raw), input_type, keypoints, size)
+                    given.append(found.ravel())
+                    count += len(found)
+                if count >= _SAMPLE:
+                    break
+    return confidence_scale(np.concatenate(given))
 
 
 def _reason(error: Exception) -> str:

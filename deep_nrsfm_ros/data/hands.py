@@ -89,7 +89,7 @@ def as_right_hands(hands: Dataset, side: str) -> Dataset:
     if lacking := [name for name in _PALM if name not in layout.keypoints]:
         raise ValueError(
             f"hands are {side!r}, but the object {layout.name!r} has no {', '.join(lacking)}: "
-            "leave the option out, or name --object hand21"
+            "leave this out, or name the object hand21 (--object, train.object)"
         )
     if side == "palms":
         left = _look_left(hands.points, layout)
@@ -128,8 +128,8 @@ def mixed_sides(hands: Dataset, least: float = _SOME) -> str:
     return (
         f"{100 * share:.0f} % of the hands look like those of the other side: if left and right "
         "hands are mixed, the model learns a mirrored depth, and no figure shows it. Say what they "
-        "are: --hands palms (each shows its palm: left ones are mirrored), right or left; in "
-        "Python by the argument hands"
+        "are (--hands, train.hands): palms (each shows its palm: left ones are mirrored), right or "
+        "left"
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from deep_nrsfm_ros.batched import Progress, evenly_spaced, no_progress
 from deep_nrsfm_ros.data.bag_files import SUFFIXES, Topic, open_bag
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
-from deep_nrsfm_ros.data.bags import NO_SCORES, keypoint_count
+from deep_nrsfm_ros.data.bags import NO_SCORES, check_confidence, keypoint_count
 from deep_nrsfm_ros.data.detections import Detections, gather
 from deep_nrsfm_ros.data.formats.arrays import read_npy, read_npz
 from deep_nrsfm_ros.data.formats.builder import (
@@ -460,7 +460,8 @@ def read_bag(
     ordered = [observations[i] for i in order]
     detections = gather(ordered, on_one_clock[order], keypoints, camera)
     warnings += clock_warnings
-    return dataclasses.replace(detections, layout=layout, warnings=tuple(warnings))
+    found = tuple(check_confidence(path, keypoints, options))
+    return dataclasses.replace(detections, layout=layout, warnings=tuple(warnings), findings=found)
 
 
 def with_topic(path: Path, options: ReadOptions, keypoints: int) -> ReadOptions:

@@ -61,7 +61,7 @@ def fit_layouts(
         be lifted. Layouts that fit equally well are in the order of `layouts`,
         the model's own, the presets.
     """
-    chosen = _sample(confidence)
+    chosen = sample_objects(confidence)
     points, confidence = points[chosen], confidence[chosen]
     if sentinel := find_sentinel(points, confidence > 0):
         confidence = np.where((points == sentinel[0]).all(-1), np.float32(0), confidence)
@@ -114,7 +114,7 @@ def choose_layout(fits: list[LayoutFit], preferred: KeypointLayout) -> LayoutFit
         return None
     best = fits[0]
     current = next((fit for fit in fits if fit.layout.keypoints == preferred.keypoints), None)
-    return best if current is None or _is_clearly_better(best, current.residual) else current
+    return best if current is None or is_clearly_better(best, current.residual) else current
 
 
 def ambiguity(
@@ -187,7 +187,7 @@ def better_layout(
     if not fits:
         return None
     best = fits[0]
-    if best.layout.keypoints == current.keypoints or not _is_clearly_better(best, residual):
+    if best.layout.keypoints == current.keypoints or not is_clearly_better(best, residual):
         return None
     return Finding(
         "layout",
@@ -196,13 +196,17 @@ def better_layout(
     )
 
 
-def _is_clearly_better(fit: LayoutFit, residual: float) -> bool:
+def is_clearly_better(fit: LayoutFit, residual: float) -> bool:
     """Return whether a fit is sound and clearly better than another residual."""
     return fit.residual < POOR_RESIDUAL and fit.residual < _CLEAR_RATIO * residual
 
 
-def _sample(confidence: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the indices of at most `MAX_OBJECTS` objects, evenly spaced, with many keypoints."""
+def sample_objects(confidence: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the indices of at most `MAX_OBJECTS` objects, evenly spaced, with many keypoints.
+
+    Args:
+        confidence: (n, q); 0 where missing.
+    """
     visible = (confidence > 0).sum(1)
     full = np.flatnonzero(visible >= np.median(visible)) if len(visible) else np.arange(0)
     if len(full) <= MAX_OBJECTS:

@@ -144,10 +144,24 @@ class Lifter:
             The n objects; n is 1 for points (q, 2).
 
         Raises:
-            ValueError: the arrays do not fit each other or the layout.
+            ValueError: the arrays do not fit each other or the layout, or no object of the layout
+                can have as many keypoints as the option `min_visible` asks for.
         """
+        self._check_layout()
         seen = from_arrays(points, confidence, self.layout)
         return lift_all(self.lift, *self._to_model(seen.points, seen.confidence))
+
+    def _check_layout(self) -> None:
+        """Raise ValueError if the layout has fewer keypoints of the model than `min_visible`."""
+        least, to_model = self.options.min_visible, self._to_model
+        shown = np.isin(self.model.layout.keypoints, to_model.filled)
+        most = int(to_model.detected_count(shown[None])[0])
+        if least > max(most, LiftingOptions.min_visible):
+            raise ValueError(
+                f"min_visible is {least}, but layout {self.layout.name!r} has {most} keypoints of "
+                f"model {self.model.name!r}, without those that follow from others: nothing would "
+                f"be lifted; set it to at most {most}, 4 is typical"
+            )
 
     def detected_count(self, confidence: Float32) -> NDArray[np.int64]:
         """Return the number (n,) of keypoints that count for the option `min_visible`.

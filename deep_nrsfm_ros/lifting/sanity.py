@@ -7,6 +7,7 @@ remedy. It is no error: the values are used as they are.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -82,6 +83,11 @@ class Finding:
     def __str__(self) -> str:
         """Return the message."""
         return self.message
+
+    @property
+    def symptom(self) -> str:
+        """Return the message up to its first colon or semicolon: what looks wrong, no remedy."""
+        return re.split("[:;] ", self.message, maxsplit=1)[0]
 
 
 def check(

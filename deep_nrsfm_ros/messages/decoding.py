@@ -108,6 +108,29 @@ def read_observation(
     raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
 
 
+def read_confidence(
+    message: Any, input_type: InputType, keypoints: int, size: Size | None = None
+) -> NDArray[np.floating]:
+    """Return the confidence (n, q) of the keypoints in a message as the detector gives it.
+
+    Args:
+        message: as in `read_observation`.
+        input_type: as in `read_observation`.
+        keypoints: as in `read_observation`.
+        size: as in `read_observation`.
+
+    Raises:
+        Exception: the message is malformed, or `input_type` is unknown.
+    """
+    mapping = _mapping(input_type)
+    values = (
+        mapping(message, keypoints, size).values
+        if mapping
+        else _READERS[str(input_type)](message, keypoints)
+    )
+    return values[..., 2] if values.shape[-1] == 3 else np.ones(values.shape[:2])
+
+
 def count_keypoints(message: Any, input_type: InputType) -> int:
     """Return the number of keypoints of each object in a message, 0 if there is no object.
 

@@ -26,7 +26,7 @@ WRONG_LAYOUT = "layout"
 """Code of the finding that another layout fits clearly better: no model can come of such data."""
 SERIOUS = {
     *("poor-fit", "orientation", "handedness", "normalised", "sentinel", "origin"),
-    *("confidence-scale", "misspelt", "one-side", "incomplete"),
+    *("confidence-scale", "misspelt", "one-side", "incomplete", "mixed-hands"),
 }
 """Codes of the findings that make a model doubtful: it learns what is wrong in its data."""
 
@@ -92,18 +92,24 @@ def check_objects(
         fits = fit_layouts(*sample, model, [layout])
         better = better_layout(fits, layout, float(np.nanmedian(lifted.residual)))
         poor = [better] if better else poor
+    if poor and any(finding.code == "normalised" for finding in findings):
+        poor = [finding for finding in poor if finding.code == WRONG_LAYOUT]  # that is its cause
     return findings + (poor or pose(lifted.rotations, sample[1], layout))
 
 
-def serious(findings: Iterable[SourceFinding]) -> list[str]:
-    """Return a sentence for each kind of finding that makes a model doubtful."""
-    return sentences(each for each in findings if each.finding.code in SERIOUS)
+def serious(findings: Iterable[SourceFinding]) -> list[SourceFinding]:
+    """Return the findings that make a model doubtful."""
+    return [each for each in findings if each.finding.code in SERIOUS]
 
 
-def sentences(findings: Iterable[SourceFinding]) -> list[str]:
+def sentences(findings: Iterable[SourceFinding], *, is_brief: bool = False) -> list[str]:
     """Return a sentence for each kind of finding, with the sources in which it was found.
 
     Of findings that differ in their numbers alone, the numbers of the first one are told.
+
+    Args:
+        findings: of any sources.
+        is_brief: leave the remedies out.
     """
     kinds: dict[str, list[SourceFinding]] = {}
     for each in findings:
@@ -111,7 +117,8 @@ def sentences(findings: Iterable[SourceFinding]) -> list[str]:
     said = []
     for kind in kinds.values():
         sources = in_words(dict.fromkeys(each.source for each in kind if each.source))
-        said.append(f"{sources}: {kind[0].finding}" if sources else str(kind[0].finding))
+        text = kind[0].finding.symptom if is_brief else str(kind[0].finding)
+        said.append(f"{sources}: {text}" if sources else text)
     return said
 
 

@@ -6,7 +6,8 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,10 +35,10 @@ from deep_nrsfm_ros.training.data_check import (
     check_objects,
     never_seen,
     sentences,
-    serious,
 )
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
+from deep_nrsfm_ros.training.python_names import in_python
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.progress import Progress
@@ -115,29 +116,30 @@ def train(
     check_name("name", name)
     check_side("hands", hands)
     layout = layout_of("layout", layout, name)
-    seen = from_arrays(points, confidence, layout)
-    starts = np.array(sequence_starts, np.int64)
-    visible = seen.confidence > 0
-    data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
-    findings = _findings(points, confidence, seen, data)
-    if object is not None:
-        layout = layout_of("object", object, name)
-        mapped, weight = KeypointMap(data.layout, layout)(seen.points, seen.confidence)
-        data = Dataset(mapped, weight > 0, layout, "arrays", sequence_starts=starts)
-    if hands:
-        data = as_right_hands(data, hands)
-    curated = curate(data)
-    origin = _origin(start, layout)
-    sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
-    if sufficiency.refusal:
-        raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
+    with _python_names():
+        seen = from_arrays(points, confidence, layout)
+        starts = np.array(sequence_starts, np.int64)
+        visible = seen.confidence > 0
+        data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
+        findings = _findings(points, confidence, seen, data)
+        if object is not None:
+            layout = layout_of("object", object, name)
+            mapped, weight = KeypointMap(data.layout, layout)(seen.points, seen.confidence)
+            data = Dataset(mapped, weight > 0, layout, "arrays", sequence_starts=starts)
+        if hands:
+            data = as_right_hands(data, hands)
+        curated = curate(data)
+        origin = _origin(start, layout)
+        sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
+        if sufficiency.refusal:
+            raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
     # A start passes its handedness on to a layout without one.
     missing = layout.warning if layout.handedness or not origin else ""
     unseen = never_seen(curated.dataset, origin)
     found = sentences(findings)
     for warning in (missing, unseen, *found, *curated.warnings, *sufficiency.warnings):
         if warning:
-            warnings.warn(warning, stacklevel=2)
+            warnings.warn(in_python(warning), stacklevel=2)
     rival = origin or _shipped(layout)
     frames = split(curated.dataset, Curation().held_out if rival else 0.0)
     preset = PRESETS["default"]._replace(recipe=recipe or Recipe())
@@ -152,13 +154,23 @@ def train(
     model = finish(trainer, name, layout, curated.dataset.source)
     if origin:
         model = inherit(model, origin)
-    judgement = judge(frames, model, rival, serious(findings))
-    on_message(str(judgement))
+    judgement = judge(frames, model, rival, findings)
+    on_message(in_python(judgement.brief))
     if judgement.doubtful:
-        warnings.warn(str(judgement), stacklevel=2)
+        warnings.warn(in_python(judgement.brief), stacklevel=2)
     date = time.strftime("%Y-%m-%d", time.gmtime())
     model.provenance.update(date=date, judgement=judgement.record())
     return model
+
+
+@contextmanager
+def _python_names() -> Iterator[None]:
+    """Name Python's arguments in the text of a ValueError."""
+    try:
+        yield
+    except ValueError as error:
+        error.args = (in_python(str(error)),)
+        raise
 
 
 def _findings(

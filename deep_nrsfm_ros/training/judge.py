@@ -25,10 +25,12 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout, Tetrahedron
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.sanity import Finding
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import align, centre_visible
 from deep_nrsfm_ros.nrsfm.handedness import MIN_VISIBLE_SHARE, votes
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
+from deep_nrsfm_ros.training.data_check import SourceFinding, sentences, serious
 from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
@@ -173,6 +175,9 @@ class Judgement(NamedTuple):
         verdict: BETTER, AS_GOOD, ALONE or DOUBTFUL.
         faults: of its data, a sentence each: a model learns what is wrong in its data, and the
             figures on such data do not show it.
+        shown: a sentence with a few figures of both; reason or summary ends with it.
+        brief_reason: the reason, without the remedies of faults in the data; "": there are none.
+        repeated: the end of the summary that is the layout's warning.
     """
 
     reason: str
@@ -182,6 +187,9 @@ class Judgement(NamedTuple):
     rival_figures: Figures | None = None
     verdict: str = DOUBTFUL
     faults: tuple[str, ...] = ()
+    shown: str = ""
+    brief_reason: str = ""
+    repeated: str = ""
 
     @property
     def doubtful(self) -> bool:
@@ -191,6 +199,13 @@ class Judgement(NamedTuple):
     def __str__(self) -> str:
         """Return the judgement as a sentence."""
         return f"the new model is doubtful: {self.reason}" if self.doubtful else self.summary
+
+    @property
+    def brief(self) -> str:
+        """Return the judgement as a sentence, for those who have read the warnings."""
+        if self.doubtful:
+            return str(self._replace(reason=self.brief_reason or self.reason))
+        return self.summary.removesuffix(self.repeated)
 
     def record(self) -> dict[str, Any]:
         """Return the judgement for the provenance of the new model."""
@@ -205,7 +220,7 @@ class Judgement(NamedTuple):
 
 
 def judge(
-    frames: Split, model: Model, rival: Model | None, faults: Sequence[str] = ()
+    frames: Split, model: Model, rival: Model | None, findings: Sequence[SourceFinding] = ()
 ) -> Judgement:
     """Return whether a new model should replace the one at hand; without labels.
 
@@ -213,16 +228,22 @@ def judge(
         frames: as in `compare`.
         model: as in `compare`.
         rival: as in `compare`.
-        faults: sentences about what looks wrong in the data. The model is doubtful for them alone:
-            more frames, or other options, would not help.
+        findings: what looks wrong in the data. For serious ones the model is doubtful whatever its
+            figures: more frames, or other options, would not help.
     """
     judgement = compare(frames, model, rival)
+    found = serious(findings)
     if sides := mixed_sides(frames.training, MIXED):
-        faults = (*faults, sides)
-    if not faults:
+        found.append(SourceFinding("", Finding("mixed-hands", sides)))
+    if not found:
         return judgement
-    reason = f"its data looks wrong: {'; '.join(faults)}. Mend it and train again"
-    return judgement._replace(reason=reason, verdict=DOUBTFUL, faults=tuple(faults))
+    faults, figures = sentences(found), f". {judgement.shown}" if judgement.shown else ""
+    reason = f"its data looks wrong: {'; '.join(faults)}. Mend it and train again{figures}"
+    symptoms = "; ".join(sentences(found, is_brief=True))
+    brief = f"its data looks wrong: {symptoms}. Mend it as the warnings say, and train again"
+    return judgement._replace(
+        reason=reason, verdict=DOUBTFUL, faults=tuple(faults), brief_reason=brief + figures
+    )
 
 
 def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
@@ -246,14 +267,15 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         return Judgement(f"{error}; {_advice(model, '')} would help", "", unknown)
     name = rival.name if rival is not None and old else ""
     verdict = _verdict(new, old)
-    figures = f"{_on(frames)}: {_shown(new, old, name)}"
+    figures, repeated = f"{_on(frames)}: {_shown(new, old, name)}", ""
     figures += _guessed(model)
     if old is None and not model.layout.handedness:
         figures += f". These figures say nothing of depth: {MIRRORED_AS_A_WHOLE.format(model.name)}"
     elif old is None and model.layout.warning:
-        figures += f". But {model.layout.warning}"
+        repeated = f". But {model.layout.warning}"
+        figures += repeated
     beside = f" beside model {name!r}" if name else ""
-    reason = ""
+    reason, shown = "", f"Judged{beside} {figures}"
     if worse := worse_figures(new, old):
         reason = "; ".join(_in_words(each, new, old, name) for each in worse)
         if old is None and worse == ["front_disagreement"]:
@@ -261,13 +283,13 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         else:
             reason += f"; {_advice(model, name)} would help"
     if reason:
-        verdict, reason = DOUBTFUL, f"{reason}. Judged{beside} {figures}"
+        verdict, reason = DOUBTFUL, f"{reason}. {shown}"
     in_sentence = _IN_SENTENCES[verdict].format(name, *_gains(new, old))
     if verdict == ALONE:
         in_sentence = f"has no other to compare with{_side_in_words(model.layout, new)}"
     summary = f"the new model {in_sentence}"
     summary += f". Judged {figures}"
-    return Judgement(reason, summary, new, name, old, verdict)
+    return Judgement(reason, summary, new, name, old, verdict, shown=shown, repeated=repeated)
 
 
 _IN_SENTENCES = {
@@ -307,9 +329,14 @@ def _side_in_words(layout: KeypointLayout, figures: Figures) -> str:
         return ", and may be mirrored as a whole"
     if layout.warning:
         return ", and its handedness contradicts the names of its keypoints"
-    if _is_side_known(figures):
-        return ": nothing shows that it mirrors frames"
-    return ", and nothing tells whether it mirrors frames"
+    if not _is_side_known(figures):
+        return ", and nothing tells whether it mirrors frames"
+    if math.isnan(figures.mirrored_share):
+        return (
+            ", and only the front that its layout names tells of mirrored frames, which is weak "
+            "evidence: too few frames show nearly the same shape from other sides"
+        )
+    return ": nothing shows that it mirrors frames"
 
 
 def _is_side_known(figures: Figures) -> bool:

@@ -4,15 +4,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from deep_nrsfm_ros.data.bags import TooManyFramesError, keypoint_count, read_bags
+from deep_nrsfm_ros.data.bags import TooManyFramesError, check_confidence, keypoint_count, read_bags
 from deep_nrsfm_ros.data.curation import Curated, Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
+from deep_nrsfm_ros.data.detections import Detections
 from deep_nrsfm_ros.data.keypoint_files import is_bag, read_keypoints, sample_bag, with_topic
 from deep_nrsfm_ros.data.mocap import TrialSelection, read_split
 from deep_nrsfm_ros.data.read_options import ReadOptions
@@ -32,11 +34,11 @@ from deep_nrsfm_ros.training.data_check import (
     check_objects,
     is_copy,
     sentences,
-    serious,
 )
 from deep_nrsfm_ros.training.distributed import own_share
 from deep_nrsfm_ros.training.layout_choice import (
     LayoutChoice,
+    Source,
     detector_layout,
     in_words,
     layout_choice,
@@ -84,12 +86,12 @@ class ReadData(NamedTuple):
         dataset: in the layout of the model.
         detector_layout: value of the lifter's `keypoint_layout` for the detector that gave the
             keypoints; "" where that is the layout of the model, or unknown.
-        faults: a sentence for each thing that looks wrong in it, so that a model of it is doubtful.
+        findings: what looks wrong in it, source by source.
     """
 
     dataset: Dataset
     detector_layout: str
-    faults: tuple[str, ...] = ()
+    findings: tuple[SourceFinding, ...] = ()
 
 
 def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
@@ -118,14 +120,8 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
     )
     if config.object == NUMBERED:
         source = target = _numbered(data, options)
-    choice, keypoint_map = layout_choice(config), KeypointMap(source, target)
-    parts, findings = list[Part](), list[SourceFinding]()
-    if data.bags:
-        parts += _read_bags(data, keypoint_map, options, reporter, choice, findings)
-    if data.inputs:
-        parts += _read_inputs(data, keypoint_map, options, reporter, choice, bool(parts), findings)
-    if choice:
-        choice.report(reporter)
+    reader = _Reader(data, options, KeypointMap(source, target), layout_choice(config), reporter)
+    parts, findings = reader.read(), reader.findings
     for sentence in sentences(findings):
         reporter.warn(sentence)
     dataset = concatenate([part.dataset for part in parts])
@@ -136,7 +132,7 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
             "read (max_frames); name fewer files, or allow more"
         )
     detector = detector_layout(config, [part.layout for part in parts])
-    return ReadData(dataset, detector, tuple(serious(findings)))
+    return ReadData(dataset, detector, tuple(findings))
 
 
 def read_people(
@@ -167,140 +163,225 @@ def _numbered(data: DataConfig, options: ReadOptions) -> KeypointLayout:
     return KeypointLayout.numbered(detections.confidence.shape[1])
 
 
-def _read_bags(
-    data: DataConfig,
-    keypoint_map: KeypointMap,
-    options: ReadOptions,
-    reporter: Reporter,
-    choice: LayoutChoice | None,
-    findings: list[SourceFinding],
-) -> list[Part]:
-    """Return the objects in the bags of each layout, and report what could not be read.
+class _Found(NamedTuple):
+    """A bag or a file that can be read.
 
-    A bag that cannot be read, or is clearly in another layout, is left out with a warning, unless
-    no data is left. What looks wrong in a bag is added to `findings`.
+    Attributes:
+        path: of it.
+        layout: of its keypoints, or the source of a choice that will give it.
+        detections: the content of a file; None for a bag, which is read later.
     """
-    target, failures, parts = keypoint_map.target, list[ValueError](), list[Part]()
-    groups: dict[tuple[str, ...], tuple[KeypointLayout, list[Path]]] = {}
-    for bag in map(Path.expanduser, data.bags):
-        layout = keypoint_map.source
-        try:
-            if choice:
-                own = with_topic(bag, options, len(target))
-                layout = choice.choose(sample_bag(bag, own, reporter.reading), bag)
-        except ValueError as error:
-            failures.append(error)
-        else:
-            groups.setdefault(layout.keypoints, (layout, []))[1].append(bag)
-    for layout, bags in groups.values():
-        try:
-            reading = read_bags(bags, layout, target, options, reporter.reading, own_share())
-        except TooManyFramesError:
-            raise
-        except ValueError as error:
-            failures.append(error)
-            continue
-        for warning in reading.warnings:
-            reporter.warn(warning)
-        if reading.unreadable:
-            count = f"{reading.unreadable} of {reading.messages}"
-            reporter.warn(f"{count} messages could not be read: {reading.reason}")
-        whole = _in_pixels(reading.dataset, options)
-        ends = [start for _, start in reading.starts[1:]] + [len(whole)]
-        kept = list[tuple[str, Dataset]]()
-        for (bag, start), end in zip(reading.starts, ends, strict=True):
-            dataset = whole[start:end]
-            found = _check_bag(bag, dataset, layout, options, is_chosen=choice is not None)
-            if wrong := _wrong_layout(bag, found):
-                failures.append(wrong)
+
+    path: Path
+    layout: KeypointLayout | Source
+    detections: Detections | None = None
+
+    def find_layout(self) -> KeypointLayout:
+        """Return the layout of its keypoints; raise ValueError where none was found."""
+        return self.layout.layout if isinstance(self.layout, Source) else self.layout
+
+
+class _Reader:
+    """Reads bags and files; collects what looks wrong in them.
+
+    Attributes:
+        findings: what looks wrong, source by source.
+    """
+
+    def __init__(
+        self,
+        data: DataConfig,
+        options: ReadOptions,
+        keypoint_map: KeypointMap,
+        choice: LayoutChoice | None,
+        reporter: Reporter,
+    ) -> None:
+        """Take what to read.
+
+        Args:
+            data: names bags and files.
+            options: of reading.
+            keypoint_map: from the layout that the configuration says to that of the model.
+            choice: finds the layouts that nothing says; None: they are the one that the
+                configuration says.
+            reporter: takes progress, and what is left out.
+        """
+        self._data, self._options, self._reporter = data, options, reporter
+        self._map, self._choice = keypoint_map, choice
+        self.findings = list[SourceFinding]()
+        self._failed_bags, self._failed_files = list[ValueError](), list[ValueError]()
+
+    def read(self) -> list[Part]:
+        """Return the objects in all bags and files; raise ValueError if there are none."""
+        bags, files = list(self._find_bags()), self._load_files()
+        if self._choice:  # it looks at all of them
+            files = _emptied(list(files))
+            self._choice.choose()
+        parts = self._read_bags(bags) if self._data.bags else []
+        parts += self._read_files(files, parts) if self._data.inputs else []
+        if self._choice:
+            self._choice.report(self._reporter)
+        return parts
+
+    def _find_bags(self) -> Iterator[_Found]:
+        """Yield the bags that can be read, with their layouts."""
+        for bag in map(Path.expanduser, self._data.bags):
+            if not self._choice:
+                yield _Found(bag, self._map.source)
                 continue
-            findings += [SourceFinding(bag.name, finding) for finding in found]
-            kept.append((bag.name, dataset))
-        if kept and len(kept) < len(reading.starts):
-            source = f"bags {', '.join(name for name, _ in kept)}"
-            whole = dataclasses.replace(concatenate([each for _, each in kept]), source=source)
-        if kept:
-            parts.append(Part(whole, layout))
-    if not parts and not data.inputs:
-        raise failures[0]
-    for failure in failures:
-        reporter.warn(f"left out: {failure}")
-    return parts
+            try:
+                options = with_topic(bag, self._options, len(self._map.target))
+                sample = sample_bag(bag, options, self._reporter.reading)
+            except ValueError as error:
+                self._failed_bags.append(error)
+            else:
+                yield _Found(bag, sample.layout or self._choice.add(sample, bag))
+
+    def _load_files(self) -> Iterator[_Found]:
+        """Yield the files that can be read, with their content.
+
+        Where there are several sources, the names that a file has for its keypoints go before the
+        layout of the configuration.
+        """
+        data, source = self._data, self._map.source
+        is_only_source = len(data.files()) == 1 and not data.bags
+        named = source if data.keypoint_layout and is_only_source else None
+        fallback = None if self._choice else source
+        options = dataclasses.replace(self._options, layout=named, fallback=fallback)
+        for path in _own_files(data)[0]:
+            try:
+                own = _options_for(path, options)
+                if self._choice and path.exists() and is_bag(path):
+                    own = with_topic(path, own, len(self._map.target))
+                detections = read_keypoints(path, own, self._reporter.reading)
+            except ValueError as error:  # of one file: the others may do
+                self._failed_files.append(error)
+                continue
+            layout: KeypointLayout | Source | None = detections.layout
+            if not layout:
+                layout = self._choice.add(detections, path) if self._choice else source
+            yield _Found(path, layout, detections)
+
+    def _read_bags(self, bags: list[_Found]) -> list[Part]:
+        """Return the objects in the bags of each layout, and report what could not be read.
+
+        A bag that cannot be read, or is clearly in another layout, is left out with a warning,
+        unless no data is left.
+        """
+        failures, parts = self._failed_bags, list[Part]()
+        reporter, options, target = self._reporter, self._options, self._map.target
+        groups: dict[tuple[str, ...], tuple[KeypointLayout, list[Path]]] = {}
+        for found in bags:
+            try:
+                layout = found.find_layout()
+            except ValueError as error:
+                failures.append(error)
+            else:
+                groups.setdefault(layout.keypoints, (layout, []))[1].append(found.path)
+        for layout, paths in groups.values():
+            try:
+                reading = read_bags(paths, layout, target, options, reporter.reading, own_share())
+            except TooManyFramesError:
+                raise
+            except ValueError as error:
+                failures.append(error)
+                continue
+            for warning in reading.warnings:
+                reporter.warn(warning)
+            if reading.unreadable:
+                count = f"{reading.unreadable} of {reading.messages}"
+                reporter.warn(f"{count} messages could not be read: {reading.reason}")
+            whole = _in_pixels(reading.dataset, options)
+            ends = [start for _, start in reading.starts[1:]] + [len(whole)]
+            kept = list[tuple[str, Dataset]]()
+            for (bag, start), end in zip(reading.starts, ends, strict=True):
+                dataset, is_chosen = whole[start:end], self._choice is not None
+                found_in_it = _check_bag(bag, dataset, layout, options, is_chosen=is_chosen)
+                if wrong := _wrong_layout(bag, found_in_it):
+                    failures.append(wrong)
+                    continue
+                self.findings += [SourceFinding(bag.name, finding) for finding in found_in_it]
+                kept.append((bag.name, dataset))
+            if kept and len(kept) < len(reading.starts):
+                source = f"bags {', '.join(name for name, _ in kept)}"
+                whole = dataclasses.replace(concatenate([each for _, each in kept]), source=source)
+            if kept:
+                parts.append(Part(whole, layout))
+        if not parts and not self._data.inputs:
+            raise failures[0]
+        for failure in failures:
+            reporter.warn(f"left out: {failure}")
+        return parts
+
+    def _read_files(self, files: Iterable[_Found], bags: list[Part]) -> list[Part]:
+        """Return the objects in each file, those of one identity one after the other.
+
+        So near-duplicates of one person follow one another, as the curation expects. A file that
+        cannot be read, or is clearly in another layout, is left out with a warning, unless no data
+        is left.
+        Each of several processes reads every n-th file; where there are fewer files than processes,
+        it takes its share of the objects in each.
+        """
+        share, reporter, target = _own_files(self._data)[1], self._reporter, self._map.target
+        parts, failures, copies = list[Part](), self._failed_files, list[str]()
+        for found in files:
+            path, detections = found.path, found.detections
+            assert detections, "a bag is no file"
+            try:
+                layout = found.find_layout()
+                names, to_target = _match_names(path, layout, target)
+                if not len(detections) or not detections.confidence.any():
+                    raise ValueError(f"{path}: it has no object with keypoints")
+                found_in_it = check_objects(
+                    detections.points,
+                    detections.confidence,
+                    layout,
+                    target,
+                    self._options.image_size,
+                    # The names in a file say its layout, and a chosen one is the one that fits.
+                    may_be_another=layout is self._map.source,
+                )
+                if wrong := _wrong_layout(path, found_in_it):
+                    raise wrong
+            except ValueError as error:  # of one file: the others may do
+                failures.append(error)
+                continue
+            found_in_it = [*detections.findings, *names.findings, *found_in_it]
+            self.findings += [SourceFinding(path.name, finding) for finding in found_in_it]
+            for warning in (*detections.warnings, *names.warnings):
+                reporter.warn(f"{path.name}: {warning}")
+            order = np.lexsort((detections.frame, detections.identities))
+            order = order[share.rows(len(order))]
+            identities = detections.identities[order]
+            starts = np.flatnonzero(np.append(True, identities[1:] != identities[:-1]))
+            points, confidence = to_target(detections.points[order], detections.confidence[order])
+            visible, source = confidence > 0, f"file {path.name}"
+            dataset = Dataset(points, visible, target, source, sequence_starts=starts)
+            if same := [part.dataset.source for part in parts if is_copy(dataset, part.dataset)]:
+                copies.append(f"{path.name} (of {same[0].removeprefix('file ')})")
+            parts.append(Part(dataset, layout))
+        if not parts and not bags:
+            raise failures[0]
+        if copies:
+            reporter.warn(f"the same keypoints twice: {in_words(copies)}; leave the copies out")
+        for failure in failures:
+            reporter.warn(f"left out: {failure}")
+        return parts
 
 
-def _read_inputs(
-    data: DataConfig,
-    keypoint_map: KeypointMap,
-    options: ReadOptions,
-    reporter: Reporter,
-    choice: LayoutChoice | None,
-    may_be_none: bool,
-    findings: list[SourceFinding],
-) -> list[Part]:
-    """Return the objects in each file, those of one identity one after the other.
-
-    So near-duplicates of one person follow one another, as the curation expects. A file that
-    cannot be read, or is clearly in another layout, is left out with a warning, unless no data is
-    left. What looks wrong in a file is added to `findings`. Where there are several sources, the
-    names that a file has for its keypoints go before the layout of the configuration.
-    Each of several processes reads every n-th file; where there are fewer files than processes, it
-    takes its share of the objects in each.
-    """
+def _own_files(data: DataConfig) -> tuple[list[Path], Share]:
+    """Return the files that this of several processes reads, and its share of each of them."""
     paths, share = data.files(), own_share()
-    is_only_source = len(paths) == 1 and not data.bags
     if len(paths) >= share.size:
-        paths, share = paths[share.index :: share.size], Share()
-    named = keypoint_map.source if data.keypoint_layout and is_only_source else None
-    fallback = None if choice else keypoint_map.source
-    options = dataclasses.replace(options, layout=named, fallback=fallback)
-    parts, failures, copies = list[Part](), list[ValueError](), list[str]()
-    for path in paths:
-        try:
-            own = _options_for(path, options)
-            if choice and path.exists() and is_bag(path):
-                own = with_topic(path, own, len(keypoint_map.target))
-            detections = read_keypoints(path, own, reporter.reading)
-            layout = detections.layout or keypoint_map.source
-            if choice:
-                layout = choice.choose(detections, path)
-            names, to_target = _match_names(path, layout, keypoint_map.target)
-            if not len(detections) or not detections.confidence.any():
-                raise ValueError(f"{path}: it has no object with keypoints")
-            found = check_objects(
-                detections.points,
-                detections.confidence,
-                layout,
-                keypoint_map.target,
-                options.image_size,
-                # The names in a file say its layout, and a chosen one is the one that fits.
-                may_be_another=layout is keypoint_map.source,
-            )
-            if wrong := _wrong_layout(path, found):
-                raise wrong
-        except ValueError as error:  # of one file: the others may do
-            failures.append(error)
-            continue
-        found = [*detections.findings, *names.findings, *found]
-        findings += [SourceFinding(path.name, finding) for finding in found]
-        for warning in (*detections.warnings, *names.warnings):
-            reporter.warn(f"{path.name}: {warning}")
-        order = np.lexsort((detections.frame, detections.identities))
-        order = order[share.rows(len(order))]
-        identities = detections.identities[order]
-        starts = np.flatnonzero(np.append(True, identities[1:] != identities[:-1]))
-        points, confidence = to_target(detections.points[order], detections.confidence[order])
-        visible, source = confidence > 0, f"file {path.name}"
-        dataset = Dataset(points, visible, keypoint_map.target, source, sequence_starts=starts)
-        if same := [part.dataset.source for part in parts if is_copy(dataset, part.dataset)]:
-            copies.append(f"{path.name} (of {same[0].removeprefix('file ')})")
-        parts.append(Part(dataset, layout))
-    if not parts and not may_be_none:
-        raise failures[0]
-    if copies:
-        reporter.warn(f"the same keypoints twice: {in_words(copies)}; leave the copies out")
-    for failure in failures:
-        reporter.warn(f"left out: {failure}")
-    return parts
+        return paths[share.index :: share.size], Share()
+    return paths, share
+
+
+def _emptied(files: list[_Found]) -> Iterator[_Found]:
+    """Yield files, each of which is free to leave memory once the next one is asked for."""
+    files.reverse()
+    while files:
+        yield files.pop()
 
 
 def _in_pixels(dataset: Dataset, options: ReadOptions) -> Dataset:
@@ -327,10 +408,12 @@ def _check_bag(
     found = check_objects(
         dataset.points, dataset.visible, target, target, size, may_be_another=False
     )
+    found += check_confidence(path, len(layout), options)
     if is_chosen or not any(finding.code == "poor-fit" for finding in found):
         return found
     sample = sample_bag(path, dataclasses.replace(options, layout=layout))
-    return check_objects(sample.points, sample.confidence, layout, target, size)
+    scale = [finding for finding in found if finding.code == "confidence-scale"]
+    return scale + check_objects(sample.points, sample.confidence, layout, target, size)
 
 
 def _wrong_layout(path: Path, findings: list[Finding]) -> ValueError | None:

@@ -13,6 +13,7 @@ from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.data.bag_files import open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.curation import Curation
+from deep_nrsfm_ros.data.hands import SIDES
 from deep_nrsfm_ros.data.keypoint_files import is_bag
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
@@ -26,6 +27,9 @@ from deep_nrsfm_ros.training.record import checkpoint_file, record_file
 from deep_nrsfm_ros.training.resume import resume_request
 from deep_nrsfm_ros.training.same_name import BEFORE, DOUBTFUL, UNFINISHED
 from deep_nrsfm_ros.training.validation import read_field_mapping, validate
+
+UNKNOWN_SIDE = "unknown"
+"""Value of `train.hands` where nothing is known of recorded hands."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,13 @@ class TrainingOptions:
         "order of the keypoints in the bags; empty = that of the parameter keypoint_layout; where "
         "that is 'model', the layout of train.object if it is set; where it is 'auto' and no "
         "message has shown it yet, the layout that fits the recording best",
+    )
+    hands: str = option(
+        UNKNOWN_SIDE,
+        "what recorded hands are, for a model of right hands: right; left = mirrored before the "
+        "training; palms = each hand shows its palm, so that those that look like left ones are "
+        "mirrored; unknown = taken as they are, and the model is doubtful if both sides are mixed",
+        choices=(UNKNOWN_SIDE, *SIDES),
     )
     from_: str = option(
         "",
@@ -172,6 +183,7 @@ def training_request(
             image_width=lifter.image_width,
             image_height=lifter.image_height,
             min_score=lifter.min_score,
+            hands="" if options.hands == UNKNOWN_SIDE else options.hands,
         ),
         object=target,
         recipe=parameters.recipe,

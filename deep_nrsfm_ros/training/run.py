@@ -20,7 +20,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
 from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
-from deep_nrsfm_ros.training.data_check import never_seen
+from deep_nrsfm_ros.training.data_check import SourceFinding, never_seen
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
@@ -91,7 +91,7 @@ def run(
     """
     validate(config, COMMAND_LINE)
     try:
-        dataset, detector_layout, faults = read_data(config, reporter)
+        dataset, detector_layout, findings = read_data(config, reporter)
         if config.data.hands:
             dataset = as_right_hands(dataset, config.data.hands)
         prepared = prepare(config.curation, dataset, reporter, has_start=bool(config.start))
@@ -101,7 +101,7 @@ def run(
         raise
     try:
         with _record(config, reporter) as checkpoint:
-            result = _train_and_save(config, prepared, faults, checkpoint, reporter, should_stop)
+            result = _train_and_save(config, prepared, findings, checkpoint, reporter, should_stop)
             return result and result._replace(detector_layout=detector_layout)
     except SafetensorError as error:  # neither OSError nor ValueError, though the disk is full
         raise ValueError(unwritable(config.output.folder, error)) from error
@@ -117,7 +117,7 @@ def _record(config: TrainingConfig, reporter: Reporter) -> AbstractContextManage
 def _train_and_save(
     config: TrainingConfig,
     prepared: Prepared,
-    faults: tuple[str, ...],
+    findings: tuple[SourceFinding, ...],
     checkpoint: Path,
     reporter: Reporter,
     should_stop: Callable[[], bool],
@@ -149,7 +149,7 @@ def _train_and_save(
         model = inherit(model, start)
     judgement, rival = None, rivals[0] if rivals else None
     if trainer.end_reason:
-        judgement, rival = _judge(frames, model, rivals, faults)
+        judgement, rival = _judge(frames, model, rivals, findings)
         model.provenance["judgement"] = judgement.record()
     else:
         model.provenance[CUT_OFF] = True
@@ -194,7 +194,7 @@ def _is_file_of(old: OldModel, file: str) -> bool:
 
 
 def _judge(
-    frames: Split, model: Model, rivals: list[Model], faults: tuple[str, ...]
+    frames: Split, model: Model, rivals: list[Model], findings: tuple[SourceFinding, ...]
 ) -> tuple[Judgement, Model | None]:
     """Return a judgement that doubts the model if there is one, else the first one, and its rival.
 
@@ -202,15 +202,15 @@ def _judge(
         frames: those of the training and those held out.
         model: the new one.
         rivals: see `_rivals`.
-        faults: of the data, in words.
+        findings: what looks wrong in the data.
     """
     from deep_nrsfm_ros.training.judge import judge
 
-    judgement = judge(frames, model, rivals[0] if rivals else None, faults)
+    judgement = judge(frames, model, rivals[0] if rivals else None, findings)
     for other in rivals[1:]:
         if judgement.doubtful:
             break
-        second = judge(frames, model, other, faults)
+        second = judge(frames, model, other, findings)
         if second.doubtful:
             return second, other
     return judgement, rivals[0] if rivals else None

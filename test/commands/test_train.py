@@ -163,12 +163,14 @@ def test_people_read_verdict_file_and_how_to_use_it_in_short_lines(
     said = capsys.readouterr()
     shared_out = next(line for line in said.err.splitlines() if "are trained on;" in line)
     assert "later ones are held out to judge the model" in shared_out
-    verdict, figures, file, report, use = said.out.strip().splitlines()
+    verdict, figures, file, report, use, truth = said.out.strip().splitlines()
     assert verdict.startswith("finished: the new model is doubtful: ") and len(verdict) < 700
     assert figures.startswith("  judged beside model 'human' on ") and len(figures) < 400
     assert file == f"  model {models / 'mine.safetensors'}" and report.startswith("  report ")
     assert "not in use, but you can look at what it lifts: lift FILE --model" in use
     assert "ros2 param set /lifter model" in use
+    path = models / "mine.safetensors"
+    assert truth == f"  see how many mm it is off on the demo's person: demo --model {path}"
     assert "{" not in said.out and "the new model is doubtful" not in said.err
 
 
@@ -773,8 +775,19 @@ def test_a_model_of_data_that_looks_wrong_is_doubtful(
     judgement = load_model(models / "mine.safetensors").provenance["judgement"]
     assert judgement["doubtful"] and judgement["faults"][0].startswith(fault)
     page = html.unescape((models / "mine.html").read_text())
-    assert judgement["reason"] in page and "<td>mine</td><td>doubtful</td>" in page
+    assert (
+        "its data looks wrong: a.npy: confidence up to" in page
+        and "<td>mine</td><td>doubtful</td>" in page
+    )
     assert in_process(*words, *few, FORCE) == 0
+    said = capsys.readouterr()
+    assert said.err.count(" divide it by 100") == 1 and "divide" not in said.out
+    verdict, figures, *_ = said.out.splitlines()
+    assert verdict.startswith(
+        "finished: the new model is doubtful: its data looks wrong: a.npy: con"
+    )
+    assert verdict.endswith(". Mend it as the warnings say, and train again") and len(verdict) < 170
+    assert figures.startswith("  judged beside model 'human' on the ") and "image error" in figures
     np.save(tmp_path / "a.npy", percent / [1, 1, 100])
     assert in_process(*words, *few) == 0
     assert "looks wrong" not in capsys.readouterr().err.split("curating")[-1]

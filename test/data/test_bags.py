@@ -18,6 +18,7 @@ from deep_nrsfm_ros.data.bag_files import BagError
 from deep_nrsfm_ros.data.bags import (
     STORAGES,
     Frame,
+    check_confidence,
     frames,
     keypoint_count,
     read_bags,
@@ -335,3 +336,14 @@ def test_more_frames_than_allowed_are_refused_before_they_fill_the_memory(tmp_pa
     assert (
         len(read_bags([path], HUMAN17, HUMAN17, ReadOptions("/k", max_frames=300)).dataset) == 300
     )
+
+
+@pytest.mark.parametrize("input_type", WRITTEN)
+def test_confidences_of_another_scale_are_found(input_type: str, tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(1, 900, (40, 17, 2))
+    for name, scale in (("right", 1), ("percent", 100)):
+        given = frames(points, np.full((40, 17), 0.9 * scale))
+        write_bag(tmp_path / name, "/keypoints", given, input_type=input_type)
+    assert not check_confidence(tmp_path / "right", 17)
+    (finding,) = check_confidence(tmp_path / "percent", 17)
+    assert "confidence up to 90: " in finding.message and "divide it by 100" in finding.message

@@ -59,7 +59,9 @@ def test_hands_of_both_sides_are_asked_about_unless_their_side_is_said() -> None
     mixed = hands(60, 40)
     assert other_side_share(mixed) == pytest.approx(0.4)
     assert "40 % of the hands look like those of the other side" in mixed_sides(mixed)
-    assert any("--hands palms" in text for text in assess_sufficiency(mixed).warnings)
+    assert any(
+        "(--hands, train.hands): palms" in text for text in assess_sufficiency(mixed).warnings
+    )
     assert mixed_sides(hands(95, 5)) == "" == mixed_sides(hands(0, 100))
     assert mixed_sides(mixed, 0.5) == ""
     for side in ("right", "left", "palms"):

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.data.walking_person import in_layout
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
 from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
 from deep_nrsfm_ros.model_files.model_file import Model, ModelFileError, save_model
@@ -202,6 +203,15 @@ def test_more_visible_points_than_a_model_has_are_refused() -> None:
         Lifter(model, LiftingOptions(min_visible=16))
     points, confidence = pixels()
     assert np.isfinite(Lifter(model, LiftingOptions(min_visible=15))(points, confidence)[0]).all()
+
+
+def test_more_visible_points_than_a_layout_has_are_refused() -> None:
+    points, _ = in_layout(COCO17, 3)
+    wrong = "min_visible is 20, but layout 'coco17' has 17 keypoints of model 'human', .* most 17"
+    with pytest.raises(ValueError, match=wrong):
+        Lifter("human", LiftingOptions(min_visible=20), layout="coco17")(points)
+    lifter = Lifter("human", LiftingOptions(min_visible=17), layout="coco17")
+    assert np.isfinite(lifter(points).shapes).all()
 
 
 @pytest.mark.parametrize("min_visible", [3, 4, 7])

@@ -66,7 +66,10 @@ def test_findings_of_one_kind_are_one_sentence() -> None:
         "0.npy, 1.npy, 2.npy and 1 more: 97% of the people",
         "0.npy: it is read up to a damaged place",
     ]
-    assert serious(findings) == ["0.npy, 1.npy, 2.npy and 1 more: 97% of the people"]
+    assert serious(findings) == findings[:4]
+    assert sentences(findings[4:], is_brief=True) == sentences(findings[4:])
+    bare = SourceFinding("", Finding("normalised", "a: b; c"))
+    assert sentences([bare], is_brief=True) == ["a"] and sentences([bare]) == ["a: b; c"]
 
 
 def test_copies() -> None:

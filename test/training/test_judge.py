@@ -15,8 +15,10 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.held_out import Split, split
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.sanity import Finding
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.network import initialise
+from deep_nrsfm_ros.training.data_check import SourceFinding
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.judge import (
     Figures,
@@ -104,6 +106,22 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
         assert "on 60 held-out frames, later ones that it was not trained on" in str(judgement)
         assert f"({rival.name}: " in str(judgement) and len(str(judgement)) < 450
         assert not judgement.record()["doubtful"]
+
+
+def test_a_front_alone_is_weak_evidence(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deep_nrsfm_ros.training import judge as module
+
+    monkeypatch.setattr(module, "MIN_TESTED", 1.1)  # no frame has enough neighbours
+    alone = judge(frames, good, None)
+    assert not alone.doubtful and math.isnan(alone.figures.mirrored_share)
+    headline = (
+        "the new model has no other to compare with, and only the front that its layout names "
+        "tells of mirrored frames, which is weak evidence: "
+    )
+    assert str(alone).startswith(headline)
+    assert "weak evidence: too few" not in str(judge(frames, good, good))
 
 
 def test_mirrored_frames_are_seen_without_another_model(
@@ -201,12 +219,24 @@ def test_a_model_that_lifts_nearly_all_frames_to_the_mirror_image_is_never_bette
 
 
 def test_faults_of_the_data_make_a_model_doubtful(frames: Split, good: Model) -> None:
-    upside_down = "walk.npy: 98% of the people are upside down: y must point down"
-    judgement = judge(frames, good, good, [upside_down])
-    assert judgement.doubtful and upside_down in str(judgement) and "Mend it" in str(judgement)
+    upside_down = Finding("orientation", "98% of the people are upside down: y must point down")
+    found = [SourceFinding("walk.npy", upside_down), SourceFinding("", Finding("stamps", "no"))]
+    judgement, sound = judge(frames, good, good, found), judge(frames, good, good)
+    assert judgement.doubtful and not judge(frames, good, good, found[1:]).doubtful
+    fault = f"walk.npy: {upside_down}"
+    assert str(judgement).startswith(
+        f"the new model is doubtful: its data looks wrong: {fault}. Mend it and train again. Judged"
+    )
     assert "would help" not in str(judgement)  # more frames of such data would not
-    assert judgement.record()["faults"] == [upside_down]
-    assert judgement.figures == judge(frames, good, good).figures
+    assert judgement.record()["faults"] == [fault]
+    assert judgement.figures == sound.figures
+    assert sound.shown in judgement.reason and "bone lengths vary by" in sound.shown
+    # Whoever has read the warning needs no remedy any more.
+    assert judgement.brief == (
+        "the new model is doubtful: its data looks wrong: walk.npy: 98% of the people are upside "
+        f"down. Mend it as the warnings say, and train again. {sound.shown}"
+    )
+    assert sound.brief == str(sound)
 
 
 def test_the_mirror_image_of_a_mirrored_model_is_no_fault() -> None:
@@ -333,8 +363,10 @@ def test_a_handedness_against_the_names_is_said_again_at_the_end(
     )
     parts = [dataclasses.replace(part, layout=layout) for part in frames]
     model = dataclasses.replace(good, layout=layout)
-    text = str(judge(Split(*parts), model, None))
+    judgement = judge(Split(*parts), model, None)
+    text = str(judgement)
     assert "its handedness has left: right_wing and right: left_wing" in text
+    assert "left: right_wing" not in judgement.brief and "its handedness con" in judgement.brief
 
 
 def test_frames_of_few_keypoints_do_not_tell_a_side(
@@ -381,6 +413,7 @@ def test_hands_of_both_sides_are_doubtful(
 
     monkeypatch.setattr(module, "mixed_sides", lambda data, least: f"mixed above {least}")
     judgement = judge(frames, good, good)
-    assert judgement.reason == "its data looks wrong: mixed above 0.3. Mend it and train again"
+    said = "its data looks wrong: mixed above 0.3. Mend it and train again. Judged beside model"
+    assert judgement.reason.startswith(said)
     assert judgement.doubtful and judgement.faults == ("mixed above 0.3",)
     assert judgement.verdict == "doubtful"

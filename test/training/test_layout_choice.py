@@ -12,10 +12,12 @@ import pytest
 from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros.commands.train import parser
 from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
+from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN17, HUMAN25, LAYOUTS
 from deep_nrsfm_ros.training.config import TrainingConfig
+from deep_nrsfm_ros.training.data_check import sentences, serious
 from deep_nrsfm_ros.training.preparation import ReadData, read_data
 from deep_nrsfm_ros.training.reporter import Reporter
 from test.fixtures.training_program import RunTraining
@@ -45,6 +47,11 @@ def read(*words: str | Path) -> ReadData:
     """Return the data that a command line names."""
     config = TrainingConfig.from_arguments(parser().parse_args(list(map(str, words))))
     return read_data(config, Reporter(as_json=False, should_stop=lambda: False))
+
+
+def faults(found: ReadData) -> list[str]:
+    """Return a sentence for each thing in the data that makes a model doubtful."""
+    return sentences(serious(found.findings))
 
 
 @pytest.mark.parametrize("option", ["--bag", "--input"])
@@ -88,6 +95,43 @@ def test_each_bag_and_file_is_taken_by_itself(
     assert "other, b.npy, other: keypoint layout body25: " in said
 
 
+def test_files_of_one_form_share_a_layout(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    body, keypoints = len(COCO17), list[Path]()
+    for i, view in enumerate(read_clip().session.views):
+        data = np.concatenate([view.points, view.confidence[..., None]], -1)[:, :body]
+        keypoints.append(tmp_path / f"{i}.npy")
+        np.save(keypoints[-1], data)
+    read("--input", keypoints[1])  # alone it is taken for a layout that is nearly the same
+    assert "1.npy: keypoint layout posetrack18_17: " in capsys.readouterr().err
+    found = read("--input", tmp_path)
+    said = capsys.readouterr().err
+    assert "0.npy, 1.npy, 2.npy and 1 more: keypoint layout coco17: it fits" in said
+    assert found.detector_layout == "coco17" and "ambiguous" not in said
+
+
+def test_normalised_files_have_the_layout_of_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, confidence = in_layout(BODY25)
+    wide = points * np.array([1, 3]) / (3 * np.max(points))
+    for i in range(3):
+        np.savez(tmp_path / f"{i}.npz", points=wide * (1 - 0.1 * i), confidence=confidence)
+    read("--input", tmp_path)
+    said = capsys.readouterr().err
+    alone = "keypoint layout body25: a guess, since the keypoints are normalised; "
+    assert "0.npz, 1.npz, 2.npz: " + alone in said
+    assert "poor fit" not in said and "ambiguous" not in said
+    write(tmp_path / "pixels.npz", BODY25)
+    found = read("--input", tmp_path)
+    assert found.detector_layout == "body25"
+    (fault,) = faults(found)
+    assert fault.startswith("0.npz, 1.npz, 2.npz: ") and "they are normalised" in fault
+    said = capsys.readouterr().err
+    assert "2.npz and 1 more: keypoint layout body25: it fits with residual 0.0" in said
+
+
 def test_the_layout_that_the_user_names_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -124,7 +168,7 @@ def test_a_source_in_another_layout_is_left_out(
     right, wrong = write(tmp_path / "right", HUMAN25), write(tmp_path / "wrong", BODY25)
     found = read(option, wrong, option, right, "--keypoint-layout", "human25")
     np.testing.assert_array_equal(found.dataset.points, in_layout(HUMAN25)[0])
-    assert "wrong" not in found.dataset.source and not found.faults
+    assert "wrong" not in found.dataset.source and not faults(found)
     assert (
         f"warning: left out: {wrong}: poor fit as human25: is it body25?" in capsys.readouterr().err
     )
@@ -142,7 +186,7 @@ def test_each_source_is_checked_by_itself(
         write_bag(path, "/keypoints", frames(points if i else upside_down, confidence))
         words += [option, path]
     found = read(*words)
-    (fault,) = found.faults
+    (fault,) = faults(found)
     assert fault.startswith("0: ") and "y must point down" in fault
     assert f"warning: {fault}" in capsys.readouterr().err
     assert len(found.dataset) == 4 * len(points)
@@ -152,10 +196,19 @@ def test_a_bag_of_normalised_keypoints_becomes_pixels(tmp_path: Path) -> None:
     points, confidence = in_layout(COCO17)
     write_bag(tmp_path / "bag", "/keypoints", frames(points / np.array(IMAGE), confidence))
     words = ("--bag", tmp_path / "bag", "--keypoint-layout", "coco17", "--object", "coco17")
-    assert "they are normalised" in read(*words).faults[0]
+    assert "they are normalised" in faults(read(*words))[0]
     sized = read(*words, "--image-width", str(IMAGE[0]), "--image-height", str(IMAGE[1]))
-    assert not sized.faults
+    assert not faults(sized)
     np.testing.assert_allclose(sized.dataset.points, points, rtol=1e-4, atol=0.01)
+
+
+@pytest.mark.parametrize("option", ["--bag", "--input"])
+def test_confidences_of_another_scale_in_a_bag_are_said(option: str, tmp_path: Path) -> None:
+    points, confidence = in_layout(COCO17)
+    write_bag(tmp_path / "percent", "/keypoints", frames(points, 100 * confidence))
+    write_bag(tmp_path / "right", "/keypoints", frames(points, confidence))
+    (fault,) = faults(read(option, tmp_path / "percent", option, tmp_path / "right"))
+    assert fault.startswith("percent: confidence up to ") and fault.endswith("divide it by 100")
 
 
 def test_a_file_that_is_read_twice_is_named(

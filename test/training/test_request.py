@@ -54,9 +54,8 @@ def request(folder: Path, **options: Any) -> TrainingRequest:
 
 
 def test_every_parameter_reaches_the_configuration(tmp_path: Path) -> None:
-    asked = request(
-        tmp_path, bags=("one", "two"), name="mine", threads=3, resume=True, activate="never"
-    )
+    words = {"name": "mine", "threads": 3, "resume": True, "activate": "never", "hands": "palms"}
+    asked = request(tmp_path, bags=("one", "two"), **words)
     human = matching_model("human17")
     assert human is not None
     expected = TrainingConfig(
@@ -68,6 +67,7 @@ def test_every_parameter_reaches_the_configuration(tmp_path: Path) -> None:
             mapping=MAPPING,
             image_width=640,
             image_height=480,
+            hands="palms",
         ),
         object="human17",
         recipe=PARTS.recipe,
@@ -82,6 +82,7 @@ def test_every_parameter_reaches_the_configuration(tmp_path: Path) -> None:
     anew = request(tmp_path, from_="none").config
     assert (anew.start, anew.rival) == ("", str(human))
     assert request(tmp_path, topic="/other").config.data.topic == "/other"
+    assert request(tmp_path).config.data.hands == ""
     with pytest.raises(ValueError, match="allows at most 2"):
         request(tmp_path, max_minutes=2.0)
 
