@@ -34,6 +34,7 @@ class Dataset:
         sequence_starts: (s,) int64, ascending from 0, first frames of the sequences: recordings,
             views or identities, the frames of each in the order of their time. Empty: unknown.
         is_one_side: whether hands are said to be right ones, or were made so; see `data.hands`.
+        cameras: (f, 3, 2) float32 M of the ground truth, points = shapes @ cameras, or None.
     """
 
     points: NDArray[np.float32]
@@ -43,6 +44,7 @@ class Dataset:
     shapes: NDArray[np.float32] | None = None
     sequence_starts: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     is_one_side: bool = False
+    cameras: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError if the shapes of the arrays do not match each other or the layout."""
@@ -53,6 +55,8 @@ class Dataset:
             raise ValueError(f"visible is {self.visible.shape}; points need {(f, p)}")
         if self.shapes is not None and self.shapes.shape != (f, p, 3):
             raise ValueError(f"shapes are {self.shapes.shape}; points need {(f, p, 3)}")
+        if self.cameras is not None and self.cameras.shape != (f, 3, 2):
+            raise ValueError(f"cameras are {self.cameras.shape}; points need {(f, 3, 2)}")
 
         starts = self.sequence_starts
         if len(starts) and (starts[0] or starts[-1] >= f or (np.diff(starts) <= 0).any()):
@@ -71,14 +75,15 @@ class Dataset:
         def chosen(array: NDArray[Any]) -> NDArray[Any]:
             return array[frames] if isinstance(frames, slice) else take(array, frames)
 
-        shapes = None if self.shapes is None else chosen(self.shapes)
+        truth = (None if each is None else chosen(each) for each in (self.shapes, self.cameras))
+        shapes, cameras = truth
         points, visible = chosen(self.points), chosen(self.visible)
         starts = self.sequence_starts
         if len(starts):
             sequence = np.searchsorted(starts, np.arange(len(self))[frames], "right")
             starts = np.flatnonzero(np.diff(sequence, prepend=-1))
         return Dataset(
-            points, visible, self.layout, self.source, shapes, starts, is_one_side=self.is_one_side
+            points, visible, self.layout, self.source, shapes, starts, self.is_one_side, cameras
         )
 
 
@@ -98,6 +103,7 @@ def concatenate(datasets: list[Dataset]) -> Dataset:
     if len(layouts) > 1:
         raise ValueError(f"the sources have {len(layouts)} different keypoint layouts; use one")
     shapes = [e.shapes for e in datasets if e.shapes is not None]
+    cameras = [e.cameras for e in datasets if e.cameras is not None]
     first = np.cumsum([0, *(len(e) for e in datasets)])
     has_starts = all(len(e.sequence_starts) or not len(e) for e in datasets)
     starts = [e.sequence_starts + at for e, at in zip(datasets, first[:-1], strict=True)]
@@ -108,6 +114,7 @@ def concatenate(datasets: list[Dataset]) -> Dataset:
         "; ".join(dict.fromkeys(e.source for e in datasets)),
         concatenated(shapes) if len(shapes) == len(datasets) else None,
         np.concatenate(starts) if has_starts else np.empty(0, np.int64),
+        cameras=concatenated(cameras) if len(cameras) == len(datasets) else None,
     )
 
 

@@ -366,12 +366,12 @@ def read_trials(
         S = centre(KEYPOINTS_OF[layout.name](read_amc(path, skeleton))[::stride])
         n = len(S)
         S = np.tile(S, (cameras, 1, 1))
-        W = S @ random_cameras(len(S), rng)
+        M = random_cameras(len(S), rng)
         source = f"CMU motion capture, subject {path.parent.name}"
         # The end of the trial is held out from all cameras: a pose is never in both parts.
         starts = np.arange(0, len(S), max(n, 1))
-        visible = np.ones(W.shape[:2], bool)
-        parts.append(Dataset(W, visible, layout, source, S, sequence_starts=starts))
+        visible = np.ones(S.shape[:2], bool)
+        parts.append(Dataset(S @ M, visible, layout, source, S, starts, cameras=M))
         on_progress(done + 1, len(paths))
     return concatenate(parts)
 

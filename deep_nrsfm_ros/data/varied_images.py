@@ -94,22 +94,24 @@ def varied(dataset: Dataset, variation: ImageVariation) -> Dataset:
     Which images these are is drawn at random, independently for each kind, by fixed seeds.
 
     Args:
-        dataset: images of motion capture, x right and y down, with their shapes, in metres.
+        dataset: images of motion capture, x right and y down, with shapes and cameras, in metres.
         variation: the shares of the images.
 
     Raises:
-        ValueError: the layout of the dataset has no such keypoints, or it has no shapes.
+        ValueError: the layout of the dataset has no such keypoints, or it has no ground truth.
     """
     variation.check(dataset.layout)
     if variation == ImageVariation():
         return dataset
-    if dataset.shapes is None:
-        raise ValueError("images without shapes cannot be varied")
+    if dataset.shapes is None or dataset.cameras is None:
+        raise ValueError("images without shapes and cameras cannot be varied")
     points, visible, shapes = dataset.points.copy(), dataset.visible.copy(), dataset.shapes.copy()
     rng = np.random.default_rng(_PERSPECTIVE_SEED)
     distances = 1 / rng.uniform(1 / FARTHEST, 1 / NEAREST, len(dataset))
     images = np.flatnonzero(rng.random(len(dataset)) < variation.perspective_images)
-    points[images] = in_perspective(points[images], shapes[images], distances[images])
+    M = dataset.cameras[images]
+    depths = (shapes[images] * np.cross(M[..., 0], M[..., 1])[:, None]).sum(-1)
+    points[images] = in_perspective(points[images], depths, distances[images])
     rng = np.random.default_rng(_HIDING_SEED)
     for share, keypoints in _HIDDEN.items():
         images = np.flatnonzero(rng.random(len(dataset)) < getattr(variation, share))
@@ -127,22 +129,19 @@ def varied(dataset: Dataset, variation: ImageVariation) -> Dataset:
     shares = [f"{name} {share:g}" for name, share in vars(variation).items() if share]
     source = f"{dataset.source}; {', '.join(shares)}"
     return dataclasses.replace(
-        dataset, points=points, visible=visible, shapes=shapes, source=source
+        dataset, points=points, visible=visible, shapes=shapes, cameras=None, source=source
     )
 
 
-def in_perspective(points: Floats, shapes: Floats, distances: Floats) -> Floats:
-    """Return the images (n, p, 2) that a lens takes of shapes whose orthographic images are given.
+def in_perspective(points: Floats, depths: Floats, distances: Floats) -> Floats:
+    """Return the images (n, p, 2) that a lens takes of people whose orthographic images are given.
 
     The images are centred, and people keep their size at the distance of their centre.
 
     Args:
-        points: (n, p, 2) orthographic images, x right and y down, centred.
-        shapes: (n, p, 3) centred, in metres.
+        points: (n, p, 2) orthographic images in metres, x right and y down, centred.
+        depths: (n, p) metres behind the centre of the person.
         distances: (n,) metres from the lens to the centre of the person.
     """
-    # W = S M is solved for M, whose third column is the direction of view.
-    M = np.linalg.solve(shapes.swapaxes(1, 2) @ shapes, shapes.swapaxes(1, 2) @ points)
-    depth = shapes @ np.cross(M[..., 0], M[..., 1])[..., None]
-    seen: Floats = points / (1 + depth / distances[:, None, None])
-    return centre(seen)
+    seen: Floats = points / (1 + depths / distances[:, None])[..., None]
+    return centre(seen.astype(points.dtype))

@@ -19,7 +19,7 @@ from deep_nrsfm_ros.data.varied_images import (
 from deep_nrsfm_ros.data.virtual_people import FACE_KEYPOINTS, FEET_KEYPOINTS
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17, HUMAN25
-from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras, rotation_from_camera
 
 F = 4000
 
@@ -29,8 +29,8 @@ def images() -> Dataset:
     """Return images of one person of random places."""
     rng = np.random.default_rng(0)
     S = centre(0.3 * rng.standard_normal((F, len(HUMAN25), 3))).astype(np.float32)
-    visible = np.ones(S.shape[:2], bool)
-    return Dataset(S[..., :2].copy(), visible, HUMAN25, "a test", S)
+    M = np.tile(np.eye(3, 2, dtype=np.float32), (F, 1, 1))
+    return Dataset(S @ M, np.ones(S.shape[:2], bool), HUMAN25, "a test", S, cameras=M)
 
 
 def columns(keypoints: tuple[str, ...]) -> list[int]:
@@ -105,20 +105,26 @@ def test_a_layout_without_the_keypoints_is_refused(
 
 
 def test_a_lens_shows_near_parts_larger() -> None:
-    left_far, right_near = (-1, 0, 1), (1, 0, -1)
-    S = np.array([[left_far, right_near, (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]], float)
-    W = in_perspective(S[..., :2], S, np.array([4.0]))
-    expected = np.array([[-4 / 5, 0], [4 / 3, 0], [0, 1], [0, -1], [0, 0], [0, 0]])
+    points = np.array([[[-1, 0], [1, 0], [0, 1], [0, -1]]], float)
+    depths = np.array([[1.0, -1.0, 0.0, 0.0]])  # the left is far, the right is near
+    expected = np.array([[-4 / 5, 0], [4 / 3, 0], [0, 1], [0, -1]])
+    W = in_perspective(points, depths, np.array([4.0]))
     np.testing.assert_allclose(W[0], expected - expected.mean(0), atol=1e-12)
 
 
-def test_the_camera_of_an_image_is_found() -> None:
+def test_the_lens_looks_along_the_camera_of_the_image(images: Dataset) -> None:
+    assert images.shapes is not None
     rng = np.random.default_rng(1)
-    S = centre(rng.standard_normal((50, 9, 3)))
-    M = random_cameras(50, rng).astype(float)
-    depth = (S @ np.cross(M[..., 0], M[..., 1])[..., None])[..., 0]
-    expected = centre((S @ M) / (1 + depth / 5)[..., None])
-    np.testing.assert_allclose(in_perspective(S @ M, S, np.full(50, 5.0)), expected, atol=1e-9)
+    M = random_cameras(F, rng)
+    seen = dataclasses.replace(images, points=images.shapes @ M, cameras=M)
+    in_camera = images.shapes @ rotation_from_camera(M).swapaxes(1, 2)
+    same = dataclasses.replace(
+        images, points=in_camera[..., :2].copy(), shapes=in_camera.astype(np.float32)
+    )
+    variation = ImageVariation(perspective_images=1.0)
+    np.testing.assert_allclose(
+        varied(seen, variation).points, varied(same, variation).points, atol=1e-5
+    )
 
 
 def test_lenses_are_at_their_distances_in_a_share_of_the_images(images: Dataset) -> None:
@@ -127,7 +133,7 @@ def test_lenses_are_at_their_distances_in_a_share_of_the_images(images: Dataset)
     changed = (after.points != images.points).any((1, 2))
     assert changed.mean() == pytest.approx(0.25, abs=0.03)
     near, far = (
-        in_perspective(images.points, images.shapes, np.full(F, metres))
+        in_perspective(images.points, images.shapes[..., 2], np.full(F, metres))
         for metres in (NEAREST, FARTHEST)
     )
     shifts = [np.linalg.norm(W - images.points, axis=(1, 2))[changed] for W in (far, near)]

@@ -27,9 +27,9 @@ def people(f: int = 60) -> Dataset:
     """Return f views of people, each of them twice."""
     rng = np.random.default_rng(0)
     shapes = centre(rng.standard_normal((17, 3)) + 0.3 * rng.standard_normal((f, 17, 3)))
-    points = np.repeat(shapes @ random_cameras(f, rng), 2, axis=0).astype(np.float32)
-    truth = np.repeat(shapes, 2, axis=0).astype(np.float32)
-    return Dataset(points, np.ones((2 * f, 17), bool), HUMAN17, "made up", truth)
+    S, M = np.repeat(shapes, 2, axis=0), np.repeat(random_cameras(f, rng), 2, axis=0)
+    points, S = (S @ M).astype(np.float32), S.astype(np.float32)
+    return Dataset(points, np.ones((2 * f, 17), bool), HUMAN17, "made up", S, cameras=M)
 
 
 @pytest.mark.parametrize(
