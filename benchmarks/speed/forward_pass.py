@@ -38,7 +38,8 @@ LEGEND = {
     "torch eager, convolutions": "each layer as the paper writes it, the camera from an SVD",
     ONNX: "our code, exported by torch.onnx; install with `pip install '.[speed]'`",
     "Lifter": "the whole call, with three test-time rotations and the correction",
-    "paper": "the paper's 12 dictionaries with random weights; default: the model cmu31",
+    "paper": "the paper's 12 dictionaries with random weights; default: the model cmu31; human: "
+    "the model of that name, whose dictionaries are wider",
 }
 Call = Callable[[], object]
 
@@ -90,12 +91,14 @@ def _onnx_session(module: nn.Module, x: Tensor) -> Any:
 
 def models() -> dict[str, Model]:
     """Return architecture -> model to time."""
-    default = load_model(find_model("cmu31", model_folders(Path("models"))))
+    folders = model_folders(Path("models"))
+    default, people = (load_model(find_model(name, folders)) for name in ("cmu31", "human"))
     architecture, normaliser, _ = PRESETS["paper"]
     p = len(default.layout)
     paper = initialise(architecture, p, np.random.default_rng(0))
     return {
         "default": default,
+        "human": people,
         "paper": Model("paper", paper, default.layout, normaliser, default.object_frame),
     }
 

@@ -21,7 +21,7 @@ distance_i: distance of the point from that centroid, relative to the RMS radius
 gap_i: standard deviation of a missing point's position in the image, given the visible ones,
     relative to the RMS radius; from the second moment of the training's keypoints, which the
     network's whitening holds. It rises with the distance from the visible points: of `human`, a
-    knee between hip and ankle has 0.38, toes of a person cut off at the hips have 0.80.
+    knee between hip and ankle has 0.46, toes of a person cut off at the hips have 0.96.
 
 A point whose detector confidence, relative to the object's others (`weights.relative_confidence`),
 is 0.7 counts as visible with probability 0.7 and as missing with probability 0.3; its gap is then
@@ -77,8 +77,8 @@ class Calibration(NamedTuple):
 
 
 CALIBRATED = Calibration(
-    visible=Coefficients(-3.40, -1.34, -1.80, 0.80, -1.44, -1.76, 0.00),
-    missing=Coefficients(-0.30, -0.90, -1.21, 1.17, -0.87, -0.75, -6.31),
+    visible=Coefficients(-3.48, -1.34, -1.82, 0.83, -1.41, -1.76, 0.00),
+    missing=Coefficients(-1.22, -0.78, -1.29, 0.67, -0.60, -0.68, -4.71),
 )
 """Fitted to a subject that no model was trained on.
 
