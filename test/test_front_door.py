@@ -241,6 +241,16 @@ def test_each_sequence_is_checked_by_itself() -> None:
         train(*given, layout=HUMAN25, recipe=recipe, sequence_starts=(0, 60, 120))
 
 
+def test_frames_that_show_nothing_are_padding() -> None:
+    points, _ = in_layout(HUMAN25, 60)
+    padded = np.concatenate([points, np.full_like(points, np.nan), 0 * points])
+    recipe = Recipe(steps=1, learning_rate=1e-7, batch=4)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        train(padded, layout=HUMAN25, recipe=recipe, sequence_starts=(0, 60, 120))
+    assert not [each for each in caught if "too few keypoints" in str(each.message)]
+
+
 def test_arrays_in_another_layout_are_refused() -> None:
     with pytest.raises(ValueError, match="poor fit as human25: is it body25"):
         train(*in_layout(BODY25, 60), layout=HUMAN25)

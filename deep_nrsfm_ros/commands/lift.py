@@ -239,7 +239,7 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
     for warning in detections.warnings:
         warn(warning)
     # A bag may be shown without its keypoints, and says how many there would be.
-    if not len(detections) and not is_bag(args.input):
+    if not len(detections.without_padding()) and not is_bag(args.input):
         raise ValueError(_no_object(args.input, len(detections.stamps)))
     chosen = detections.largest() if args.objects == "largest" else detections
     if detections.layout:
@@ -247,7 +247,7 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
         for warning in names.warnings:
             warn(warning)
         return Objects(chosen, detections.layout, (*detections.findings, *names.findings))
-    layout, reason, ambiguity = resolve_layout(chosen, model)
+    layout, reason, ambiguity = resolve_layout(chosen.without_padding(), model)
     note(f"keypoint layout {layout.name}: {reason}")
     found = (*detections.findings, *([ambiguity] if ambiguity else []))
     return Objects(chosen, layout, found)

@@ -34,7 +34,7 @@ class Summary:
 
     Attributes:
         lifted: number of objects lifted.
-        total: number of objects.
+        total: number of objects; padding of arrays is none.
         frames: number of frames.
         left_out: number of objects that were not lifted, by reason.
         residual: median reprojection error of the lifted objects; NaN if there is none.
@@ -101,12 +101,13 @@ def summarise(
             findings = [f for f in findings if f.code != "poor-fit"] + [better]
     if is_person(model.layout):
         findings += pose(recording.lifted.rotations, detections.confidence, recording.source)
-    if is_lifted.any() and is_lifted.mean() < _FEW_LIFTED:
-        few = f"only {is_lifted.sum()} of {len(is_lifted)} objects are lifted"
+    total = int((~detections.is_padding).sum())
+    if is_lifted.any() and is_lifted.sum() < _FEW_LIFTED * total:
+        few = f"only {is_lifted.sum()} of {total} objects are lifted"
         findings.append(Finding("few-lifted", few))
     return Summary(
         int(is_lifted.sum()),
-        len(detections),
+        total,
         len(detections.stamps),
         _left_out(recording, min_visible, with_camera=intrinsics is not None),
         residual,
@@ -118,7 +119,7 @@ def summarise(
 def _left_out(recording: Recording, min_visible: int, *, with_camera: bool) -> dict[str, int]:
     """Return the number of objects that were not lifted, by reason."""
     detections = recording.detections
-    rows = np.flatnonzero(~recording.is_lifted)
+    rows = np.flatnonzero(~(recording.is_lifted | detections.is_padding))
     if not len(rows):
         return {}
     to_model, few = KeypointMap(recording.source, recording.target), 0

@@ -52,6 +52,8 @@ class Detections:
             it gives none, or several.
         warnings: sentences about what was left out of the source.
         findings: what looks wrong in the source.
+        is_padding: (m,) bool, objects without a keypoint that fill an array with as many objects in
+            each frame; None = none of them.
     """
 
     points: NDArray[np.float32]
@@ -67,6 +69,7 @@ class Detections:
     image_size: Size | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+    is_padding: NDArray[np.bool_] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         """Raise ValueError if the arrays do not match each other or frames are not ascending."""
@@ -76,11 +79,14 @@ class Detections:
             object.__setattr__(self, "frames", Frames(np.arange(f), np.full(f, "")))
         if self.scores is None:
             object.__setattr__(self, "scores", np.ones(m, np.float32))
+        if self.is_padding is None:
+            object.__setattr__(self, "is_padding", np.zeros(m, bool))
         for name, shape in {
             "points": (m, q, 2),
             "frame": (m,),
             "identities": (m,),
             "scores": (m,),
+            "is_padding": (m,),
         }.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} are {getattr(self, name).shape}; {shape} is needed")
@@ -102,7 +108,12 @@ class Detections:
             frame=self.frame[objects],
             identities=self.identities[objects],
             scores=self.scores[objects],
+            is_padding=self.is_padding[objects],
         )
+
+    def without_padding(self) -> Detections:
+        """Return the detections without the objects that only fill an array."""
+        return self[~self.is_padding] if self.is_padding.any() else self
 
     def has_identities(self) -> bool:
         """Return whether an identity is not just the index of the object in its frame."""

@@ -75,7 +75,8 @@ def train(
 
     Args:
         points: (f, p, 2) keypoints of f frames, x right and y down, in pixels or another unit that
-            is the same for x and y. A keypoint at (0, 0) or with a NaN is missing.
+            is the same for x and y. A keypoint at (0, 0) or with a NaN is missing. Frames without
+            any are not used.
         confidence: (f, p) from 0, which is missing, to 1, or booleans of visibility. None: all
             keypoints are visible.
         layout: keypoint layout of the points, as an object, by the name of a preset or a layout
@@ -126,6 +127,8 @@ def train(
             layout = layout_of("object", object, name)
             mapped, weight = KeypointMap(data.layout, layout)(seen.points, seen.confidence)
             data = Dataset(mapped, weight > 0, layout, "arrays", sequence_starts=starts)
+        if (is_seen := seen.confidence.any(1)).any():  # a frame that shows nothing is padding
+            data = data if is_seen.all() else data[np.flatnonzero(is_seen)]
         if hands:
             data = as_right_hands(data, hands)
         curated = curate(data)

@@ -253,7 +253,7 @@ class _Reader:
                 own = _options_for(path, options)
                 if self._choice and path.exists() and is_bag(path):
                     own = with_topic(path, own, len(self._map.target))
-                detections = read_keypoints(path, own, self._reporter.reading)
+                detections = read_keypoints(path, own, self._reporter.reading).without_padding()
             except ValueError as error:  # of one file: the others may do
                 self._failed_files.append(error)
                 continue

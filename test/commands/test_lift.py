@@ -359,6 +359,33 @@ def test_people_far_away_and_those_left_out(
     assert "56 of 60 objects" in said and "left out: 4 have fewer than 4 detected" in said
 
 
+@pytest.mark.parametrize("nothing", [0.0, np.nan])
+def test_padding_of_an_array_is_no_object(
+    nothing: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    padded = np.full((60, 5, 17, 3), nothing)
+    padded[:40, 1] = np.concatenate((POINTS, CONFIDENCE[..., None]), -1)[:40]
+    np.save(tmp_path / "a.npy", padded)
+    out = tmp_path / "out.npz"
+    words = [str(tmp_path / "a.npy"), "--keypoint-layout", "coco17", "--output", str(out)]
+    main(words)
+    said = capsys.readouterr()
+    assert "40 of 40 objects in 60 frames lifted" in said.out and "left out" not in said.out
+    assert "warning" not in said.err
+    with np.load(out) as file:
+        lifted = np.isfinite(file["residual"]).reshape(60, 5)
+        assert lifted[:40, 1].all() and lifted.sum() == 40
+    padded[:30, 1, :, 2] = 0.05  # they are seen, if poorly
+    np.save(tmp_path / "a.npy", padded)
+    with pytest.raises(SystemExit):
+        main([*words, "--min-confidence", "0.1"])
+    assert "only 10 of 40 objects are lifted" in capsys.readouterr().err
+    np.save(tmp_path / "a.npy", np.full_like(padded, nothing))
+    with pytest.raises(SystemExit):
+        main(words)
+    assert capsys.readouterr().err.endswith("a.npy has no object in its 60 frames\n")
+
+
 def test_a_camera_file_that_says_nothing(
     people: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -329,3 +329,12 @@ def test_names_of_another_object_are_an_error_that_names_the_file(tmp_path: Path
     np.savez(tmp_path / "a.npz", points=in_layout(COCO17)[0], names=np.array(names))
     with pytest.raises(ValueError, match=r"a\.npz: its keypoints are named p0, p1, .*rename them"):
         read("--input", tmp_path / "a.npz")
+
+
+def test_padding_of_an_array_is_no_frame(tmp_path: Path) -> None:
+    padded = np.zeros((60, 5, 17, 2))
+    padded[:, 3] = in_layout(COCO17, 60)[0]
+    np.save(tmp_path / "a.npy", padded)
+    found = read("--input", tmp_path / "a.npy", "--object", "coco17")
+    np.testing.assert_allclose(found.dataset.points, padded[:, 3], rtol=1e-6)
+    assert found.dataset.sequence_starts.tolist() == [0]

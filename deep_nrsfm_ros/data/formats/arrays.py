@@ -22,7 +22,7 @@ from deep_nrsfm_ros.data.formats.frame_numbers import stamps_of
 from deep_nrsfm_ros.data.formats.names import contradiction, layout_of_names
 from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.observation import to_observation
+from deep_nrsfm_ros.lifting.observation import to_observation, without_value
 from deep_nrsfm_ros.lifting.sanity import confidence_scale, find_origin
 
 _MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
@@ -68,7 +68,10 @@ def read_npz(path: Path, options: ReadOptions) -> Detections:
 
 
 def read_npy(path: Path, options: ReadOptions) -> Detections:
-    """Return the objects in an array: (frames, q, 2 or 3) or (frames, objects, q, 2 or 3)."""
+    """Return the objects in an array: (frames, q, 2 or 3) or (frames, objects, q, 2 or 3).
+
+    Such an array has as many objects in each frame: one without a keypoint is padding.
+    """
     try:
         points = np.load(path, allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
@@ -87,7 +90,7 @@ def read_npy(path: Path, options: ReadOptions) -> Detections:
             "frame": np.repeat(np.arange(f), n),
             "stamps": stamps_of(None, f, options.rate or DEFAULT_RATE),
         }
-    return _detections(arrays, options, [], rate_acts=True)
+    return _detections(arrays, options, [], is_npy=True)
 
 
 def _open(path: Path) -> Any:
@@ -121,7 +124,7 @@ def _detections(
     arrays: Mapping[str, NDArray[Any]],
     options: ReadOptions,
     warnings: list[str],
-    rate_acts: bool = False,
+    is_npy: bool = False,
 ) -> Detections:
     """Return the objects in arrays as detections, in the order of their frames.
 
@@ -129,7 +132,8 @@ def _detections(
         arrays: by their names in an .npz; `points` (m, q, 2 or 3), the others optional.
         options: how they are read.
         warnings: from reading the arrays.
-        rate_acts: whether `options.rate` has been used for `stamps`.
+        is_npy: whether they are of an .npy, with as many objects in each frame, and `stamps` made
+            by `options.rate`.
 
     Raises:
         KeypointFileError: an array is not usable, or an option contradicts it.
@@ -142,13 +146,14 @@ def _detections(
         confidence = _numbers(arrays, "confidence", np.float64, (m, q))
         points = np.concatenate([points[..., :2], confidence[..., None]], -1)
     frame = _frame_of_each(arrays, m)
-    frames, stamps = _frames_and_stamps(arrays, frame, options, rate_acts=rate_acts)
+    frames, stamps = _frames_and_stamps(arrays, frame, options, rate_acts=is_npy)
     scores = _scores(arrays, m, options)
     identities, warning = _identities(arrays, frame)
     warnings = [*warnings, warning] if warning else warnings
     given = points[..., 2] if points.shape[2] == 3 else np.ones((m, q))
     findings = confidence_scale(given) + find_origin(points[..., :2], given)
     observation = to_observation(points, options.min_confidence)
+    is_padding = _is_padding(points, options) if is_npy else np.zeros(m, bool)
     order = np.argsort(frame, kind="stable")
     kept = order[scores[order] >= options.min_score] if options.min_score else order
     if len(kept) < m:
@@ -165,7 +170,17 @@ def _detections(
         layout=layout,
         warnings=tuple(warnings),
         findings=tuple(findings),
+        is_padding=is_padding[kept],
     )
+
+
+def _is_padding(points: NDArray[Any], options: ReadOptions) -> NDArray[np.bool_]:
+    """Return which objects (m,) of (m, q, 2 or 3) have no keypoint, whatever its confidence.
+
+    A keypoint below `min_confidence` is one: the object is no padding, but is poorly seen.
+    """
+    found = without_value(to_observation(points), options.missing_value)
+    return np.asarray(~found.confidence.any(1))
 
 
 def _layout(arrays: Mapping[str, NDArray[Any]], options: ReadOptions) -> KeypointLayout | None:
