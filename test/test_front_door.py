@@ -230,6 +230,8 @@ def test_arrays_are_checked_as_files_are(
     if "no frame" not in complaint:
         judgement = model.provenance["judgement"]
         assert judgement["doubtful"] and re.search(complaint, judgement["reason"])
+        told = " ".join([judgement["reason"], *judgement["faults"]])
+        assert " --" not in told and "(--" not in told and "image_width" not in told
 
 
 def test_each_sequence_is_checked_by_itself() -> None:
@@ -241,12 +243,18 @@ def test_each_sequence_is_checked_by_itself() -> None:
         train(*given, layout=HUMAN25, recipe=recipe, sequence_starts=(0, 60, 120))
 
 
+def test_a_model_of_the_package_is_not_hidden() -> None:
+    with pytest.raises(ValueError, match="name is 'human', the name of a model that comes with"):
+        train(np.ones((5, 25, 2)), layout=HUMAN25, name="human")
+
+
 def test_frames_that_show_nothing_are_padding() -> None:
     points, _ = in_layout(HUMAN25, 60)
     padded = np.concatenate([points, np.full_like(points, np.nan), 0 * points])
     recipe = Recipe(steps=1, learning_rate=1e-7, batch=4)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
+        train(padded, layout=HUMAN25, recipe=recipe, sequence_starts=None)
         train(padded, layout=HUMAN25, recipe=recipe, sequence_starts=(0, 60, 120))
     assert not [each for each in caught if "too few keypoints" in str(each.message)]
 

@@ -33,6 +33,7 @@ SERIOUS = {
 _PERSON = {"left_hip", "left_ankle", "left_shoulder"}  # keypoints of every layout of people
 _MOST_CHECKED = 100_000  # frames
 _NUMBER = re.compile(r"[-+]?\d[\d.,e+]*")
+_COUNTS = re.compile(r"(?<![\d.])(\d+)(%?) of (the )?(\d+)(?![\d.]*\d)")
 _SAME_POINT = 1e-3  # of the size of the data, within which two files have the same keypoint
 _COMPARED = 200  # frames
 
@@ -105,7 +106,8 @@ def serious(findings: Iterable[SourceFinding]) -> list[SourceFinding]:
 def sentences(findings: Iterable[SourceFinding], *, is_brief: bool = False) -> list[str]:
     """Return a sentence for each kind of finding, with the sources in which it was found.
 
-    Of findings that differ in their numbers alone, the numbers of the first one are told.
+    Of findings that differ in their numbers alone, counts such as "5 of 60" and "8% of the 60" are
+    summed, and other numbers are those of the first one.
 
     Args:
         findings: of any sources.
@@ -117,9 +119,29 @@ def sentences(findings: Iterable[SourceFinding], *, is_brief: bool = False) -> l
     said = []
     for kind in kinds.values():
         sources = in_words(dict.fromkeys(each.source for each in kind if each.source))
-        text = kind[0].finding.symptom if is_brief else str(kind[0].finding)
+        found = [each.finding for each in kind]
+        text = _summed([each.symptom if is_brief else str(each) for each in found])
         said.append(f"{sources}: {text}" if sources else text)
     return said
+
+
+def _summed(texts: list[str]) -> str:
+    """Return the first of texts that differ in their numbers alone, with the sum of all counts."""
+    found = [list(_COUNTS.finditer(text)) for text in texts]
+    if len(texts) < 2 or len({len(each) for each in found}) > 1:
+        return texts[0]
+    parts, at = list[str](), 0
+    for same in zip(*found, strict=True):
+        totals = [int(each[4]) for each in same]
+        parts.append(texts[0][at : same[0].start()])
+        if same[0][2]:
+            counts = sum(int(each[1]) * n for each, n in zip(same, totals, strict=True))
+            parts.append(f"{counts / max(sum(totals), 1):.0f}%")
+        else:
+            parts.append(str(sum(int(each[1]) for each in same)))
+        parts.append(f" of {same[0][3] or ''}{sum(totals)}")
+        at = same[0].end()
+    return "".join([*parts, texts[0][at:]])
 
 
 def never_seen(dataset: Dataset, start: Model | None = None) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,6 +39,7 @@ from deep_nrsfm_ros.training.data_check import (
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
 from deep_nrsfm_ros.training.python_names import in_python
+from deep_nrsfm_ros.training.same_name import check_not_shipped
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.progress import Progress
@@ -57,7 +58,7 @@ def train(
     name: str = "trained",
     start: Model | str | Path = "",
     recipe: Recipe | None = None,
-    sequence_starts: Sequence[int] = (),
+    sequence_starts: Sequence[int] | None = (),
     on_progress: Callable[[Progress], None] = lambda progress: None,
     on_message: Callable[[str], None] = lambda sentence: None,
 ) -> Model:
@@ -68,10 +69,18 @@ def train(
     data and the result are Python warnings.
 
     Where the object has a model, the new one is compared with it without labels, on the last tenth
-    of each sequence, which the training does not use. `provenance["judgement"]` of the result has
-    `doubtful` (a bool), `reason` (the sentence on it) and the figures of both; `on_message` gets
-    the sentence, and a doubtful model gives a warning. A model of data that looks wrong is
-    doubtful, too.
+    of each sequence, which the training does not use. A model of data that looks wrong is
+    doubtful, whatever its figures. `on_message` gets what the judge says, and a doubtful model
+    gives a warning. `provenance["judgement"]` of the result is a dict:
+
+    - `verdict`: "better", "as_good", "alone" (no model of the package has these keypoints) or
+      "doubtful"; `doubtful`: whether it is the last one.
+    - `reason`: the verdict as a sentence, with what would help.
+    - `figures`: of the new model by their names, such as `residual`, `bone_variation` and
+      `mirrored_share`; less is better.
+    - `rival`, `rival_figures`: name and figures of the model that it is compared with; there only
+      if there is one.
+    - `faults`: what looks wrong in the data, a sentence each; there only if something does.
 
     Args:
         points: (f, p, 2) keypoints of f frames, x right and y down, in pixels or another unit that
@@ -87,7 +96,7 @@ def train(
         hands: what is known of recorded hands, which must all be right ones: "right"; "left", which
             are mirrored; "palms" where each shows its palm, so that left ones are seen and
             mirrored. "": nothing.
-        name: name of the model.
+        name: name of the model, not one of the package's: yours would hide it.
         start: model to start from, its name or its file. "" is a model that comes with the package
             and has most keypoints of the layout, if there is one; "none" is random weights.
         recipe: steps, seed and all else of the training; None stands for the defaults: from a
@@ -96,7 +105,8 @@ def train(
             look.
         sequence_starts: first frames of the recordings, views or people in the points, the frames
             of each in the order of their time: (0, 500) where 500 frames of one camera come first.
-            (0,): one recording. (): unknown, each quarter of the frames counts as a sequence.
+            (0,): one recording. () or None: unknown, each quarter of the frames counts as a
+            sequence.
         on_progress: called every few seconds from the first step on, and at the end.
         on_message: called with a sentence when work of up to minutes begins before the first step,
             such as the factorisations of at most `Recipe.few_frames` frames, and at the end with
@@ -105,7 +115,8 @@ def train(
     Raises:
         MissingExtraError: torch is not installed.
         ValueError: the arrays do not fit each other or the layout, the keypoints are clearly in
-            another layout, or a model cannot be learned from them.
+            another layout, or a model cannot be learned from them; or the name is that of a model
+            that comes with the package.
     """
     require_extra("train", "training")
     from deep_nrsfm_ros.training.finish import finish
@@ -115,11 +126,12 @@ def train(
     from deep_nrsfm_ros.training.setup import Setup
 
     check_name("name", name)
+    check_not_shipped("name", name)
     check_side("hands", hands)
     layout = layout_of("layout", layout, name)
     with _python_names():
         seen = from_arrays(points, confidence, layout)
-        starts = np.array(sequence_starts, np.int64)
+        starts = np.array(() if sequence_starts is None else sequence_starts, np.int64)
         visible = seen.confidence > 0
         data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
         findings = _findings(points, confidence, seen, data)
@@ -162,8 +174,17 @@ def train(
     if judgement.doubtful:
         warnings.warn(in_python(judgement.brief), stacklevel=2)
     date = time.strftime("%Y-%m-%d", time.gmtime())
-    model.provenance.update(date=date, judgement=judgement.record())
+    model.provenance.update(date=date, judgement=_in_python(judgement.record()))
     return model
+
+
+def _in_python(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the record of a judgement with its sentences in Python's words."""
+    return record | {
+        key: in_python(text) if isinstance(text, str) else [in_python(each) for each in text]
+        for key, text in record.items()
+        if key in ("reason", "faults")
+    }
 
 
 @contextmanager

@@ -115,7 +115,7 @@ def _duplicate(path: Path, other: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def check_not_shipped(option: str, name: str, folder: Path) -> None:
+def check_not_shipped(option: str, name: str, folder: Path | None = None) -> None:
     """Raise ValueError for the name of a model of the package, which the new one would hide.
 
     In the package's own folders of models it may be trained anew.
@@ -123,11 +123,11 @@ def check_not_shipped(option: str, name: str, folder: Path) -> None:
     Args:
         option: what gives the name, for the message.
         name: name of the new model.
-        folder: its folder.
+        folder: its folder; None: unknown.
     """
-    own = {each.resolve() for each in model_folders(folder)[1:]}
     shipped = {path.stem for path in shipped_models()}
-    if name in shipped and folder.expanduser().resolve() not in own:
+    own = {each.resolve() for each in model_folders(folder)[1:]} if folder else set()
+    if name in shipped and not (folder and folder.expanduser().resolve() in own):
         raise ValueError(
             f"{option} is {name!r}, the name of a model that comes with the package and that yours "
             f"would hide; choose another, such as 'my_{name}'"

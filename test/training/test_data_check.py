@@ -72,6 +72,24 @@ def test_findings_of_one_kind_are_one_sentence() -> None:
     assert sentences([bare], is_brief=True) == ["a"] and sentences([bare]) == ["a: b; c"]
 
 
+def test_counts_of_findings_of_one_kind_are_summed() -> None:
+    texts = ("87 of 2500 visible keypoints lie at (-1, -1): mend it", "13 of 500 {}", "0 of 0 {}")
+    rest = texts[0].partition("2500 ")[2]
+    findings = [
+        SourceFinding(f"{i}.npy", Finding("sentinel", text.format(rest)))
+        for i, text in enumerate(texts)
+    ]
+    assert sentences(findings) == [
+        "0.npy, 1.npy, 2.npy: 100 of 3000 visible keypoints lie at (-1, -1): mend it"
+    ]
+    shares = [
+        SourceFinding("", Finding("handedness", f"{share}% of the {n} people whose face is seen"))
+        for share, n in ((100, 51), (98, 55))
+    ]
+    assert sentences(shares) == ["99% of the 106 people whose face is seen"]
+    assert sentences(shares, is_brief=True) == sentences(shares)
+
+
 def test_copies() -> None:
     def dataset(points: np.ndarray, visible: np.ndarray = CONFIDENCE > 0) -> Dataset:
         return Dataset(points.astype(np.float32), visible, COCO17, "test")
