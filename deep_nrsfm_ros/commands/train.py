@@ -16,6 +16,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.configuration import add_arguments
@@ -39,6 +40,9 @@ from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments
 from deep_nrsfm_ros.training.run import TrainingResult, run
+
+if TYPE_CHECKING:  # it imports torch
+    from deep_nrsfm_ros.training.judge import Judgement
 
 CANCELLED = 128 + signal.SIGINT
 """Exit code of a training that was stopped, by whatever signal."""
@@ -128,7 +132,8 @@ def parser() -> argparse.ArgumentParser:
         dest="start",
         metavar="MODEL",
         help="start from this model, a name or a file; none = from random weights (default: a "
-        "model that comes with the package and has most keypoints of the object, if there is one)",
+        "model that comes with the package and has most keypoints of the object, if there is one; "
+        "with --cmu none)",
     )
     run.add_argument(
         "--preset",
@@ -232,19 +237,22 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
     page = write_page(result, reporter)
     lines += [f"report {page}"] if page else []
     if not reporter.as_json and result.state == "finished":  # else the lifter says it
-        is_doubtful = judgement is not None and judgement.doubtful
-        lines += _next_steps(result.model.layout, result.path, is_doubtful=is_doubtful)
+        lines += _next_steps(result.model.layout, result.path, judgement)
     message = ("; " if reporter.as_json else "\n  ").join(lines)
     if not reporter.as_json:
         message = message.replace(". Judged ", "\n  judged ")
     reporter.end(result.state, message, model=str(result.path), report=page, **values)
 
 
-def _next_steps(layout: KeypointLayout, path: Path, *, is_doubtful: bool) -> list[str]:
+def _next_steps(layout: KeypointLayout, path: Path, judgement: Judgement | None) -> list[str]:
     """Return how a model is put in use, and how it is measured if it lifts people."""
     known = path.parent.resolve() == default_models_dir().resolve()
     name = path.stem if known else str(path)
-    use = "not in use, but you can look at what it lifts" if is_doubtful else "use it"
+    use = "use it"
+    if judgement and judgement.doubtful:
+        use = "not in use, but you can look at what it lifts"
+    elif judgement and judgement.is_first_look:
+        use = "too few steps for use, but you can look at what it lifts"
     lines = [
         f"{use}: lift FILE --model {name}, or in a lifter: ros2 param set /lifter model {path.stem}"
     ]

@@ -23,6 +23,7 @@ from deep_nrsfm_ros.data.hands import MIXED, mixed_sides
 from deep_nrsfm_ros.data.held_out import Split
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout, Tetrahedron
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import Finding
@@ -34,6 +35,7 @@ from deep_nrsfm_ros.training.data_check import SourceFinding, sentences, serious
 from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
+from deep_nrsfm_ros.training.steps import FROM_RANDOM
 
 Floats = NDArray[Any]
 
@@ -147,6 +149,12 @@ MOST_MIRRORED = 0.05
 """Share of mirrored frames above which a model is doubtful where there is none to compare with."""
 
 
+FEW_STEPS = 2000
+"""Steps from random weights below which more steps help."""
+LEARNED_RESIDUAL = 0.05
+"""Residual above which a model of few steps is a first look: it has learned too little for use."""
+
+
 class Rank(NamedTuple):
     """What orders models on the same frames; the least is the best.
 
@@ -178,6 +186,8 @@ class Judgement(NamedTuple):
         shown: a sentence with a few figures of both; reason or summary ends with it.
         brief_reason: the reason, without the remedies of faults in the data; "": there are none.
         repeated: the end of the summary that is the layout's warning.
+        is_first_look: whether it has learned too little for use, in few steps from random weights,
+            and the verdict is ALONE.
     """
 
     reason: str
@@ -190,6 +200,7 @@ class Judgement(NamedTuple):
     shown: str = ""
     brief_reason: str = ""
     repeated: str = ""
+    is_first_look: bool = False
 
     @property
     def doubtful(self) -> bool:
@@ -214,6 +225,8 @@ class Judgement(NamedTuple):
         result["figures"] = _rounded(self.figures)
         if self.rival_figures:
             result |= {"rival": self.rival, "rival_figures": _rounded(self.rival_figures)}
+        if self.is_first_look:
+            result["first_look"] = True
         if self.faults:
             result["faults"] = list(self.faults)
         return result
@@ -279,17 +292,34 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
     if worse := worse_figures(new, old):
         reason = "; ".join(_in_words(each, new, old, name) for each in worse)
         if old is None and worse == ["front_disagreement"]:
-            reason += _fronts_in_words(comparison.fronts(model))
+            reason += _fronts_in_words(comparison.fronts(model), model)
         else:
             reason += f"; {_advice(model, name)} would help"
     if reason:
         verdict, reason = DOUBTFUL, f"{reason}. {shown}"
     in_sentence = _IN_SENTENCES[verdict].format(name, *_gains(new, old))
-    if verdict == ALONE:
+    is_first_look = _has_few_steps(model) and new.residual > LEARNED_RESIDUAL and verdict == ALONE
+    if is_first_look:
+        in_sentence = (
+            f"is a first look, and has no other to compare with: {model.provenance['step']} steps "
+            f"from random weights leave an image error of {percent(new.residual)}; {FROM_RANDOM} "
+            "steps are usual"
+        )
+    elif verdict == ALONE:
         in_sentence = f"has no other to compare with{_side_in_words(model.layout, new)}"
     summary = f"the new model {in_sentence}"
     summary += f". Judged {figures}"
-    return Judgement(reason, summary, new, name, old, verdict, shown=shown, repeated=repeated)
+    return Judgement(
+        *(reason, summary, new, name, old, verdict),
+        shown=shown,
+        repeated=repeated,
+        is_first_look=is_first_look,
+    )
+
+
+def _has_few_steps(model: Model) -> bool:
+    """Return whether a model has few steps from random weights."""
+    return "from" not in model.provenance and model.provenance.get("step", FEW_STEPS) < FEW_STEPS
 
 
 _IN_SENTENCES = {
@@ -387,14 +417,21 @@ def percent(share: float) -> str:
     return f"{value:.0f} %" if value >= 9.95 or value < 0.05 else f"{value:.1f} %"
 
 
-def _fronts_in_words(fronts: Sequence[tuple[Tetrahedron, float]]) -> str:
-    """Return where the fours of a handedness do not hold, the worst one first, and the remedy."""
+def _fronts_in_words(fronts: Sequence[tuple[Tetrahedron, float]], model: Model) -> str:
+    """Return where the fours of a handedness do not hold, the worst one first, and the remedy.
+
+    Several fours of a layout of the package hold, so that the model is at fault.
+    """
     four, behind = max(fronts, key=lambda each: each[1])
     left, right, up, front = four
+    where = f": {front} lies behind {left}, {right} and {up} in {percent(behind)}"
+    own = LAYOUTS.get(model.layout.name)
+    if own and len(fronts) > 1 and model.layout.handedness == own.handedness:
+        return f"{where}; {_advice(model, '')} would help"
+    several = "" if len(fronts) > 1 else ", or several, which vote"
     return (
-        f": {front} lies behind {left}, {right} and {up} in {percent(behind)}. This need not be "
-        "the model's fault: the layout's four may not always hold (as where an animal turns its "
-        "head). Name fours of a part that does not bend, or several, which vote"
+        f"{where}. This need not be the model's fault: the layout's four may not always hold (as "
+        f"where an animal turns its head). Name fours of a part that does not bend{several}"
     )
 
 
@@ -479,13 +516,16 @@ def _advice(model: Model, rival: str) -> str:
     advice = ["more views", "more frames"]
     if minutes := model.provenance.get("factorisation_needs_minutes"):
         advice.insert(0, f"more time (--minutes {minutes:g}, train.minutes, or no limit)")
+    elif _has_few_steps(model):
+        advice.insert(0, f"more steps (--steps {FROM_RANDOM}, train.steps)")
     if "from" in model.provenance:
         advice.append("fewer steps")
         advice.append("a larger share of the start (--start-share, train.start_share)")
     else:
         advice.append(f"a start from {rival or 'a model of such an object'} (--from, train.from)")
     if model.layout.edges and model.layout.handedness:
-        advice.append("the layout's losses (bone_length_weight, handedness_weight, depth_penalty)")
+        options = "--bone-length-weight, --handedness-weight, --depth-penalty, or train.*"
+        advice.append(f"the layout's losses ({options})")
     return f"{', '.join(advice[:-1])} or {advice[-1]}"
 
 

@@ -21,6 +21,7 @@ _TERMS = (
         "sides, or start from a model of such an object (start)",
     ),
     (r"\(--from, train.from\)", "(start)"),
+    (r"\(--steps (\d+), train.steps\)", r"(Recipe.steps, \1 are usual)"),
     (r"\(--start-share, train.start_share\)", "(Recipe.start_share)"),
     (r"--start-share ([\d.]+) keeps", r"Recipe(start_share=\1) keeps"),
     (

@@ -227,7 +227,9 @@ def _save(
         old: the model that has its name.
         judgement: of the new one; None: it was cut off.
     """
-    is_at_stake = old is not None and (old.is_good or _is_file_of(old, config.rival))
+    is_at_stake = old is not None and (
+        old.is_at_stake(model.layout, judgement) or _is_file_of(old, config.rival)
+    )
     name = name_beside(model.name, old if is_at_stake else None, judgement)
     path, note = config.output.folder / f"{name}{MODEL_SUFFIX}", ""
     if name != model.name:

@@ -3,7 +3,8 @@
 
 A good model, one that was trained to its end and is not doubtful, is replaced only by one that is
 not doubtful beside it. Whatever is replaced is kept once, as NAME_before. A doubtful model is
-written beside a good one as NAME_doubtful, and one that was cut off as NAME_unfinished.
+written beside a good one of the same object as NAME_doubtful, and one that was cut off as
+NAME_unfinished. A first look, of few steps from random weights, is no good model.
 """
 
 from __future__ import annotations
@@ -47,11 +48,22 @@ class OldModel(NamedTuple):
 
     @property
     def is_good(self) -> bool:
-        """Whether it was trained to its end and is not doubtful."""
+        """Whether it was trained to its end, is not doubtful and no first look."""
         if self.model is None or self.is_cut_off:
             return False
         judgement = self.model.provenance.get("judgement")
-        return not (isinstance(judgement, dict) and judgement.get("doubtful"))
+        if not isinstance(judgement, dict):
+            return True
+        return not (judgement.get("doubtful") or judgement.get("first_look"))
+
+    def is_at_stake(self, layout: KeypointLayout, judgement: Judgement | None) -> bool:
+        """Return whether a new model of a layout may not simply take the name of this good one.
+
+        Args:
+            layout: of the new model.
+            judgement: of it; None: it was cut off.
+        """
+        return self.is_good and (judgement is None or self.is_rival(layout))
 
     def is_rival(self, layout: KeypointLayout) -> bool:
         """Return whether a new model of a layout must be better: it is good and of one object."""

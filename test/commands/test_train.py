@@ -600,6 +600,39 @@ def test_a_good_model_of_the_name_is_compared_with_and_not_lost(
     assert ("mine", "better") in rows and ("mine_before", "at hand") in rows
 
 
+def test_a_good_model_of_another_object_gives_its_name(
+    tmp_path: Path,
+    models: Path,
+    arguments: list[str],
+    in_process: RunTraining,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "paw.yaml").write_text(PAW)
+    data = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"))
+    words = (*data, *QUICK, "--output", str(models), "--few-frames", "0", "--seeds", "1")
+    assert in_process(*words, "--steps", "1") == 0
+    good = mark_as_good(models / "mine.safetensors")
+    doubt = judge.Judgement("worse", "", judge.Figures(*[0.1] * 9))
+    monkeypatch.setattr(judge, "judge", lambda *_: doubt)
+    assert in_process(*arguments, "--steps", "3") == 0
+    assert "the model 'mine' that was there is kept as 'mine_before'" in capsys.readouterr().out
+    assert (models / "mine_before.safetensors").read_bytes() == good
+    assert not (models / "mine_doubtful.safetensors").exists()
+
+
+def test_a_first_look_is_not_offered_for_use(tmp_path: Path) -> None:
+    alone = judge.Judgement("", "it is alone", judge.Figures(*[0.1] * 9))
+    for judgement, use in (
+        (alone, "use it: lift FILE"),
+        (alone._replace(is_first_look=True), "too few steps for use, but you can look at what it"),
+        (alone._replace(reason="worse"), "not in use, but you can look at what it lifts: lift"),
+    ):
+        assert train._next_steps(HUMAN25, tmp_path / "mine.safetensors", judgement)[0].startswith(
+            use
+        )
+
+
 def test_a_new_model_must_be_better_than_the_one_at_hand_and_that_of_its_name(
     arguments: list[str], models: Path, in_process: RunTraining, monkeypatch: pytest.MonkeyPatch
 ) -> None:

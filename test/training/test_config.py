@@ -81,6 +81,12 @@ def test_a_training_of_people_starts_from_the_model_of_people_unless_told_otherw
     assert parsed("--cmu", "c", "--object", "human17").start == ""
 
 
+def test_motion_capture_starts_from_random_weights_and_the_help_says_so() -> None:
+    config = TrainingConfig.from_arguments(parser().parse_args(["--cmu", "FOLDER"]))
+    assert not config.start and not config.rival
+    assert "if there is one; with --cmu none)" in " ".join(parser().format_help().split())
+
+
 def test_the_command_line_reaches_every_option_of_the_parts() -> None:
     config = parsed(
         *("--bag", "a", "--bag", "b", "--topic", "/k", "--keypoint-layout", "coco17"),

@@ -14,6 +14,7 @@ import pytest
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.held_out import Split, split
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HAND21, HUMAN25
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import Finding
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -23,6 +24,7 @@ from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.judge import (
     Figures,
     Judge,
+    _fronts_in_words,
     judge,
     percent,
     rank,
@@ -403,7 +405,40 @@ def test_a_front_that_only_the_fours_of_the_layout_doubt_is_theirs(
     monkeypatch.setattr(module.Judge, "fronts", lambda self, model: [(four, 0.17)])
     reason = judge(Split(*parts), good, None).reason
     assert f"{names[3]} lies behind {names[0]}, {names[1]} and {names[2]} in 17 %" in reason
-    assert "four may not always hold" in reason and "more views" not in reason
+    assert "four may not always hold" in reason and "several, which vote" in reason
+    assert "more views" not in reason
+
+
+def test_several_fours_of_the_package_are_not_blamed(good: Model) -> None:
+    for layout, is_blamed in (
+        (HUMAN25, False),
+        (dataclasses.replace(HUMAN25, name="mine"), True),
+        (dataclasses.replace(HUMAN25, handedness=HUMAN25.handedness[1:]), True),
+        (HAND21, False),
+    ):
+        model = dataclasses.replace(good, layout=layout)
+        said = _fronts_in_words([(four, 0.4) for four in layout.handedness], model)
+        advice = "in 40 %; more steps (--steps 30000, train.steps), more views, "
+        assert ("animal" in said, advice in said) == (is_blamed, not is_blamed)
+        assert "several" not in said
+
+
+def test_few_steps_from_random_weights_are_a_first_look(
+    frames: Split, good: Model, bad: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deep_nrsfm_ros.training import judge as module
+
+    monkeypatch.setattr(module, "worse_figures", lambda *_: [])
+    alone = judge(frames, dataclasses.replace(bad, provenance={"step": 20}), None)
+    assert alone.is_first_look and alone.record()["first_look"]
+    assert str(alone).startswith(
+        "the new model is a first look, and has no other to compare with: 20 steps from random "
+        f"weights leave an image error of {percent(alone.figures.residual)}; 30000 steps are usual"
+    )
+    assert good.provenance["step"] < 2000 and not judge(frames, good, None).is_first_look
+    for other in ({"step": 2000}, {"step": 20, "from": {"model": "human"}}, {}):
+        later = judge(frames, dataclasses.replace(bad, provenance=other), None)
+        assert not later.is_first_look and "first_look" not in later.record()
 
 
 def test_hands_of_both_sides_are_doubtful(

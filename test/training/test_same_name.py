@@ -41,6 +41,7 @@ def save(folder: Path, **provenance: Any) -> Path:
         ({}, True),  # of an earlier version, or of motion capture
         ({"judgement": {"doubtful": False}}, True),
         ({"judgement": {"doubtful": True}}, False),
+        ({"judgement": {"doubtful": False, "first_look": True}}, False),
         ({CUT_OFF: True}, False),
     ],
 )
@@ -52,6 +53,13 @@ def test_a_finished_model_that_nobody_doubts_is_good(
     old = old_model(tmp_path, "mine")
     assert old and old.is_good == is_good and old.is_rival(HUMAN25) == is_good
     assert not old.is_rival(HAND21)  # of another object
+
+
+def test_a_model_of_another_object_gives_its_name(tmp_path: Path) -> None:
+    save(tmp_path)
+    old = old_model(tmp_path, "mine")
+    assert old and old.is_at_stake(HUMAN25, DOUBTED) and not old.is_at_stake(HAND21, DOUBTED)
+    assert old.is_at_stake(HAND21, None)  # it was cut off
 
 
 def test_a_file_that_cannot_be_read_is_kept_but_is_no_rival(tmp_path: Path) -> None:
