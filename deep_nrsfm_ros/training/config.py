@@ -83,8 +83,24 @@ class DataConfig:
         size = (self.image_width, self.image_height)
         return size if all(size) else None
 
+    def own_bags(self) -> list[Path]:
+        """Return the bags that `bags` names, each once."""
+        return _once(list(map(Path.expanduser, self.bags)))[0]
+
     def files(self) -> list[Path]:
-        """Return the recordings that `inputs` names, also those in its folders."""
+        """Return the recordings that `inputs` names, also those in its folders, each once.
+
+        One that `bags` names, too, is not among them.
+        """
+        bags = self.own_bags()
+        return _once([*bags, *self._named_files()])[0][len(bags) :]
+
+    def repeated(self) -> list[Path]:
+        """Return the bags and files that are named more than once."""
+        return _once([*map(Path.expanduser, self.bags), *self._named_files()])[1]
+
+    def _named_files(self) -> list[Path]:
+        """Return the recordings that `inputs` names, as often as it names them."""
         return [path for named in self.inputs for path in recordings(named.expanduser())]
 
 
@@ -331,6 +347,15 @@ def _flat(config: TrainingConfig) -> dict[str, Any]:
         else:
             flat[part.name] = value
     return flat
+
+
+def _once(paths: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Return each path once, and each of those that come again, by the files that they name."""
+    kept, again = dict[Path, Path](), dict[Path, Path]()
+    for path in paths:
+        whole = path.resolve()
+        (again if whole in kept else kept).setdefault(whole, path)
+    return list(kept.values()), list(again.values())
 
 
 def _absolute(path: Path) -> Path:

@@ -213,19 +213,22 @@ class _Reader:
 
     def read(self) -> list[Part]:
         """Return the objects in all bags and files; raise ValueError if there are none."""
+        if repeated := self._data.repeated():
+            names = in_words(path.name for path in repeated)
+            self._reporter.warn(f"named more than once: {names}; trained on once")
         bags, files = list(self._find_bags()), self._load_files()
         if self._choice:  # it looks at all of them
             files = _emptied(list(files))
             self._choice.choose()
         parts = self._read_bags(bags) if self._data.bags else []
-        parts += self._read_files(files, parts) if self._data.inputs else []
+        parts += self._read_files(files, parts) if self._data.files() else []
         if self._choice:
             self._choice.report(self._reporter)
         return parts
 
     def _find_bags(self) -> Iterator[_Found]:
         """Yield the bags that can be read, with their layouts."""
-        for bag in map(Path.expanduser, self._data.bags):
+        for bag in self._data.own_bags():
             if not self._choice:
                 yield _Found(bag, self._map.source)
                 continue
@@ -307,7 +310,7 @@ class _Reader:
                 whole = dataclasses.replace(concatenate([each for _, each in kept]), source=source)
             if kept:
                 parts.append(Part(whole, layout))
-        if not parts and not self._data.inputs:
+        if not parts and not self._data.files():
             raise failures[0]
         for failure in failures:
             reporter.warn(f"left out: {failure}")

@@ -85,15 +85,15 @@ def test_each_bag_and_file_is_taken_by_itself(
     bag = write(tmp_path / "bag", HUMAN17)
     other = write(tmp_path / "other", BODY25)
     found = read("--bag", bag, "--bag", other, "--input", tmp_path, "--object", "human17")
-    layouts = (HUMAN17, BODY25, *[COCO17] * 5, BODY25, HUMAN17, BODY25)
+    layouts = (HUMAN17, BODY25, *[COCO17] * 5, BODY25)
     together = np.concatenate([expected(layout, HUMAN17) for layout in layouts])
     seen = found.dataset.visible[..., None]
     np.testing.assert_allclose(found.dataset.points * seen, together * seen, rtol=1e-5)
     assert found.detector_layout == ""  # they are of several detectors
     said = capsys.readouterr().err
     assert "0.npz, 1.npz, 2.npz and 2 more: keypoint layout coco17: " in said
-    assert "bag, bag: keypoint layout human17: " in said
-    assert "other, b.npy, other: keypoint layout body25: " in said
+    assert "bag: keypoint layout human17: " in said
+    assert "other, b.npy: keypoint layout body25: " in said
 
 
 def test_files_of_one_form_share_a_layout(
@@ -221,6 +221,26 @@ def test_a_file_that_is_read_twice_is_named(
     read("--input", tmp_path, "--object", "coco17")
     said = capsys.readouterr().err
     assert "warning: the same keypoints twice: b.npy (of a.npz); leave the copies out" in said
+
+
+def test_what_is_named_twice_is_trained_on_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, bag = write(tmp_path / "a.npz", COCO17), write(tmp_path / "bag", HUMAN17)
+    once = len(read("--input", file, "--bag", bag, "--object", "human17").dataset)
+    assert "named more than once" not in capsys.readouterr().err
+    same = tmp_path / "bag" / ".." / "a.npz"
+    words = ("--bag", bag, "--bag", bag, "--input", bag, "--input", file, "--input", tmp_path)
+    found = read(*words, "--input", same, "--object", "human17")
+    said = capsys.readouterr().err
+    assert len(found.dataset) == once
+    assert "warning: named more than once: bag, a.npz; trained on once" in said
+    assert "the same keypoints" not in said
+    damaged = tmp_path / "damaged"
+    damaged.mkdir()
+    (damaged / "damaged.mcap").write_bytes(b"no bag")
+    with pytest.raises(ValueError, match="damaged"):
+        read("--bag", damaged, "--input", damaged, "--object", "human17")
 
 
 def test_the_page_names_the_layout_for_the_lifter(
