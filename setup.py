@@ -65,7 +65,7 @@ setup(
     package_data={
         NAME: [
             *("py.typed", "kernel/*.pyi", "layouts/presets/*.yaml", "layouts/trees/*.yaml"),
-            *("data/clip.npz", "data/clip_licence.txt"),
+            *("data/clip.npz", "data/clip_standing.npz", "data/clip_licence.txt"),
             *("reporting/*.j2", "reporting/*.css", "reporting/*.js"),
         ]
     },

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the clip that comes with the package from the wheel of Pose2Sim.
+"""Make the clips that come with the package from the wheel of Pose2Sim.
 
-    python -m docs.make_clip     # OpenCV decodes the videos: pip install '.[examples,demo]'
+    python -m docs.make_clip     # after `make demo-live`, which installs OpenCV and MediaPipe
 
-Writes `deep_nrsfm_ros/data/clip.npz`; the wheel is fetched to `.cache`.
+Writes `clip.npz` and `clip_standing.npz` in `deep_nrsfm_ros/data`; the wheel is fetched to
+`.cache`, MediaPipe's results are kept in `runs/benchmarks`.
 """
 
 from __future__ import annotations
@@ -16,8 +17,24 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from deep_nrsfm_ros.data.clip import IMAGE_STEP, Clip, Images, write_clip
-from deep_nrsfm_ros.data.pose2sim import View, extract_videos, fetch_wheel, read_session
+from benchmarks.data.pose2sim_scenes import scenes
+from deep_nrsfm_ros.data.clip import (
+    BALANCING,
+    FILES,
+    IMAGE_STEP,
+    STANDING,
+    Clip,
+    Images,
+    write_clip,
+)
+from deep_nrsfm_ros.data.pose2sim import (
+    Session,
+    View,
+    extract_videos,
+    fetch_wheel,
+    read_session,
+)
+from deep_nrsfm_ros.layouts.presets import BODY25B, MEDIAPIPE33
 
 _ASPECT = 0.8  # width / height of the images
 _HEIGHT = 340  # pixels of the images
@@ -51,16 +68,38 @@ def cut_out(view: View, video: Path) -> Images:
     return Images(tuple(files), corner.astype(np.float64), float(scale), size)
 
 
+def standing(moving: Session) -> Session:
+    """Return the person who stands: MediaPipe's keypoints, and ground truth made of them."""
+    _, still, (_, pixels) = scenes(Path("runs/benchmarks"))
+    views = tuple(
+        View(
+            view.camera,
+            np.nan_to_num(scene.mediapipe.points).astype(np.float32),
+            scene.mediapipe.confidence.astype(np.float32),
+            0.0,
+            scene.truth,
+        )
+        for view, scene in zip(moving.views, still, strict=True)
+    )
+    camera, truth = views[0].camera, views[0].truth
+    world = (truth - camera.translation) @ camera.rotation
+    return Session(views, world, (pixels, pixels), moving.pixels_given)
+
+
 def main() -> None:
-    """Write the file."""
+    """Write the files."""
     wheel = fetch_wheel(Path(".cache"))
-    session = read_session(wheel)
-    with tempfile.TemporaryDirectory() as folder:
-        videos = extract_videos(wheel, "Balancing", Path(folder))
-        images = tuple(cut_out(view, videos[view.camera.name]) for view in session.views)
-    path = Path("deep_nrsfm_ros/data/clip.npz")
-    write_clip(path, Clip(session, images))
-    print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+    moving = read_session(wheel)
+    for trial, video, session, layout in (
+        (BALANCING, "Balancing", moving, BODY25B),
+        (STANDING, "Static", standing(moving), MEDIAPIPE33),
+    ):
+        with tempfile.TemporaryDirectory() as folder:
+            videos = extract_videos(wheel, video, Path(folder))
+            images = tuple(cut_out(view, videos[view.camera.name]) for view in session.views)
+        path = Path("deep_nrsfm_ros/data") / FILES[trial]
+        write_clip(path, Clip(session, images, layout))
+        print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

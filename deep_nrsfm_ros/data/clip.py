@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The clip that comes with the package: a real person, four calibrated cameras, ground truth.
+"""The clips that come with the package: a real person, four calibrated cameras, ground truth.
 
-It is the balancing trial of Pose2Sim's demo session (`data/pose2sim.py`), made smaller: detections
-and ground truth as they are, and the images around the person. `clip_licence.txt` has its licence.
+They are the two trials of Pose2Sim's demo session (`data/pose2sim.py`), made smaller: detections
+and ground truth, and the images around the person. `clip_licence.txt` has their licence. Balancing:
+the detections and the calibration of the session. Standing: MediaPipe's keypoints of the images,
+and ground truth triangulated from them, since the session has no real detections of this trial.
 """
 
 from __future__ import annotations
@@ -16,11 +18,15 @@ import numpy as np
 
 from deep_nrsfm_ros.data.cameras import Array, Camera
 from deep_nrsfm_ros.data.pose2sim import Session, View
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import BODY25B, preset
 
 IMAGE_STEP = 2
 """Every second frame has an image."""
 
-_FILE = "clip.npz"
+BALANCING, STANDING = "balancing", "standing"
+FILES = {BALANCING: "clip.npz", STANDING: "clip_standing.npz"}
+"""File of each clip."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +58,21 @@ class Clip:
     Attributes:
         session: the world has z up, its unit is mm, and the floor is at z = 0.
         images: of each view of the session.
+        layout: of the detections.
     """
 
     session: Session
     images: tuple[Images, ...]
+    layout: KeypointLayout = BODY25B
 
 
-def read_clip() -> Clip:
-    """Return the clip of the package."""
-    with (files("deep_nrsfm_ros.data") / _FILE).open("rb") as file, np.load(file) as arrays:
+def read_clip(trial: str = BALANCING) -> Clip:
+    """Return a clip of the package.
+
+    Args:
+        trial: a key of `FILES`.
+    """
+    with (files("deep_nrsfm_ros.data") / FILES[trial]).open("rb") as file, np.load(file) as arrays:
         return _clip(arrays)
 
 
@@ -87,6 +99,7 @@ def write_clip(path: Path, clip: Clip) -> None:
         "image_sizes": [each.size for each in images],
         "images": np.frombuffer(b"".join(files), np.uint8),
         "image_lengths": np.reshape([len(file) for file in files], (len(images), -1)),
+        "layout": clip.layout.name,
     }
     np.savez_compressed(path, **arrays)
 
@@ -121,4 +134,5 @@ def _clip(arrays: Any) -> Clip:
         images.append(
             Images(own, arrays["corners"][i], float(arrays["scales"][i]), (width, height))
         )
-    return Clip(session, tuple(images))
+    layout = preset(str(arrays["layout"])) if "layout" in arrays else BODY25B
+    return Clip(session, tuple(images), layout)

@@ -45,8 +45,8 @@ class View:
 
     Attributes:
         camera: after refinement.
-        points: (f, 25, 2) in pixels, layout BODY25B.
-        confidence: (f, 25) in [0, 1].
+        points: (f, q, 2) in pixels, layout BODY25B unless a clip says another.
+        confidence: (f, q) in [0, 1].
         delay: frames by which the camera is behind the first camera.
         truth: (f, 12, 3) positions of `JOINTS` in the camera's optical frame, in mm; NaN where
             unknown.

@@ -8,7 +8,7 @@ page of it, `stage_pictures` makes images.
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,13 +119,16 @@ def make_stage(
     return Stage(source, target, KeypointLayout("truth", JOINTS, edges), tuple(views))
 
 
-def stage_page(stage: Stage, title: str, notes: Sequence[str]) -> str:
+def stage_page(
+    stage: Stage, title: str, notes: Sequence[str], links: Mapping[str, str] | None = None
+) -> str:
     """Return a stage as one HTML page that opens offline.
 
     Args:
         stage: to show.
         title: of the page.
         notes: sentences below the title.
+        links: other pages below the title, from what they show to their files.
     """
     head = {
         "source": _drawn(stage.source),
@@ -141,6 +144,7 @@ def stage_page(stage: Stage, title: str, notes: Sequence[str]) -> str:
         ["orbit.js", "stage.js"],
         title=title,
         notes=notes,
+        links=links or {},
         grid=GRID,
         stage=embedded(head),
     )

@@ -114,6 +114,8 @@ def test_demo_from_keypoints_to_trained_model(
     assert all(row[1] == "100" and 10 <= float(row[2]) <= 100 for row in table[1:])
     assert len(read_points(output / "lifted")) >= 200
     assert len(said.splitlines()) <= 40 and (output / "demo.html").as_uri() in said
+    assert 'href="standing.html"' in (output / "demo.html").read_text()
+    assert 'href="demo.html"' in (output / "standing.html").read_text()
     assert (output / "demo.png").read_bytes().startswith(b"\x89PNG")
     assert load_model(output / "models" / "demo.safetensors").layout == HUMAN17
     assert said.count("mm aligned") == 2  # of both models

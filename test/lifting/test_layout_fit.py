@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.data.walking_person import in_layout
+from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17, LAYOUTS
@@ -37,6 +38,16 @@ def test_the_layout_of_seventeen_keypoints(human: Model, name: str) -> None:
     other = next(fit for fit in fits if fit.layout.name in {"human17", "coco17"} - {name})
     finding = better_layout(fits, other.layout, other.residual)
     assert finding and f"is it {name}? It fits {fits[0].residual:.2f}" in finding.message
+
+
+@pytest.mark.parametrize("name", ["coco17", "posetrack18_17"])
+def test_a_layout_without_some_keypoints_of_another_is_told_from_it(
+    human: Model, name: str
+) -> None:
+    columns = [LAYOUTS["body25b"].index(keypoint) for keypoint in LAYOUTS[name].keypoints]
+    for view in read_clip().session.views:
+        found = fit_layouts(view.points[:, columns], view.confidence[:, columns], human)
+        assert found[0].layout.name == name
 
 
 def test_keypoints_of_which_no_layout_is_known(human: Model) -> None:

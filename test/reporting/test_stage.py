@@ -54,6 +54,12 @@ def page(stage: Stage, tmp_path_factory: pytest.TempPathFactory) -> str:
     return path.as_uri()
 
 
+def test_a_page_links_to_another(stage: Stage) -> None:
+    page = stage_page(stage, "a person", [], {"a & b": "other.html"})
+    assert '<a href="other.html">a &amp; b</a>' in page
+    assert "<a " not in stage_page(stage, "a person", ["a note"])
+
+
 def test_page_shows_images_and_a_fitted_person(tab: Any, page: str) -> None:
     tab.open(page)
     tab.press("t")

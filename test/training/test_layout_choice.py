@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -104,8 +103,6 @@ def test_files_of_one_form_share_a_layout(
         data = np.concatenate([view.points, view.confidence[..., None]], -1)[:, :body]
         keypoints.append(tmp_path / f"{i}.npy")
         np.save(keypoints[-1], data)
-    read("--input", keypoints[1])  # alone it is taken for a layout that is nearly the same
-    assert "1.npy: keypoint layout posetrack18_17: " in capsys.readouterr().err
     found = read("--input", tmp_path)
     said = capsys.readouterr().err
     assert "0.npy, 1.npy, 2.npy and 1 more: keypoint layout coco17: it fits" in said
@@ -157,8 +154,7 @@ def test_a_layout_that_is_clearly_wrong_is_refused(
     place = ("--name", "mine", "--output", str(tmp_path), "--steps", "1", "--threads", "1")
     assert in_process(*words, *place) == 2
     said = capsys.readouterr().err
-    told = f"failed: {re.escape(str(wrong))}: poor fit as human25: is it body25\\? It fits 0.0\\d "
-    assert re.search(told, said)
+    assert f"failed: {wrong}: poor fit as human25: is it body25? It fits 0.0" in said
     assert "set the keypoint layout to body25 (--keypoint-layout, train.keypoint_layout)" in said
     assert not list(tmp_path.glob("*mine*"))
 

@@ -18,27 +18,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.commands.program import Parser, program, program_name
-from deep_nrsfm_ros.data.clip import Clip, read_clip
+from deep_nrsfm_ros.data.clip import STANDING, Clip, read_clip
 from deep_nrsfm_ros.data.detections import gather, stamps_at
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, View
 from deep_nrsfm_ros.data.recording import lift_recording
 from deep_nrsfm_ros.extras import is_installed, require_extra
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import BODY25B
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
-from deep_nrsfm_ros.nrsfm.metrics import camera_errors
+from deep_nrsfm_ros.nrsfm.metrics import CameraErrors, camera_errors
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.reporting.stage import Stage, make_stage, stage_page
 
 TORSO = 0.5
 """Metres from the neck to the middle of the hips that the demo assumes of the person."""
-PAGE, PICTURE = "demo.html", "demo.png"
+PAGE, PICTURE, STANDING_PAGE = "demo.html", "demo.png", "standing.html"
+_TITLE = "A person in 3D, from one camera at a time"
 _NOTES = (
     f"place and size from the camera's intrinsics and an assumed torso of {TORSO} m; "
     "nothing is fitted to the ground truth",
+)
+_STANDING_NOTES = (
+    *_NOTES,
+    "keypoints by MediaPipe; the ground truth is triangulated from them",
 )
 
 
@@ -94,8 +100,14 @@ def read_model(name: str, output: Path) -> Model:
     return model
 
 
-def lift_view(view: View, model: Model) -> NDArray[np.floating]:
-    """Return the lifted points (f, p, 3) of one camera in its optical frame, in metres."""
+def lift_view(view: View, model: Model, layout: KeypointLayout = BODY25B) -> NDArray[np.floating]:
+    """Return the lifted points (f, p, 3) of one camera in its optical frame, in metres.
+
+    Args:
+        view: what the camera saw.
+        model: lifts it.
+        layout: of the view's keypoints.
+    """
     frames = [
         Observation(view.points[i : i + 1], view.confidence[i : i + 1])
         for i in range(len(view.points))
@@ -103,12 +115,12 @@ def lift_view(view: View, model: Model) -> NDArray[np.floating]:
     detections = gather(
         frames,
         stamps_at(RATE, len(frames)),
-        len(BODY25B),
+        len(layout),
         view.camera.name,
         ["person"] * len(frames),
     )
     lifter = Lifter(model, LiftingOptions(reference_length=TORSO))
-    recording = lift_recording(detections, BODY25B, lifter, intrinsics=view.camera.intrinsics)
+    recording = lift_recording(detections, layout, lifter, intrinsics=view.camera.intrinsics)
     shapes: NDArray[np.floating] = recording.lifted.shapes
     return shapes
 
@@ -127,12 +139,16 @@ def write_keypoints(clip: Clip, output: Path) -> None:
 
 
 def show(stage: Stage, output: Path) -> str:
-    """Write page and picture of a stage; return a sentence that names the page."""
+    """Write page and picture of a stage; return a sentence that names the page.
+
+    The page links to that of the person who stands, where there is one.
+    """
     output.mkdir(parents=True, exist_ok=True)
     page = output / PAGE
-    page.write_text(
-        stage_page(stage, "A person in 3D, from one camera at a time", _NOTES), encoding="utf-8"
-    )
+    links = {"the same person, standing": STANDING_PAGE}
+    if not (output / STANDING_PAGE).exists():
+        links = {}
+    page.write_text(stage_page(stage, _TITLE, _NOTES, links), encoding="utf-8")
     if is_installed("PIL"):
         from deep_nrsfm_ros.reporting.stage_image import draw_picture
 
@@ -158,24 +174,52 @@ def run(args: argparse.Namespace) -> None:
         f"{len(clip.session.views)} cameras saw a person for {len(clip.session.world) / RATE:.1f} "
         f"s; the ground truth is triangulated from all of them ({truth:.1f} px off on average)"
     )
-    lifted = []
-    for view in clip.session.views:
-        shapes = lift_view(view, model)
-        lifted.append(shapes)
-        known = np.isfinite(shapes).all((1, 2))
-        limbs = [model.layout.index(joint) for joint in JOINTS]
-        error = camera_errors(1000 * shapes[known][:, limbs], view.truth[known])
+    lifted = [lift_view(view, model) for view in clip.session.views]
+    for view, shapes in zip(clip.session.views, lifted, strict=True):
+        known, error = errors_of(view, shapes, model)
         say(
             f"{view.camera.name}: {known.sum()} of {len(known)} frames lifted; joints are "
             f"{error.aligned:.0f} mm off after alignment, the rotation {error.rotation:.0f} degrees"
         )
     write_keypoints(clip, args.output)
+    write_standing(model, args.output)
     show(stage_of(clip, model, lifted), args.output)
+
+
+def errors_of(
+    view: View, shapes: NDArray[np.floating], model: Model
+) -> tuple[NDArray[np.bool_], CameraErrors]:
+    """Return which frames (f,) are lifted, and how far these are off.
+
+    Args:
+        view: has the ground truth.
+        shapes: (f, p, 3) lifted points, as `lift_view` returns them.
+        model: of the p keypoints.
+    """
+    known = np.isfinite(shapes).all((1, 2))
+    limbs = [model.layout.index(joint) for joint in JOINTS]
+    return known, camera_errors(1000 * shapes[known][:, limbs], view.truth[known])
+
+
+def write_standing(model: Model, output: Path) -> None:
+    """Lift the person who stands, write the page of it, and say how far the joints are off."""
+    clip = read_clip(STANDING)
+    lifted = [lift_view(view, model, clip.layout) for view in clip.session.views]
+    pairs = zip(clip.session.views, lifted, strict=True)
+    off = [f"{errors_of(view, shapes, model)[1].aligned:.0f}" for view, shapes in pairs]
+    stage = stage_of(clip, model, lifted)
+    output.mkdir(parents=True, exist_ok=True)
+    page = stage_page(stage, f"{_TITLE}: standing", _STANDING_NOTES, {"balancing": PAGE})
+    (output / STANDING_PAGE).write_text(page, encoding="utf-8")
+    say(
+        f"the same person standing, {len(clip.session.world)} frames: joints are {', '.join(off)} "
+        f"mm off by camera; the page links to {STANDING_PAGE}"
+    )
 
 
 def stage_of(clip: Clip, model: Model, lifted: Sequence[NDArray[np.floating]]) -> Stage:
     """Return the stage of the clip with its lifted points (f, p, 3) of each camera."""
-    return make_stage(clip.session, clip.images, BODY25B, model.layout, lifted)
+    return make_stage(clip.session, clip.images, clip.layout, model.layout, lifted)
 
 
 @program

@@ -29,6 +29,7 @@ from deep_nrsfm_ros.commands.demo.first_look import (
     say,
     show,
     stage_of,
+    write_standing,
 )
 from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
 from deep_nrsfm_ros.data.clip import read_clip
@@ -97,6 +98,7 @@ def run(given: argparse.Namespace) -> None:
                 client.announce(view.camera)
                 played.append(client.play(view.camera.name))
         lifted = evaluate(session, played, model.layout, bags["lifted"])
+        write_standing(model, given.output)
         page = show(stage_of(clip, model, lifted), given.output)
         if given.train_steps:
             with Client(process, bags["keypoints"], bags["trained"]) as client:
