@@ -196,7 +196,8 @@ def _warnings(frames: int, span: float, deformation: float, has_start: bool) -> 
             if has_start
             else f"{views}, so that depth rests on deformation alone and may come out mirrored; "
             "record the object from more sides, start from a model of such an object (--from, "
-            "train.from), or let the layout help (bone_length_weight, handedness_weight)"
+            "train.from), or let the layout help (--bone-length-weight, --handedness-weight, "
+            "or train.*)"
         )
     if deformation < _RIGID:
         warnings.append(

@@ -80,6 +80,8 @@ def train(
       `mirrored_share`; less is better.
     - `rival`, `rival_figures`: name and figures of the model that it is compared with; there only
       if there is one.
+    - `first_look`: True where few steps from random weights have taught too little for use, and
+      there is no rival; there only then.
     - `faults`: what looks wrong in the data, a sentence each; there only if something does.
 
     Args:

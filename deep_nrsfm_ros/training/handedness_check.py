@@ -40,6 +40,6 @@ def disagreement(
     return (
         f"the keypoints disagree on where the front is, so that depth is wrong in part ({listing} "
         "of the frames where it belongs); record the object from more sides, start from a model "
-        "of such an object (--from, train.from), or let the layout help (bone_length_weight, "
-        "handedness_weight)"
+        "of such an object (--from, train.from), or let the layout help (--bone-length-weight, "
+        "--handedness-weight, or train.*)"
     )
