@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.body.person_height import trunk_length
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
-from deep_nrsfm_ros.lifting.intrinsics import MAX_FIELD_OF_VIEW, Intrinsics
+from deep_nrsfm_ros.lifting.intrinsics import MAX_FIELD_OF_VIEW, Intrinsics, check_field_of_view
 
 
 @dataclass(frozen=True)
@@ -128,10 +128,12 @@ class FieldOfViewOptions:
         """Return the camera of an image of that width and height in pixels; None: unknown.
 
         Raises:
-            ValueError: the field of view is known, and the size of the image is not.
+            ValueError: the field of view is known, and the size of the image is not; or nobody
+                has such a field of view.
         """
         if not self.field_of_view:
             return None
+        check_field_of_view(self.field_of_view)
         if image_size is None:
             raise ValueError(
                 f"field_of_view is {self.field_of_view:g} and needs the size of the image: set "
