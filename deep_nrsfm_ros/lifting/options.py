@@ -115,10 +115,10 @@ class FieldOfViewOptions:
         "horizontal angle of view in degrees (of the width of the whole image, upright or not) of "
         "a camera that is not calibrated: with the size of the image (image_width, image_height) "
         "it takes the place of a CameraInfo, so that objects are lifted to their places in the "
-        "optical frame; 0 = unknown, 60 to 70 typical of webcams and of phones held sideways, 40 "
-        "to 50 of phones held upright, 90 wide; a diagonal of 78 in a data sheet is 70 here, at "
-        "16:9; if it is wrong, distances are off in proportion to the focal length, rotations by "
-        "a few degrees",
+        "optical frame; 0 = unknown, else at least 10, 60 to 70 typical of webcams and of phones "
+        "held sideways, 40 to 50 of phones held upright, 90 wide; a diagonal of 78 in a data sheet "
+        "is 70 here, at 16:9; if it is wrong, distances are off in proportion to the focal length, "
+        "rotations by a few degrees",
         low=0.0,
         high=MAX_FIELD_OF_VIEW,
         read_only=True,

@@ -284,8 +284,8 @@ def quality(residual: Floats, confidence: Floats, image_size: Size | None = None
         return [
             Finding(
                 "poor-fit",
-                f"poor fit: median residual {error:.2f}, below 0.1 is usual: check "
-                f"{_size_first(image_size)}the keypoint layout, the model, and that y points down",
+                f"poor fit: median residual {error:.2f}, below 0.1 is usual: check"
+                f"{_size_first(image_size)} the keypoint layout, the model, and that y points down",
             )
         ]
     if certainty < LOW_CONFIDENCE:
@@ -304,8 +304,8 @@ def _size_first(image_size: Size | None) -> str:
     if image_size is None:
         return ""
     return (
-        f"first the size of the image, {image_size[0]} x {image_size[1]} (width before height, of "
-        "the image in which the keypoints were detected), then "
+        f" first the size of the image, {image_size[0]} x {image_size[1]} (width before height, of "
+        "the image in which the keypoints were detected), then"
     )
 
 
@@ -338,8 +338,8 @@ def orientation(rotations: Floats, image_size: Size | None = None) -> list[Findi
         return [
             Finding(
                 "orientation",
-                f"{sideways:.0%} of the people lie on their side: check "
-                f"{_size_first(image_size)}that x and y are not exchanged and that the image is "
+                f"{sideways:.0%} of the people lie on their side: check"
+                f"{_size_first(image_size)} that x and y are not exchanged and that the image is "
                 "not turned",
             )
         ]
@@ -491,7 +491,7 @@ def _coordinates(
             "they are pixels that are taken as normalised; say units: pixels in the field mapping",
         )
     elif far > OUTSIDE:
-        yield Finding("outside", _outside_text(far, source, worst))
+        yield _outside_finding(far, source, worst)
 
 
 def _outside(points: Floats, confidence: Floats, size: Size) -> list[Finding]:
@@ -500,15 +500,16 @@ def _outside(points: Floats, confidence: Floats, size: Size) -> list[Finding]:
         return []
     shown = points[confidence > 0]
     worst = shown[np.abs(shown / np.array(size) - 0.5).max(-1).argmax()]
-    return [Finding("outside", _outside_text(share, f"{size[0]} x {size[1]}", worst))]
+    return [_outside_finding(share, f"{size[0]} x {size[1]}", worst)]
 
 
-def _outside_text(share: float, image: str, worst: Floats) -> str:
-    """Return the message about keypoints outside the image."""
-    return (
+def _outside_finding(share: float, image: str, worst: Floats) -> Finding:
+    """Return the finding of keypoints outside the image."""
+    return Finding(
+        "outside",
         f"{share:.0%} of the keypoints lie outside the image of {image}, one at "
         f"({worst[0]:.0f}, {worst[1]:.0f}): the size is wrong; give that of the image in which the "
-        "keypoints were detected, not resized or cut, width before height, and its camera"
+        "keypoints were detected, not resized or cut, width before height, and its camera",
     )
 
 
