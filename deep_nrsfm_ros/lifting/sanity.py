@@ -509,7 +509,8 @@ def _outside_finding(share: float, image: str, worst: Floats) -> Finding:
         "outside",
         f"{share:.0%} of the keypoints lie outside the image of {image}, one at "
         f"({worst[0]:.0f}, {worst[1]:.0f}): the size is wrong; give that of the image in which the "
-        "keypoints were detected, not resized or cut, width before height, and its camera",
+        "keypoints were detected, not resized or cut, width before height, and its camera (if "
+        "it is right: give guesses outside the image a low confidence)",
     )
 
 
