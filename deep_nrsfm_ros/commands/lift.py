@@ -29,7 +29,7 @@ from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, lift_recording
 from deep_nrsfm_ros.data.resolve_layout import check_names, resolve_layout
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics, check_field_of_view
 from deep_nrsfm_ros.lifting.lifter import Lifter, check_min_visible
 from deep_nrsfm_ros.lifting.options import FieldOfViewOptions, GravityOptions, LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL, Finding, Size, is_person
@@ -149,6 +149,8 @@ def check_options(args: argparse.Namespace, model: Model) -> None:
             "--field-of-view and --intrinsics contradict each other: leave --field-of-view out, "
             "the file says more"
         )
+    if angle := _field_of_view(args):
+        check_field_of_view(angle)
     check_min_visible("--min-visible", lifting.min_visible, model)
     if "noise" in args and lifting.correction == "none":
         raise ValueError("--noise has no effect with --correction none: leave one out")
@@ -167,11 +169,21 @@ def _field_of_view(args: argparse.Namespace) -> float:
 
 
 def read_camera(args: argparse.Namespace, detections: Detections) -> Camera:
-    """Return the camera of detections; raise ValueError if nothing says the size of its image."""
-    angle = _field_of_view(args)
+    """Return the camera of detections.
+
+    Raises:
+        ValueError: nothing says the size of its image, or the images have several sizes.
+    """
+    angle, given = _field_of_view(args), _camera_of_options(args)
+    if (angle or given.image_size or given.intrinsics) and detections.sizes_text:
+        raise ValueError(
+            f"the images of {args.input} have {detections.sizes_text}, and one size, field of view "
+            "or camera cannot be that of all: write a file for the images of each size, and lift "
+            "each by itself"
+        )
     if not angle:
-        return _camera_of_options(args)
-    size = _camera_of_options(args).image_size or detections.image_size
+        return given
+    size = given.image_size or detections.image_size
     if size is None:
         raise ValueError(
             f"--field-of-view {angle:g} needs the size of the image, which {args.input} does not "
@@ -236,6 +248,8 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
     )
     with progress("reading") as on_progress:
         detections = read_keypoints(args.input, options, on_progress)
+    for sentence in detections.notes:
+        note(sentence)
     for warning in detections.warnings:
         warn(warning)
     # A bag may be shown without its keypoints, and says how many there would be.
@@ -295,10 +309,21 @@ def camera_hint(args: argparse.Namespace, model: Model, detections: Detections) 
     if camera.intrinsics or not is_person(model.layout):
         return ""
     known = camera.image_size or detections.image_size
-    return (
+    if detections.sizes_text:
+        return ""
+    said = (
         "hint: say the camera's field of view, even roughly, and people are lifted more "
-        "accurately: --field-of-view 65 (webcams, phones held sideways)"
-    ) + ("" if known else " --image-width W --image-height H")
+        "accurately, at their places in metres from the camera: "
+    )
+    if known:
+        upright = known[1] > known[0]
+        usual = "45 (phones held upright)" if upright else "65 (webcams, phones held sideways)"
+        return f"{said}--field-of-view {usual}"
+    return (
+        f"{said}--field-of-view 65 (webcams, phones held sideways) or 45 (held upright) "
+        "--image-width W --image-height H, the size of the image in which the keypoints were "
+        "detected"
+    )
 
 
 def _no_object(path: Path, frames: int) -> str:

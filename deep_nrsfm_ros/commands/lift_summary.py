@@ -93,14 +93,18 @@ def summarise(
         image_size,
         detections.stamps,
         recording.lifted if is_lifted.any() else None,
+        is_normalised=detections.is_normalised,
     )
+    is_outside = any(finding.code == "outside" for finding in findings)
     residual = float(np.median(recording.lifted.residual[is_lifted])) if is_lifted.any() else np.nan
-    if any(finding.code == "poor-fit" for finding in findings):
+    if not is_outside and any(finding.code == "poor-fit" for finding in findings):
         fits = fit_layouts(detections.points, detections.confidence, model, [recording.source])
         if better := better_layout(fits, recording.source, residual):
             findings = [f for f in findings if f.code != "poor-fit"] + [better]
     if is_person(model.layout):
-        findings += pose(recording.lifted.rotations, detections.confidence, recording.source)
+        used = image_size if intrinsics or detections.is_normalised else None
+        seen = detections.confidence
+        findings += pose(recording.lifted.rotations, seen, recording.source, image_size=used)
     total = int((~detections.is_padding).sum())
     if is_lifted.any() and is_lifted.sum() < _FEW_LIFTED * total:
         few = f"only {is_lifted.sum()} of {total} objects are lifted"

@@ -17,6 +17,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.sanity import Finding, Size
 
+_SIZES = 4  # sizes of images that are told one by one
 _GHOST = 0.5  # of the best score in a frame: an object below it is not chosen for its size
 
 
@@ -48,9 +49,12 @@ class Detections:
         scores: (m,) float32, score of the object in the detector's own scale; None = all 1.
         layout: layout in which the keypoints are given; None = nothing says it.
         usual_layout: layout that is usual in a file of this format, without `layout`; None = none.
-        image_size: width and height of all images in pixels, as the source gives them; None =
-            it gives none, or several.
+        image_sizes: the different sizes of the images, width and height in pixels, as the source
+            gives them, and the number of images of each, the most frequent first; None for images
+            without a size.
+        is_normalised: the keypoints were fractions of the image and are multiplied by its size.
         warnings: sentences about what was left out of the source.
+        notes: sentences about how the source is taken, which are no cause for doubt.
         findings: what looks wrong in the source.
         is_padding: (m,) bool, objects without a keypoint that fill an array with as many objects in
             each frame; None = none of them.
@@ -66,8 +70,10 @@ class Detections:
     scores: NDArray[np.float32] = None  # type: ignore[assignment]
     layout: KeypointLayout | None = None
     usual_layout: KeypointLayout | None = None
-    image_size: Size | None = None
+    image_sizes: tuple[tuple[Size | None, int], ...] = ()
+    is_normalised: bool = False
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     is_padding: NDArray[np.bool_] = None  # type: ignore[assignment]
 
@@ -114,6 +120,20 @@ class Detections:
     def without_padding(self) -> Detections:
         """Return the detections without the objects that only fill an array."""
         return self[~self.is_padding] if self.is_padding.any() else self
+
+    @property
+    def image_size(self) -> Size | None:
+        """Width and height of all images in pixels; None: the source gives none, or several."""
+        return self.image_sizes[0][0] if len(self.image_sizes) == 1 else None
+
+    @property
+    def sizes_text(self) -> str:
+        """The sizes of the images, if the source gives several; else ""."""
+        known = [(size, count) for size, count in self.image_sizes if size]
+        if len(known) < 2:
+            return ""
+        told = [f"{size[0]} x {size[1]}: {count}" for size, count in known[:_SIZES]]
+        return f"{len(known)} sizes ({', '.join([*told, *['...'] * (len(known) > _SIZES)])})"
 
     def has_identities(self) -> bool:
         """Return whether an identity is not just the index of the object in its frame."""

@@ -36,11 +36,12 @@ from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.observation import (
     Observation,
     left_out_sentences,
+    outside_share,
     without_border,
     without_value,
 )
-from deep_nrsfm_ros.lifting.sanity import Finding, to_pixels
-from deep_nrsfm_ros.messages.decoding import implied_layout
+from deep_nrsfm_ros.lifting.sanity import OUTSIDE, Finding, Size, to_pixels
+from deep_nrsfm_ros.messages.decoding import implied_layout, is_normalised
 from deep_nrsfm_ros.messages.serialised import MessageReader, read_header
 from deep_nrsfm_ros.messages.stamps import one_clock
 
@@ -145,11 +146,13 @@ def _finish(detections: Detections, options: ReadOptions) -> Detections:
     if present.points is not points:
         points, confidence = present.points, present.confidence
         detections = dataclasses.replace(detections, points=points, confidence=confidence)
-    pixels = to_pixels(points, confidence, options.image_size)
+    size = options.image_size or detections.image_size
+    pixels = to_pixels(points, confidence, size)
     if pixels is not points:
-        detections = dataclasses.replace(detections, points=pixels)
-    if options.image_size:
-        detections = _without_border(detections, options.image_size)
+        detections = dataclasses.replace(detections, points=pixels, is_normalised=True)
+    # No size is that of all images of a source that gives several.
+    if size and not detections.sizes_text:
+        detections = _without_border(detections, size)
     return detections
 
 
@@ -182,22 +185,27 @@ def _without_copies(detections: Detections) -> Detections:
     return dataclasses.replace(kept, warnings=(*kept.warnings, warning))
 
 
-def _without_border(detections: Detections, size: tuple[int, int]) -> Detections:
-    """Return detections in which keypoints at the image's border are missing; say how many."""
-    inner = without_border(Observation(detections.points, detections.confidence), size)
-    count = int((detections.confidence > 0).sum() - (inner.confidence > 0).sum())
+def _without_border(detections: Detections, size: Size) -> Detections:
+    """Return detections in which keypoints at the image's border are missing; say how many.
+
+    Where so many pixels are outside that the size is wrong, nothing is left out.
+    """
+    points, confidence = detections.points, detections.confidence
+    if not detections.is_normalised and outside_share(points, confidence, size) > OUTSIDE:
+        return detections
+    inner = without_border(Observation(points, confidence), size)
+    total = int((confidence > 0).sum())
+    count = total - int((inner.confidence > 0).sum())
     if not count:
         return detections
-    warning = (
-        f"{count} of {(detections.confidence > 0).sum()} keypoints are at the border of the image "
-        f"of {size[0]} x {size[1]} pixels or outside, and count as missing"
+    detections = dataclasses.replace(detections, points=inner.points, confidence=inner.confidence)
+    sentence = (
+        f"{count} of {total} keypoints are at the border of the image of {size[0]} x {size[1]} "
+        "pixels or outside, and count as missing"
     )
-    return dataclasses.replace(
-        detections,
-        points=inner.points,
-        confidence=inner.confidence,
-        warnings=(*detections.warnings, warning),
-    )
+    if count < _FEW_AT_BORDER * total:
+        return dataclasses.replace(detections, notes=(*detections.notes, sentence))
+    return dataclasses.replace(detections, warnings=(*detections.warnings, sentence))
 
 
 def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
@@ -326,6 +334,7 @@ def _read_frames(
             builder.leave_out("cannot be read", f"{frame.name}: {problem}")
 
 
+_FEW_AT_BORDER = 0.01  # fraction of keypoints below which the border is no cause for doubt
 _BLOCK = 4096  # objects that are compared at once
 _SAMPLE = 256  # messages of a topic that `sample_bag` reads at least
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
@@ -415,13 +424,14 @@ def read_bag(
     observations, stamps, times, reason, camera, count = [], [], [], "", "", 0
     warnings: list[str] = []
     left_out: list[str] = []
-    has_scores, below = False, 0
+    has_scores, below, normalised = False, 0, False
     layout = options.layout or options.fallback or _implied_by_type(path, options)
     keypoints = len(layout) if layout else keypoint_count([path], options)
     with closing(open_bag(path)) as bag:
         topics = keypoint_topics(bag, options.topic, options.mapping, keypoints)
         for topic, input_type, decode in topics:
             reader = MessageReader(input_type, decode)
+            normalised |= is_normalised(input_type)
             for record in bag.records(topic):
                 count += 1
                 try:
@@ -461,7 +471,13 @@ def read_bag(
     detections = gather(ordered, on_one_clock[order], keypoints, camera)
     warnings += clock_warnings
     found = tuple(check_confidence(path, keypoints, options))
-    return dataclasses.replace(detections, layout=layout, warnings=tuple(warnings), findings=found)
+    return dataclasses.replace(
+        detections,
+        layout=layout,
+        is_normalised=normalised,
+        warnings=tuple(warnings),
+        findings=found,
+    )
 
 
 def with_topic(path: Path, options: ReadOptions, keypoints: int) -> ReadOptions:
@@ -497,7 +513,7 @@ def sample_bag(path: Path, options: ReadOptions, on_progress: Progress = no_prog
     """
     layout = options.layout or options.fallback or _implied_by_type(path, options)
     keypoints = len(layout) if layout else keypoint_count([path], options)
-    observations = []
+    observations, normalised = [], False
     with closing(open_bag(path)) as bag:
 
         def messages(topic: Topic) -> Iterator[bytes]:
@@ -510,6 +526,7 @@ def sample_bag(path: Path, options: ReadOptions, on_progress: Progress = no_prog
             bag, options.topic, options.mapping, keypoints
         ):
             reader = MessageReader(input_type, decode)
+            normalised |= is_normalised(input_type)
             for raw in evenly_spaced(messages(topic), _SAMPLE):
                 with suppress(Exception):  # damaged bytes fail in many ways; the others do
                     _, observation = reader(
@@ -517,7 +534,8 @@ def sample_bag(path: Path, options: ReadOptions, on_progress: Progress = no_prog
                     )
                     observations.append(observation.above(options.min_score))
     sample = gather(observations, range(len(observations)), keypoints)
-    return _finish(dataclasses.replace(sample, layout=layout), options)
+    sample = dataclasses.replace(sample, layout=layout, is_normalised=normalised)
+    return _finish(sample, options)
 
 
 def _implied_by_type(path: Path, options: ReadOptions) -> KeypointLayout | None:

@@ -21,11 +21,28 @@ EQUIDISTANT = "equidistant"
 COEFFICIENTS = {PLUMB_BOB: (0, 4, 5), RATIONAL: (0, 4, 5, 8), EQUIDISTANT: (0, 4)}
 """Numbers of coefficients that each lens model may have; those left out are 0."""
 
+MIN_FIELD_OF_VIEW = 10.0
+"""Smallest angle of view in degrees of a camera that is not calibrated: less is a long lens."""
 MAX_FIELD_OF_VIEW = 150.0
 """Largest angle of view in degrees; wider lenses are far from a pinhole."""
 
 _MAX_STEPS = 20  # of Newton's method; a usual lens takes 5, the border of a fisheye more
 _TOLERANCE = 1e-9  # last step in the plane z = 1, or in radians, of a search that has converged
+
+
+def check_field_of_view(degrees: float) -> None:
+    """Raise ValueError unless an angle is from `MIN_FIELD_OF_VIEW` to `MAX_FIELD_OF_VIEW`."""
+    if MIN_FIELD_OF_VIEW <= degrees <= MAX_FIELD_OF_VIEW:
+        return
+    in_degrees, hint = math.degrees(degrees), ""
+    if MIN_FIELD_OF_VIEW <= in_degrees <= MAX_FIELD_OF_VIEW:
+        hint = f": give degrees; {degrees:g} radians are {in_degrees:.0f} degrees"
+    elif 0 < degrees < MIN_FIELD_OF_VIEW:
+        hint = ": give degrees; a camera that sees less must be calibrated (CameraInfo)"
+    raise ValueError(
+        f"field of view is {degrees:g} degrees; it must be at least {MIN_FIELD_OF_VIEW:g} and at "
+        f"most {MAX_FIELD_OF_VIEW:g}{hint}"
+    )
 
 
 @dataclass(frozen=True)
@@ -72,14 +89,9 @@ class Intrinsics:
             size: width and height of the whole image in pixels.
 
         Raises:
-            ValueError: the angle is not above 0 and at most `MAX_FIELD_OF_VIEW`, or a side of the
-                image is not above 0.
+            ValueError: as `check_field_of_view`, or a side of the image is not above 0.
         """
-        if not 0 < degrees <= MAX_FIELD_OF_VIEW:
-            raise ValueError(
-                f"field of view is {degrees:g} degrees; it must be above 0 and at most "
-                f"{MAX_FIELD_OF_VIEW:g}"
-            )
+        check_field_of_view(degrees)
         width, height = size
         if min(size) <= 0:
             raise ValueError(f"image is {width} x {height}; both sides must be above 0 pixels")

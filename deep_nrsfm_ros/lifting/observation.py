@@ -22,6 +22,8 @@ MIN_POSITIVE = np.nextafter(np.float32(0), np.float32(1))
 """The smallest positive float32: a keypoint of confidence 0 is missing at any threshold."""
 _BORDER = 0.002  # of the image's side
 _FAR = 0.05  # fraction of keypoints half an image outside that is too many
+_JUST = 0.01  # of the image's side: a keypoint that is less outside is at the border
+_SURE = 0.5  # of the median confidence, below which a keypoint is a guess
 _HALF_PIXEL = np.float32(0.5)  # the last pixel is at size - 1
 _CERTAIN, _MISSING = np.float32(1), np.float32(0)
 
@@ -145,6 +147,31 @@ def without_border(observation: Observation, size: tuple[int, int]) -> Observati
     points = np.where(outside[..., None], _MISSING, points)
     confidence = np.where(outside, _MISSING, confidence)
     return observation._replace(points=points, confidence=confidence)
+
+
+def outside_share(
+    points: NDArray[np.floating], confidence: NDArray[np.floating], size: tuple[int, int]
+) -> float:
+    """Return the fraction of sure keypoints outside an image, and not merely at its border.
+
+    Sure is a confidence of at least half the median: detectors guess outside the image what they do
+    not see of a person whom it cuts off.
+
+    Args:
+        points: (n, q, 2) in pixels.
+        confidence: (n, q); 0 where missing.
+        size: width and height of the image in pixels.
+    """
+    visible = confidence > 0
+    if not visible.any():
+        return 0.0
+    sure = visible & (confidence >= _SURE * np.median(confidence[visible]))
+    half = np.array(size, np.float32) / 2
+    reach, count = (1 + 2 * _JUST) * half, 0
+    for rows in slices(len(points)):
+        beyond = (np.abs(points[rows] - half) > reach).any(-1)
+        count += int((beyond & sure[rows]).sum())
+    return count / int(sure.sum())
 
 
 def without_value(observation: Observation, value: float | None) -> Observation:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.body.person_height import trunk_length
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
-from deep_nrsfm_ros.lifting.intrinsics import MAX_FIELD_OF_VIEW, Intrinsics
+from deep_nrsfm_ros.lifting.intrinsics import MAX_FIELD_OF_VIEW, Intrinsics, check_field_of_view
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,10 @@ class FieldOfViewOptions:
         "horizontal angle of view in degrees (of the width of the whole image, upright or not) of "
         "a camera that is not calibrated: with the size of the image (image_width, image_height) "
         "it takes the place of a CameraInfo, so that objects are lifted to their places in the "
-        "optical frame; 0 = unknown, 60 to 70 typical of webcams and of phones held sideways, 40 "
-        "to 50 of phones held upright, 90 wide; a diagonal of 78 in a data sheet is 70 here, at "
-        "16:9; if it is wrong, distances are off in proportion to the focal length, rotations by "
-        "a few degrees",
+        "optical frame; 0 = unknown, else at least 10, 60 to 70 typical of webcams and of phones "
+        "held sideways, 40 to 50 of phones held upright, 90 wide; a diagonal of 78 in a data sheet "
+        "is 70 here, at 16:9; if it is wrong, distances are off in proportion to the focal length, "
+        "rotations by a few degrees",
         low=0.0,
         high=MAX_FIELD_OF_VIEW,
         read_only=True,
@@ -128,10 +128,12 @@ class FieldOfViewOptions:
         """Return the camera of an image of that width and height in pixels; None: unknown.
 
         Raises:
-            ValueError: the field of view is known, and the size of the image is not.
+            ValueError: the field of view is known, and the size of the image is not; or nobody
+                has such a field of view.
         """
         if not self.field_of_view:
             return None
+        check_field_of_view(self.field_of_view)
         if image_size is None:
             raise ValueError(
                 f"field_of_view is {self.field_of_view:g} and needs the size of the image: set "

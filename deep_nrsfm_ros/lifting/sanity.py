@@ -20,6 +20,7 @@ from deep_nrsfm_ros.large_arrays import release
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
+from deep_nrsfm_ros.lifting.observation import outside_share
 
 Floats = NDArray[np.floating[Any]]
 Size = tuple[int, int]
@@ -31,6 +32,8 @@ USUAL_RESIDUAL = 0.1
 """Median reprojection error of objects below which the fit is usual."""
 LOW_CONFIDENCE = 0.3
 """Median confidence of objects below which the answer is doubtful."""
+OUTSIDE = 0.05
+"""Fraction of keypoints outside the image above which its size is wrong."""
 
 _MAX_OBJECTS = 5000  # objects of a sample; more cost time and change no finding
 _NORMALISED = 2.0  # largest normalised coordinate; a detector puts some points beyond the border
@@ -54,7 +57,6 @@ _MARKED = 0.001  # fraction of points on a spot such as (-1, -1) that is more th
 _REPEATED = 0.01  # fraction of points on any other spot that is more than chance
 _STANDS_OUT = 5  # times the points of the next spot: pixels of a coarse grid repeat alike
 _FILLED = 0.98  # side of a box of 0 to 1 from which on an object fills it
-_OUTSIDE = 0.05  # fraction of points far outside the image that is too many
 _MARGIN = 0.5  # of the image's size: points further outside are far outside
 _SCALED_TWICE = 20.0  # sizes of the image from its corner to the points
 _MAX_PLACE = 1000.0  # metres from the camera
@@ -97,6 +99,8 @@ def check(
     image_size: Size | None = None,
     stamps: NDArray[np.int64] | None = None,
     lifted: Lifted | None = None,
+    *,
+    is_normalised: bool = False,
 ) -> list[Finding]:
     """Return what looks wrong in keypoints, their stamps and the shapes lifted from them.
 
@@ -107,6 +111,8 @@ def check(
         image_size: width and height of the image in pixels; None: unknown.
         stamps: (f,) in ns, one for each frame, in the order of the frames; None: unknown.
         lifted: the objects, lifted; None: not lifted.
+        is_normalised: the points were fractions of the image and are multiplied by its size, so
+            that those somewhat outside say nothing of it.
     """
     findings = confidence_scale(confidence)
     visible, objects = _sample(confidence) > 0, _sample(points)
@@ -115,13 +121,18 @@ def check(
             spot, times = sentinel
             visible = visible & ~(objects == spot).all(-1)
             findings.append(_sentinel(spot, times, int(_sample(confidence).astype(bool).sum())))
-        findings += _coordinates(objects, visible, intrinsics, image_size)
+        found = list(_coordinates(objects, visible, intrinsics, image_size))
+        if not (found or is_normalised or image_size is None):
+            certainty = np.where(visible, _sample(confidence), 0)
+            found = _outside(objects, certainty, image_size)
+        findings += found
     if stamps is not None:
         findings += _stamps(np.asarray(stamps, np.int64))
     if lifted is not None:
         if intrinsics:
             findings += _places(lifted)
-        findings += quality(lifted.residual, lifted.object_confidence)
+        used = image_size if intrinsics or is_normalised else None
+        findings += quality(lifted.residual, lifted.object_confidence, used)
     return findings
 
 
@@ -256,12 +267,13 @@ def confidence_scale(confidence: Floats) -> list[Finding]:
     ]
 
 
-def quality(residual: Floats, confidence: Floats) -> list[Finding]:
+def quality(residual: Floats, confidence: Floats, image_size: Size | None = None) -> list[Finding]:
     """Return whether the lifted objects fit their keypoints poorly or have low confidence.
 
     Args:
         residual: (n,) reprojection errors; NaN where not lifted.
         confidence: (n,) of the objects.
+        image_size: with which they were lifted; None: without.
     """
     is_lifted = ~np.isnan(residual)
     if not is_lifted.any():
@@ -272,8 +284,8 @@ def quality(residual: Floats, confidence: Floats) -> list[Finding]:
         return [
             Finding(
                 "poor-fit",
-                f"poor fit: median residual {error:.2f}, below 0.1 is usual: check the keypoint "
-                "layout, the model, and that y points down",
+                f"poor fit: median residual {error:.2f}, below 0.1 is usual: check"
+                f"{_size_first(image_size)} the keypoint layout, the model, and that y points down",
             )
         ]
     if certainty < LOW_CONFIDENCE:
@@ -287,17 +299,28 @@ def quality(residual: Floats, confidence: Floats) -> list[Finding]:
     return []
 
 
+def _size_first(image_size: Size | None) -> str:
+    """Return what to check before all else where the size of the image was used; "" if not."""
+    if image_size is None:
+        return ""
+    return (
+        f" first the size of the image, {image_size[0]} x {image_size[1]} (width before height, of "
+        "the image in which the keypoints were detected), then"
+    )
+
+
 def is_person(layout: KeypointLayout) -> bool:
     """Return whether a layout is of people, whose up axis is known."""
     return bool(layout.handedness) and {"left_hip", "left_ankle"} <= set(layout.keypoints)
 
 
-def orientation(rotations: Floats) -> list[Finding]:
+def orientation(rotations: Floats, image_size: Size | None = None) -> list[Finding]:
     """Return whether nearly all people are upside down, or lie on their side, in the image.
 
     Args:
         rotations: (n, 3, 3) from object axes (x front, y left, z up) to camera axes (y down); NaN
             where not lifted.
+        image_size: with which they were lifted; None: without.
     """
     x, y = _up_in_image(rotations).T
     if not len(x):
@@ -315,8 +338,9 @@ def orientation(rotations: Floats) -> list[Finding]:
         return [
             Finding(
                 "orientation",
-                f"{sideways:.0%} of the people lie on their side: check that x and y are not "
-                "exchanged and that the image is not turned",
+                f"{sideways:.0%} of the people lie on their side: check"
+                f"{_size_first(image_size)} that x and y are not exchanged and that the image is "
+                "not turned",
             )
         ]
     return []
@@ -384,10 +408,14 @@ def facing(
 
 
 def pose(
-    rotations: Floats, confidence: Floats, layout: KeypointLayout, least: float = _SEEN
+    rotations: Floats,
+    confidence: Floats,
+    layout: KeypointLayout,
+    least: float = _SEEN,
+    image_size: Size | None = None,
 ) -> list[Finding]:
     """Return `facing`, which says the cause, or else `orientation`; for the arguments see there."""
-    return facing(rotations, confidence, layout, least) or orientation(rotations)
+    return facing(rotations, confidence, layout, least) or orientation(rotations, image_size)
 
 
 def _sentinel(spot: Floats, times: int, total: int) -> Finding:
@@ -462,13 +490,28 @@ def _coordinates(
             f"the middle keypoint lies {beyond:.0f} image sizes away from an image of {source}: "
             "they are pixels that are taken as normalised; say units: pixels in the field mapping",
         )
-    elif far > _OUTSIDE:
-        yield Finding(
-            "outside",
-            f"{far:.0%} of the keypoints lie far outside the image of {source}, one at "
-            f"({worst[0]:.0f}, {worst[1]:.0f}): give the size and the camera of the image in which "
-            "they were detected",
-        )
+    elif far > OUTSIDE:
+        yield _outside_finding(far, source, worst)
+
+
+def _outside(points: Floats, confidence: Floats, size: Size) -> list[Finding]:
+    """Return whether so many keypoints lie outside the image that its size must be wrong."""
+    if min(size) <= 1 or (share := outside_share(points, confidence, size)) <= OUTSIDE:
+        return []
+    shown = points[confidence > 0]
+    worst = shown[np.abs(shown / np.array(size) - 0.5).max(-1).argmax()]
+    return [_outside_finding(share, f"{size[0]} x {size[1]}", worst)]
+
+
+def _outside_finding(share: float, image: str, worst: Floats) -> Finding:
+    """Return the finding of keypoints outside the image."""
+    return Finding(
+        "outside",
+        f"{share:.0%} of the keypoints lie outside the image of {image}, one at "
+        f"({worst[0]:.0f}, {worst[1]:.0f}): the size is wrong; give that of the image in which the "
+        "keypoints were detected, not resized or cut, width before height, and its camera (if "
+        "it is right: give guesses outside the image a low confidence)",
+    )
 
 
 def _extent(points: Floats, visible: NDArray[np.bool_]) -> float:

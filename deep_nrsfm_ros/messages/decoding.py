@@ -23,7 +23,7 @@ from deep_nrsfm_ros.lifting.observation import (
     check_keypoints,
     to_observation,
 )
-from deep_nrsfm_ros.messages.field_mapping import MAPPINGS, FieldMapping, Size
+from deep_nrsfm_ros.messages.field_mapping import MAPPINGS, PIXELS, FieldMapping, Size
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES, read_mapping
 from deep_nrsfm_ros.messages.point_cloud import point_cloud_format
 
@@ -106,6 +106,12 @@ def read_observation(
     except (AttributeError, TypeError, ValueError, IndexError, OverflowError) as error:
         raise MessageError(f"expected a message of type {type_name(input_type)}: {error}") from None
     raise ValueError(f"no input type {input_type!r}; choose one of {', '.join(INPUT_TYPES)}")
+
+
+def is_normalised(input_type: InputType) -> bool:
+    """Return whether messages of a type give fractions of the image, or of a scaled one."""
+    mapping = _mapping(input_type)
+    return mapping is not None and mapping.units != PIXELS
 
 
 def read_confidence(

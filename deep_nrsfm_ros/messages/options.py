@@ -46,15 +46,16 @@ class InputOptions:
     )
     image_width: int = option(
         0,
-        "width of the image in pixels, by which normalised keypoints (0 to 1) are multiplied, and "
-        "which field_of_view needs; 0 = unknown, 640 typical",
+        "width in pixels of the image in which the keypoints were detected, not resized or cut: "
+        "normalised keypoints (0 to 1) are multiplied by it, field_of_view needs it, and keypoints "
+        "at the border of the image or outside count as missing; 0 = unknown, 640 typical",
         low=0,
         high=1000000,
     )
     image_height: int = option(
         0,
-        "height of the image in pixels, by which normalised keypoints (0 to 1) are multiplied, and "
-        "which field_of_view needs; 0 = unknown, 480 typical",
+        "height in pixels of the image in which the keypoints were detected, as image_width; 0 = "
+        "unknown, 480 typical",
         low=0,
         high=1000000,
     )

@@ -36,7 +36,7 @@ from deep_nrsfm_ros.lifting.sanity import (
     orientation,
     to_pixels,
 )
-from deep_nrsfm_ros.messages.decoding import implied_layout, type_name
+from deep_nrsfm_ros.messages.decoding import implied_layout, is_normalised, type_name
 from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -67,6 +67,7 @@ class _Sample(NamedTuple):
         stamps: (f,) in ns.
         left_out: sentences about objects and keypoints that are left out.
         has_scores: objects have scores.
+        is_normalised: the messages give fractions of the image.
     """
 
     points: NDArray[np.float32]
@@ -74,6 +75,7 @@ class _Sample(NamedTuple):
     stamps: NDArray[np.int64]
     left_out: list[str]
     has_scores: bool
+    is_normalised: bool
 
 
 class StreamCheck:
@@ -188,6 +190,7 @@ class StreamCheck:
             size or pipeline.image_size,
             sample.stamps,
             self._lifted,
+            is_normalised=sample.is_normalised,
         )
         findings += [Finding("left-out", text) for text in sample.left_out]
         if pipeline.min_score and not sample.has_scores:
@@ -203,7 +206,11 @@ class StreamCheck:
         if self._ambiguity and self._ambiguity[0].keypoints == pipeline.source.keypoints:
             findings.insert(0, self._ambiguity[1])
         if self._lifted is not None and is_person(pipeline.model.layout):
-            findings += orientation(self._lifted.rotations)
+            used = size or pipeline.image_size if intrinsics or sample.is_normalised else None
+            findings += orientation(self._lifted.rotations, used)
+        outside = [finding for finding in findings if finding.code == "outside"]
+        if outside:  # the cause of whatever else looks wrong
+            return outside + [finding for finding in findings if finding.code != "outside"]
         if residual >= POOR_RESIDUAL:
             fits = fit_layouts(sample.points, sample.confidence, pipeline.model)
             better = better_layout(fits, pipeline.source, residual)
@@ -235,10 +242,13 @@ class StreamCheck:
             return None
         points = np.concatenate([observation.points for observation in observations])
         confidence = np.concatenate([observation.confidence for observation in observations])
-        points = to_pixels(points, confidence, size).astype(np.float32, copy=False)
+        pixels = to_pixels(points, confidence, size).astype(np.float32, copy=False)
+        was_normalised = pixels is not points or is_normalised(self._recent[-1][1].input_type)
         left_out = left_out_sentences(r for each in observations for r in each.left_out)
         has_scores = any(each.scores for each in observations)
-        return _Sample(points, confidence, np.array(stamps, np.int64), left_out, has_scores)
+        return _Sample(
+            pixels, confidence, np.array(stamps, np.int64), left_out, has_scores, was_normalised
+        )
 
 
 def _implied(reader: MessageReader, model: Model) -> KeypointLayout | None:

@@ -62,7 +62,7 @@ from deep_nrsfm_ros.lifting.options import (
     HistoryOptions,
     LiftingOptions,
 )
-from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding
+from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, is_person
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.detections_3d import Lifted3D
 from deep_nrsfm_ros.messages.field_mapping import YOLO
@@ -278,6 +278,7 @@ class LifterNode(Node):
             )
         )
         self._log_unit()
+        self._log_field_of_view()
         if self._pipeline.remembers:
             self.get_logger().info(
                 "an answer depends on the last seconds of its object too; -p "
@@ -322,6 +323,16 @@ class LifterNode(Node):
             self.get_logger().info(
                 f"metres: {a} to {b} is taken to be {layout.reference_length:g} m; -p "
                 "reference_length, or -p person_height of people, says otherwise"
+            )
+
+    def _log_field_of_view(self) -> None:
+        """Log that people are lifted more accurately with a camera, if there is none."""
+        if not self._camera.enabled and is_person(self._pipeline.model.layout):
+            self.get_logger().info(
+                "hint: people are lifted more accurately, at their places in metres from the "
+                "camera, with -p camera_info, or roughly with -p field_of_view (65 typical of "
+                "webcams), image_width and image_height, the size of the image in which the "
+                "keypoints were detected"
             )
 
     def _quiet_publisher(self, kind: type, topic: str) -> Publisher:
@@ -586,9 +597,10 @@ class LifterNode(Node):
         residual = self._lifter_diagnostics.residual
         level, message, values = self._lifter_diagnostics.report()
         self._check_input(level, residual, idle=idle)
-        layouts = [f for f in self._findings if f.code == "layout"]
-        if level == OK and self._findings or level == WARN and layouts:
-            level, message = WARN, str((layouts or self._findings)[0])
+        outside = [f for f in self._findings if f.code == "outside"]
+        causes = outside or [f for f in self._findings if f.code == "layout"]
+        if level == OK and self._findings or level == WARN and causes or outside:
+            level, message = max(level, WARN), str((causes or self._findings)[0])
         values["findings"] = "; ".join(map(str, self._findings)) or "none"
         values["keypoint layout"] = self._layout_status()
         model = self._pipeline.model
@@ -660,7 +672,8 @@ class LifterNode(Node):
     def _build_pipeline(self, changes: Sequence[Parameter]) -> Pipeline:
         """Return the pipeline for the parameters after `changes`; raise ValueError if invalid."""
         inputs = parameter_bridge.read(self, InputOptions, changes=changes)
-        if not self._camera_options.camera_info:
+        if not self._camera_options.camera_info and self._view.field_of_view:
+            self._check_image_size(inputs, changes)
             self._view.intrinsics(inputs.image_size)
         self._training_parameters(changes)
         parameter_bridge.read(self, GravityOptions, _GRAVITY, changes)
@@ -745,6 +758,29 @@ class LifterNode(Node):
         self._up = parameter_bridge.read(self, GravityOptions, _GRAVITY).direction
         for warning in self._unused_options(changes):
             self.get_logger().warning(warning)
+
+    def _check_image_size(self, inputs: InputOptions, changes: Sequence[Parameter]) -> None:
+        """Raise ValueError if a field of view would have a size that nobody means.
+
+        Args:
+            inputs: the parameters after the changes.
+            changes: of parameters; empty at the start.
+        """
+        view, width, height = self._view.field_of_view, inputs.image_width, inputs.image_height
+        sides = {"image_width": width, "image_height": height}
+        if missing := [name for name, side in sides.items() if not side and any(sides.values())]:
+            raise ValueError(
+                f"field_of_view is {view:g} and needs the size of the image: image_width is "
+                f"{width} and image_height is {height}; set {missing[0]}"
+            )
+        # At the start, and of an equal value, a change of one side is none of the camera.
+        changed = [change.name for change in changes if change.name in sides]
+        if len(changed) == 1 and sides[changed[0]] != self.get_parameter(changed[0]).value:
+            raise ValueError(
+                f"{changed[0]} alone would make the image {width} x {height}, and the camera of "
+                f"field_of_view {view:g} depends on both: set image_width and image_height in one "
+                "call (set_parameters_atomically)"
+            )
 
     def _unused_options(self, changes: Sequence[Parameter] = ()) -> list[str]:
         """Return a warning for each parameter without effect that is among `changes` or new."""

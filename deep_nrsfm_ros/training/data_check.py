@@ -73,7 +73,8 @@ def check_objects(
     """
     step = max(1, len(points) // _MOST_CHECKED)
     points, confidence = points[::step], np.asarray(confidence[::step], np.float32)
-    findings = check(points, confidence, None, image_size)
+    # A training uses the size for fractions alone: pixels may be of an image of another size.
+    findings = check(points, confidence, None, image_size, is_normalised=True)
     if not set(target.keypoints) >= _PERSON or not len(points):
         return findings
     model = load_model(PEOPLE)

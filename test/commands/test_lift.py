@@ -177,11 +177,83 @@ def test_a_field_of_view_is_as_good_as_a_camera_file(
         np.testing.assert_allclose(file["shapes"], expected, atol=1e-3)
     assert "hint" not in capsys.readouterr().err
     assert lift(tmp_path, "coco17", "--field-of-view", "0") == 0
-    assert "--field-of-view 65 (webcams, phones held sideways) --image-width W" in (
-        capsys.readouterr().err
-    )
+    hint = capsys.readouterr().err
+    assert "65 (webcams, phones held sideways) or 45 (held upright) --image-width W" in hint
+    assert "the size of the image in which the keypoints were detected" in hint
+    assert "at their places in metres from the camera" in hint
     assert lift(tmp_path, "coco17", *WIDE_AND_HIGH) == 0
     assert capsys.readouterr().err.endswith("--field-of-view 65 (webcams, phones held sideways)\n")
+    upright = ("--image-width", "1280", "--image-height", "1290")
+    assert lift(tmp_path, "coco17", *upright) == 0
+    assert capsys.readouterr().err.endswith("--field-of-view 45 (phones held upright)\n")
+
+
+def coco_file(folder: Path, points: np.ndarray, *sizes: tuple[int, int]) -> Path:
+    """Write a COCO file of the walking person; return it. The sizes of its images alternate."""
+    values = np.concatenate([points, CONFIDENCE[..., None]], -1).reshape(len(points), -1).tolist()
+    images = [
+        {"id": i, **dict(zip(("width", "height"), sizes[i % len(sizes)], strict=True))}
+        for i in range(len(points))
+    ]
+    people = [{"image_id": i, "keypoints": row} for i, row in enumerate(values)]
+    path = folder / "coco.json"
+    path.write_text(json.dumps({"images": images, "annotations": people}))
+    return path
+
+
+def run(*words: str) -> int:
+    """Return the exit code of `lift`."""
+    try:
+        main(list(words))
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def test_the_border_is_the_same_whoever_says_the_size(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = POINTS.copy()
+    points[5:8, 9, 0] = 0.2  # a wrist at the left border
+    path, answers = coco_file(tmp_path, points, IMAGE), []
+    camera = WALKING_CAMERA + f"width: {IMAGE[0]}\nheight: {IMAGE[1]}\n"
+    (tmp_path / "camera.yaml").write_text(camera)
+    calibrated = ("--intrinsics", str(tmp_path / "camera.yaml"))
+    for words in (VIEW, (*VIEW, *WIDE_AND_HIGH), calibrated):
+        assert run(str(path), *words, "--output", str(tmp_path / "out.npz")) == 0
+        said = capsys.readouterr().err
+        assert "3 of 1020 keypoints are at the border" in said and "warning" not in said
+        with np.load(tmp_path / "out.npz") as file:
+            answers.append(file["shapes"])
+    np.testing.assert_allclose(answers[1], answers[0], atol=1e-3)
+    np.testing.assert_allclose(answers[2], answers[0], atol=1e-3)
+
+
+def test_a_wrong_size_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    exchanged = ("--image-width", "400", "--image-height", "1280")
+    assert lift(tmp_path, "coco17", *VIEW, *exchanged) == 3
+    said = capsys.readouterr().err
+    assert "of the keypoints lie outside the image of 400 x 1280" in said
+    assert "the size is wrong" in said and "count as missing" not in said
+    path, output = coco_file(tmp_path, POINTS, (400, 1280)), ("--output", str(tmp_path / "o.npz"))
+    assert run(str(path), *VIEW, *output) == 3  # as where a tool ignores the EXIF rotation
+    assert "outside the image of 400 x 1280" in capsys.readouterr().err
+    assert run(str(path), *VIEW, *WIDE_AND_HIGH, *output) == 0
+    assert run(str(path), *output) == 0  # without a camera nothing hangs on the size
+
+
+def test_images_of_several_sizes_have_no_one_camera(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = coco_file(tmp_path, POINTS, IMAGE, IMAGE, (720, 1280))
+    output = ("--output", str(tmp_path / "o.npz"))
+    for words in (VIEW, (*VIEW, *WIDE_AND_HIGH), WIDE_AND_HIGH):
+        assert run(str(path), *words, *output) == 2
+        said = capsys.readouterr().err
+        assert f"{path} have 2 sizes (1280 x 720: 40, 720 x 1280: 20), and one" in said
+        assert "lift each by itself" in said
+    assert run(str(path), *output) == 0
+    assert "hint" not in capsys.readouterr().err
 
 
 def test_a_coco_file_says_the_size_that_a_field_of_view_needs(
@@ -309,6 +381,7 @@ SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
         ({}, ("--rectified",), 2, "--rectified has no effect without --intrinsics"),
         ({}, VIEW, 2, "keypoints.npz does not say: give --image-width and --image-height"),
         ({}, ("--field-of-view", "151"), 2, "field_of_view is 151.0; it must be at least 0 and at"),
+        ({}, ("--field-of-view", "1.13"), 2, "give degrees; 1.13 radians are 65 degrees"),
         ({}, (*VIEW, "--intrinsics", "a.yaml"), 2, "leave --field-of-view out"),
         ({}, ("--correction", "none", "--noise", "0.1"), 2, "--noise has no effect"),
         (
@@ -317,7 +390,7 @@ SENTINEL = np.where(np.arange(17)[:, None] % 5 == 0, np.float32(-1), POINTS)
             2,
             "--person-height has no effect, since reference_length is 0.5",
         ),
-        ({}, ("--image-width", "160", "--image-height", "90"), 3, "far outside the image of 160 x"),
+        ({}, ("--image-width", "160", "--image-height", "90"), 3, "lie outside the image of 160 x"),
     ],
 )
 def test_what_looks_wrong_is_said(

@@ -49,10 +49,19 @@ def test_a_field_of_view_is_that_of_the_width_of_the_image() -> None:
 
 @pytest.mark.parametrize("degrees", [0, -60, 150.1, 180, float("nan")])
 def test_no_camera_has_such_a_field_of_view(degrees: float) -> None:
-    with pytest.raises(ValueError, match=r"field of view is .* must be above 0 and at most 150"):
+    with pytest.raises(ValueError, match=r"field of view is .* must be at least 10 and at most 15"):
         Intrinsics.from_field_of_view(degrees, (640, 480))
     with pytest.raises(ValueError, match="image is 640 x 0"):
         Intrinsics.from_field_of_view(60, (640, 0))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "said"),
+    [(1.13, "give degrees; 1.13 radians are 65 degrees"), (5, "give degrees; a camera that sees")],
+)
+def test_radians_are_no_degrees(degrees: float, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Intrinsics.from_field_of_view(degrees, (640, 480))
 
 
 def explicit(lens: str, distortion: tuple[float, ...], x: float, y: float) -> tuple[float, float]:

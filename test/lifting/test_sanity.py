@@ -86,6 +86,31 @@ def test_points_far_outside_the_image(options: dict[str, object]) -> None:
     assert codes(points, **options) == ["outside"]
 
 
+def test_points_outside_the_image_name_the_size() -> None:
+    (finding,) = check(people(), ALL, CAMERA, (1280, 560))
+    assert "lie outside the image of 1280 x 560, one at (" in finding.message
+    assert "not resized or cut, width before height" in finding.message
+    # At most 5 % may be wrong detections, and fractions beyond 1 are parts that the image cuts off.
+    assert not check(people(), ALL, CAMERA, (1280, 590))
+    assert not check(people(), ALL, CAMERA, (1280, 560), is_normalised=True)
+
+
+def test_where_a_size_is_used_it_is_checked_first() -> None:
+    first = "check first the size of the image, 1280 x 720 (width before height"
+    for camera, normalised, expected in (
+        (CAMERA, False, first),
+        (None, True, first),
+        (None, False, "check the keypoint layout"),
+    ):
+        (finding,) = check(
+            people(), ALL, camera, SIZE, lifted=lifted(residual=0.5), is_normalised=normalised
+        )
+        assert finding.code == "poor-fit" and expected in finding.message
+    sideways = np.tile(np.array([(0, 0, 1), (0, 1, 0), (-1, 0, 0)], float), (N, 1, 1))
+    assert first in orientation(sideways, SIZE)[0].message
+    assert "check that x and y" in orientation(sideways)[0].message
+
+
 @pytest.mark.parametrize("spot", [(-1, -1), (-999, -999), (-1, 0), (9999, 9999)])
 def test_sentinels(spot: tuple[int, int]) -> None:
     points = people()

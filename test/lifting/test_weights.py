@@ -14,7 +14,7 @@ from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.numpy_backend import NumpyBackend
-from deep_nrsfm_ros.lifting.observation import Observation, without_border
+from deep_nrsfm_ros.lifting.observation import Observation, outside_share, without_border
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import load_model
@@ -89,6 +89,27 @@ def test_files_leave_out_the_border_and_say_so(tmp_path: Path) -> None:
     assert "12 of 51 keypoints are at the border" in " ".join(map(str, detections.warnings))
 
 
+def test_a_file_with_many_keypoints_outside_is_of_another_image(tmp_path: Path) -> None:
+    np.savez(tmp_path / "keypoints.npz", points=people(3))
+    options = ReadOptions(image_size=(720, 400), layout=HUMAN17)
+    detections = read_keypoints(tmp_path / "keypoints.npz", options)
+    assert detections.confidence.all() and not detections.warnings
+    # Fractions are multiplied by the size: those beyond 1 are legs that the image cuts off.
+    np.savez(tmp_path / "keypoints.npz", points=people(3) / (720, 400))
+    detections = read_keypoints(tmp_path / "keypoints.npz", options)
+    assert detections.is_normalised and not detections.confidence[:, LEGS[-1]].any()
+
+
+def test_few_keypoints_at_the_border_are_no_warning(tmp_path: Path) -> None:
+    points = people(20)
+    points[7, LEGS[:2], 1] = 719
+    np.savez(tmp_path / "keypoints.npz", points=points)
+    options = ReadOptions(image_size=(1280, 720), layout=HUMAN17)
+    detections = read_keypoints(tmp_path / "keypoints.npz", options)
+    assert not detections.warnings
+    assert "2 of 340 keypoints are at the border" in detections.notes[0]
+
+
 def test_a_weight_grows_with_the_score() -> None:
     scores = np.linspace(0, 1, 21)
     confidence = np.full((21, 17), 0.9)
@@ -128,6 +149,19 @@ def test_keypoints_at_the_border_are_missing(size: tuple[int, int]) -> None:
     assert found.identities == ("a",) and points[0, 3, 0] == w + 50
     inside = Observation(points[:, :1], confidence[:, :1])
     assert without_border(inside, size) is inside
+
+
+def test_sure_keypoints_outside_the_image_are_counted() -> None:
+    points, confidence = people(4), np.full((4, 17), 0.8, np.float32)
+    assert outside_share(points, confidence, (1280, 720)) == 0
+    points[:2, LEGS, 1] = 750
+    share = outside_share(points, confidence, (1280, 720))
+    assert share == pytest.approx(2 * len(LEGS) / (4 * 17))
+    confidence[:2, LEGS] = 0.2  # what a detector guesses of legs that the image cuts off
+    assert outside_share(points, confidence, (1280, 720)) == 0
+    points[:, LEGS, 1], confidence[:] = 724, 0.8  # at the border
+    assert outside_share(points, confidence, (1280, 720)) == 0
+    assert outside_share(points, 0 * confidence, (1280, 720)) == 0
 
 
 def test_the_size_of_another_image_leaves_nothing_out() -> None:

@@ -112,7 +112,11 @@ def test_a_field_of_view_gives_objects_their_place_without_camera_info(
     x, y, z = place(answer)
     assert z > 0.5 and (x / z, y / z) == pytest.approx(ray, abs=0.05)
 
-    assert "set image_width and image_height" in client.set_parameters(image_width=0)
+    refused = client.set_parameters(image_width=0)
+    assert "image_width is 0 and image_height is 480; set image_width" in refused
+    refused = client.set_parameters(image_width=1280)  # would halve all places
+    assert "would make the image 1280 x 480" in refused and "in one call" in refused
+    assert client.set_parameters(image_width=640) == ""
     assert "read-only" in client.set_parameters(field_of_view=90.0)
     assert client.set_parameters(image_width=1280, image_height=960) == ""
     client.wait_for_health(lambda _, v: v["camera"].endswith(f"{2 * focal:.1f} pixels"))
@@ -145,6 +149,14 @@ def test_a_camera_that_is_not_calibrated_is_reported(
         ({"tf_prefix": "person_"}, "tf_prefix is 'person_' without camera_info"),
         ({"rectified": True}, "rectified is true without camera_info"),
         ({"field_of_view": 65.0}, "field_of_view is 65 and needs the size of the image: set image"),
+        (
+            {"field_of_view": 65.0, "image_height": 480},
+            "image_width is 0 and image_height is 480; set image_width",
+        ),
+        (
+            {"field_of_view": 1.13, "image_width": 640, "image_height": 480},
+            "1.13 radians are 65 degrees",
+        ),
         (
             {"field_of_view": 65.0, "camera_info": "camera_info"},
             "camera_info is 'camera_info', whose CameraInfo says it too: leave field_of_view out",

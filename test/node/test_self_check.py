@@ -73,6 +73,26 @@ def test_a_layout_that_does_not_fit_is_said(start_lifter: StartLifter, connect: 
         client.wait_for_health(lambda s, v: s.level == b"\x00" and "coco17" in v["keypoint layout"])
 
 
+def test_a_size_of_another_image_is_said(start_lifter: StartLifter, connect: Connect) -> None:
+    size = {"image_width": 400, "image_height": 1280}
+    lifter = start_lifter(model="human", keypoint_layout="coco17", field_of_view=65.0, **size)
+    client = connect()
+    with stream(client, *in_layout(COCO17)):
+        status = client.wait_for_health(lambda s, _: "outside the image of 400 x 1280" in s.message)
+        assert status.level != b"\x00" and "not resized or cut" in status.message
+        assert not client.set_parameters(image_width=IMAGE[0], image_height=IMAGE[1])
+        client.wait_for_health(lambda s, v: s.level == b"\x00" and v["findings"] == "none")
+    assert "hint" not in lifter.log
+
+
+def test_a_field_of_view_is_hinted_at_once(start_lifter: StartLifter, connect: Connect) -> None:
+    lifter = start_lifter(model="human", keypoint_layout="coco17")
+    client = connect()
+    with stream(client, *in_layout(COCO17)):
+        client.wait_for_health(lambda _, v: int(v["messages lifted"]) > 60)
+    assert lifter.log.count("roughly with -p field_of_view (65 typical of webcams)") == 1
+
+
 def test_the_size_of_the_image_acts_on_clouds(start_lifter: StartLifter, connect: Connect) -> None:
     points, confidence = in_layout(COCO17)
     # Without history, so that the same keypoints are lifted alike before and after.

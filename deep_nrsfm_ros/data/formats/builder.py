@@ -161,11 +161,11 @@ class DetectionsBuilder:
         self._preset: KeypointLayout | None = None
         self._categories: dict[Any, str] = {}
         self._has_scores = False
-        self._image_sizes: set[Size | None] = set()
+        self._image_sizes: Counter[Size | None] = Counter()
 
     def image_size(self, size: Size | None) -> None:
         """Add width and height in pixels of an image; None: the input lists it without them."""
-        self._image_sizes.add(size)
+        self._image_sizes[size] += 1
 
     def frame(
         self,
@@ -350,7 +350,7 @@ class DetectionsBuilder:
             scores=scores,
             layout=layout,
             usual_layout=COCO17 if self.is_coco and points.shape[1] == len(COCO17) else None,
-            image_size=next(iter(self._image_sizes)) if len(self._image_sizes) == 1 else None,
+            image_sizes=tuple(self._image_sizes.most_common()),
             warnings=(*self.warnings, *self.reasons()),
             findings=tuple(self._findings.values()),
         )

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What looks wrong in the last messages of a stream: keypoints outside the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.data.walking_person import IMAGE, in_layout
+from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.observation import Observation
+from deep_nrsfm_ros.lifting.options import LiftingOptions
+from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
+from deep_nrsfm_ros.messages.decoding import POLYGON, InputType, is_normalised
+from deep_nrsfm_ros.messages.field_mapping import FieldMapping
+from deep_nrsfm_ros.messages.options import InputOptions
+from deep_nrsfm_ros.messages.pipeline import Pipeline
+from deep_nrsfm_ros.messages.stream_check import StreamCheck
+from deep_nrsfm_ros.model_files.model_file import load_model
+
+FRACTIONS = FieldMapping("other_msgs/Pose", keypoints="points", units="normalised")
+PIXELS = FieldMapping("other_msgs/Pose", keypoints="points")
+
+
+@dataclass
+class Reader:
+    """Reads the same observation from any bytes."""
+
+    input_type: InputType
+    observation: Observation
+
+    def __call__(self, raw: bytes, *args: Any) -> tuple[None, Observation]:
+        return None, self.observation
+
+
+def test_fractions_are_told_from_pixels() -> None:
+    assert is_normalised(FRACTIONS) and not is_normalised(PIXELS) and not is_normalised(POLYGON)
+
+
+@pytest.mark.parametrize(("mapping", "expected"), [(PIXELS, ["outside"]), (FRACTIONS, [])])
+def test_pixels_outside_the_image_and_parts_that_it_cuts_off(
+    mapping: FieldMapping, expected: list[str]
+) -> None:
+    points, confidence = in_layout(HUMAN17)
+    points = points[:8] + np.array([0, 250], np.float32)  # legs below the image
+    pipeline = Pipeline(
+        load_model("human17"), None, InputOptions(), LiftingOptions(), SmoothingOptions()
+    )
+    stream = StreamCheck(search=False)
+    reader: Any = Reader(mapping, Observation(points, confidence[:8]))
+    stream.received("keypoints", reader, b"")
+    camera = Intrinsics.from_field_of_view(65, IMAGE)
+    found = stream.look(pipeline, IMAGE, camera, 0.5)
+    assert [finding.code for finding in found if finding.code == "outside"] == expected
+    assert not expected or found[0].code == "outside"
