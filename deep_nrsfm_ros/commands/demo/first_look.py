@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.commands.program import Parser, program, program_name
+from deep_nrsfm_ros.data.cameras import Array
 from deep_nrsfm_ros.data.clip import STANDING, Clip, read_clip
 from deep_nrsfm_ros.data.detections import gather, stamps_at
+from deep_nrsfm_ros.data.over_time import OverTime
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, View
 from deep_nrsfm_ros.data.recording import lift_recording
 from deep_nrsfm_ros.extras import is_installed, require_extra
@@ -45,7 +47,9 @@ _NOTES = (
 _STANDING_NOTES = (
     *_NOTES,
     "keypoints by MediaPipe; the ground truth is triangulated from them",
+    "the lifter is given the direction of gravity, as by TF or an IMU",
 )
+_UP = np.array([0.0, 0.0, 1.0])  # against gravity, in the world of the clips
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -100,13 +104,16 @@ def read_model(name: str, output: Path) -> Model:
     return model
 
 
-def lift_view(view: View, model: Model, layout: KeypointLayout = BODY25B) -> NDArray[np.floating]:
+def lift_view(
+    view: View, model: Model, layout: KeypointLayout = BODY25B, up: Array | None = None
+) -> NDArray[np.floating]:
     """Return the lifted points (f, p, 3) of one camera in its optical frame, in metres.
 
     Args:
         view: what the camera saw.
         model: lifts it.
         layout: of the view's keypoints.
+        up: (3,) direction against gravity in the camera's axes; None: unknown.
     """
     frames = [
         Observation(view.points[i : i + 1], view.confidence[i : i + 1])
@@ -120,7 +127,9 @@ def lift_view(view: View, model: Model, layout: KeypointLayout = BODY25B) -> NDA
         ["person"] * len(frames),
     )
     lifter = Lifter(model, LiftingOptions(reference_length=TORSO))
-    recording = lift_recording(detections, layout, lifter, intrinsics=view.camera.intrinsics)
+    recording = lift_recording(
+        detections, layout, lifter, intrinsics=view.camera.intrinsics, over_time=OverTime(up=up)
+    )
     shapes: NDArray[np.floating] = recording.lifted.shapes
     return shapes
 
@@ -204,7 +213,10 @@ def errors_of(
 def write_standing(model: Model, output: Path) -> None:
     """Lift the person who stands, write the page of it, and say how far the joints are off."""
     clip = read_clip(STANDING)
-    lifted = [lift_view(view, model, clip.layout) for view in clip.session.views]
+    lifted = [
+        lift_view(view, model, clip.layout, view.camera.rotation @ _UP)
+        for view in clip.session.views
+    ]
     pairs = zip(clip.session.views, lifted, strict=True)
     off = [f"{errors_of(view, shapes, model)[1].aligned:.0f}" for view, shapes in pairs]
     stage = stage_of(clip, model, lifted)
