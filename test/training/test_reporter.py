@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from deep_nrsfm_ros.data.keypoint_files import read_keypoints
+from deep_nrsfm_ros.training import reporter as module
 from deep_nrsfm_ros.training.reporter import Reporter
 
 
@@ -29,6 +30,18 @@ def test_an_end_that_is_reached_again_and_again_is_shown_once(
         lines.reading(done, 5)
     shown = [json.loads(line)["step"] for line in capsys.readouterr().out.splitlines()]
     assert shown == [0, 5]
+
+
+def test_the_bar_of_a_second_count_of_the_same_size_ends_too(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter(range(100))
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    bar = reporter()
+    for done in (0, 5, 0, 5):
+        bar.curating(done, 5)
+    assert capsys.readouterr().err.count("100%") == 2
+    assert bar._bar is None
 
 
 def test_many_small_files_are_one_bar(capsys: pytest.CaptureFixture[str]) -> None:
