@@ -58,8 +58,8 @@ class Reporter:
         if self._should_stop():
             raise CancelledError
         is_due = time.monotonic() - self._last > 0.2
-        # A file may be at its end many times, while its last lines are read. A bar that is open is of
-        # another count, which ends now.
+        # A file may be at its end many times, while its last lines are read. An open bar is of a
+        # later count.
         if done == total and self._ended == (state, total) and self._bar is None:
             return
         # A bar of each of many small files would hide the warnings.

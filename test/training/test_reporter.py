@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from deep_nrsfm_ros.data.keypoint_files import read_keypoints
-from deep_nrsfm_ros.training import reporter as module
 from deep_nrsfm_ros.training.reporter import Reporter
 
 
@@ -36,7 +35,7 @@ def test_the_bar_of_a_second_count_of_the_same_size_ends_too(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = iter(range(100))
-    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr("deep_nrsfm_ros.training.reporter.time.monotonic", lambda: next(clock))
     bar = reporter()
     for done in (0, 5, 0, 5):
         bar.curating(done, 5)
