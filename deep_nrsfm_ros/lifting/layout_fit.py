@@ -26,7 +26,7 @@ MAX_OBJECTS = 200
 """Objects of a sample: they take 2 to 10 ms a layout."""
 
 _CLEAR_RATIO = 0.6  # a residual below this fraction of another is clearly better
-_PART_RATIO = 0.85  # keypoints that a layout leaves out fit badly where another one is meant
+_PART_RATIO = 0.85  # of the residual with all keypoints, below which some of them are not meant
 _MIN_MAPPED = 10  # keypoints of the model, or half of them; fewer fit any shape in any order
 _FAST_OPTIONS = LiftingOptions(correction="none", test_time_rotations=1, refill=0)
 
@@ -74,19 +74,22 @@ def fit_layouts(
         residual = lift_all(lifter.lift, *mapped).residual
         if not np.isnan(residual).all():
             fits.append(LayoutFit(layout, float(np.nanmedian(residual))))
-    layouts = [fit.layout for fit in fits]
+    visible = np.ones(confidence.shape[1], bool)
+    sources = [_sources(fit.layout, model, visible) for fit in fits]
+    ranks = [
+        fit.residual / (_PART_RATIO if any(_is_part(own, other) for other in sources) else 1)
+        for fit, own in zip(fits, sources, strict=True)
+    ]
+    return [fits[i] for i in np.argsort(ranks, kind="stable")]
 
-    def rank(fit: LayoutFit) -> float:
-        is_part = any(_is_part(fit.layout, of, model) for of in layouts)
-        return fit.residual / (_PART_RATIO if is_part else 1)
 
-    return sorted(fits, key=rank)
+def _is_part(own: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
+    """Return whether a layout gives the model some of what another one gives, and no more.
 
-
-def _is_part(layout: KeypointLayout, of: KeypointLayout, model: Model) -> bool:
-    """Return whether the model gets of a layout some of what it gets of another, and no more."""
-    visible = np.ones(len(layout), bool)
-    own, other = _sources(layout, model, visible), _sources(of, model, visible)
+    Args:
+        own: (p, 2) `_sources` of the layout.
+        other: (p, 2) those of the other one.
+    """
     taken = own[:, 0] > 0
     return bool((own[taken] == other[taken]).all() and (other[~taken, 0] > 0).any())
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.data.clip import IMAGE_STEP, Images
 from deep_nrsfm_ros.data.pose2sim import JOINTS, RATE, Session
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.nrsfm.metrics import camera_errors
+from deep_nrsfm_ros.nrsfm.metrics import CameraErrors, camera_errors
 from deep_nrsfm_ros.reporting.capsules import body_capsules
 from deep_nrsfm_ros.reporting.drawing import edge_colours
 from deep_nrsfm_ros.reporting.template import embedded, render
@@ -42,7 +42,7 @@ class StageView:
         shapes: (f, p, 3) lifted points; NaN where nothing was lifted.
         truth: (f, j, 3) ground truth of `JOINTS`; NaN where unknown.
         position: (3,) of the camera.
-        errors: what the page says of the errors.
+        error: of the lifted limb joints.
     """
 
     name: str
@@ -52,7 +52,20 @@ class StageView:
     shapes: Floats
     truth: Floats
     position: Floats
-    errors: str
+    error: CameraErrors
+
+    @property
+    def errors(self) -> str:
+        """What the page says of the errors."""
+        return (
+            f"{self.error.aligned:.0f} mm after alignment, {self.error.in_camera:.0f} mm as it "
+            f"stands but for scale and place, rotation {self.error.rotation:.0f}° off"
+        )
+
+    @property
+    def lifted(self) -> NDArray[np.bool_]:
+        """Which of the f frames are lifted."""
+        return np.asarray(np.isfinite(self.shapes).all((1, 2)))
 
 
 @dataclass(frozen=True)
@@ -101,7 +114,6 @@ def make_stage(
     for view, image, shapes in zip(session.views, images, lifted, strict=True):
         camera = view.camera
         known = np.isfinite(shapes).all((1, 2))
-        errors = camera_errors(shapes[known][:, limbs] / _MM, view.truth[known])
         views.append(
             StageView(
                 camera.name,
@@ -111,8 +123,7 @@ def make_stage(
                 (shapes - _MM * camera.translation) @ camera.rotation,
                 _MM * (view.truth - camera.translation) @ camera.rotation,
                 -_MM * camera.translation @ camera.rotation,
-                f"{errors.aligned:.0f} mm after alignment, {errors.in_camera:.0f} mm as it stands "
-                f"but for scale and place, rotation {errors.rotation:.0f}° off",
+                camera_errors(shapes[known][:, limbs] / _MM, view.truth[known]),
             )
         )
     edges = tuple(edge for edge in source.edges if set(edge) <= set(JOINTS))

@@ -32,7 +32,6 @@ from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import Model, find_model, load_model
-from deep_nrsfm_ros.nrsfm.metrics import CameraErrors, camera_errors
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.reporting.stage import Stage, make_stage, stage_page
 
@@ -183,31 +182,16 @@ def run(args: argparse.Namespace) -> None:
         f"{len(clip.session.views)} cameras saw a person for {len(clip.session.world) / RATE:.1f} "
         f"s; the ground truth is triangulated from all of them ({truth:.1f} px off on average)"
     )
-    lifted = [lift_view(view, model) for view in clip.session.views]
-    for view, shapes in zip(clip.session.views, lifted, strict=True):
-        known, error = errors_of(view, shapes, model)
+    stage = stage_of(clip, model, [lift_view(view, model) for view in clip.session.views])
+    for view in stage.views:
         say(
-            f"{view.camera.name}: {known.sum()} of {len(known)} frames lifted; joints are "
-            f"{error.aligned:.0f} mm off after alignment, the rotation {error.rotation:.0f} degrees"
+            f"{view.name}: {view.lifted.sum()} of {len(view.lifted)} frames lifted; joints are "
+            f"{view.error.aligned:.0f} mm off after alignment, the rotation "
+            f"{view.error.rotation:.0f} degrees"
         )
     write_keypoints(clip, args.output)
     write_standing(model, args.output)
-    show(stage_of(clip, model, lifted), args.output)
-
-
-def errors_of(
-    view: View, shapes: NDArray[np.floating], model: Model
-) -> tuple[NDArray[np.bool_], CameraErrors]:
-    """Return which frames (f,) are lifted, and how far these are off.
-
-    Args:
-        view: has the ground truth.
-        shapes: (f, p, 3) lifted points, as `lift_view` returns them.
-        model: of the p keypoints.
-    """
-    known = np.isfinite(shapes).all((1, 2))
-    limbs = [model.layout.index(joint) for joint in JOINTS]
-    return known, camera_errors(1000 * shapes[known][:, limbs], view.truth[known])
+    show(stage, args.output)
 
 
 def write_standing(model: Model, output: Path) -> None:
@@ -217,9 +201,8 @@ def write_standing(model: Model, output: Path) -> None:
         lift_view(view, model, clip.layout, view.camera.rotation @ _UP)
         for view in clip.session.views
     ]
-    pairs = zip(clip.session.views, lifted, strict=True)
-    off = [f"{errors_of(view, shapes, model)[1].aligned:.0f}" for view, shapes in pairs]
     stage = stage_of(clip, model, lifted)
+    off = [f"{view.error.aligned:.0f}" for view in stage.views]
     output.mkdir(parents=True, exist_ok=True)
     page = stage_page(stage, f"{_TITLE}: standing", _STANDING_NOTES, {"balancing": PAGE})
     (output / STANDING_PAGE).write_text(page, encoding="utf-8")
