@@ -235,6 +235,8 @@ def _text(node: ast.expr, texts: dict[str, str]) -> str:
         return _text(node.left, texts) + _text(node.right, texts)
     if isinstance(node, ast.Name):
         return texts.get(node.id, "…")
+    if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "wording":
+        return _text(node.args[0], texts)
     return "…"
 
 

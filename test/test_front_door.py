@@ -24,7 +24,6 @@ from deep_nrsfm_ros.layouts.presets import BODY25, COCO17, HUMAN25
 from deep_nrsfm_ros.model_files.model_file import ModelFileError, save_model
 from deep_nrsfm_ros.nrsfm.factorisation.consensus import Consensus
 from deep_nrsfm_ros.training import few_frames
-from deep_nrsfm_ros.training.python_names import in_python
 
 ROOT = Path(__file__).parents[1]
 
@@ -154,7 +153,7 @@ def test_an_array_becomes_a_model_that_lifts(
     layout = KeypointLayout("thing", tuple("abcdefgh"))
     progress: list[Any] = []
     messages: list[str] = []
-    with pytest.warns(UserWarning, match="'thing' names no handedness"):
+    with pytest.warns(UserWarning, match="'thing' names no handedness") as warned:
         model = train(
             points,
             layout=layout,
@@ -163,8 +162,9 @@ def test_an_array_becomes_a_model_that_lifts(
             on_progress=progress.append,
             on_message=messages.append,
         )
+    assert {warning.filename for warning in warned} == {__file__}
     assert ["factorisations" in message for message in messages] == [True, False]
-    assert messages[-1] == in_python(model.provenance["judgement"]["reason"])
+    assert messages[-1] == model.provenance["judgement"]["reason"]
     assert "look at its shapes from the side, or name a handedness" in messages[-1]
     assert model.name == "thing" and model.layout == layout and progress
     assert "rival" not in model.provenance["judgement"]  # no model has such an object

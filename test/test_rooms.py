@@ -16,7 +16,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "deep_nrsfm_ros"
 NAME = PACKAGE.name
 FLOORS = (
-    {"configuration", "yaml_file", "batched", "extras", "similar_names"},
+    {"configuration", "yaml_file", "batched", "extras", "similar_names", "wording"},
     {"large_arrays"},
     {"layouts"},
     {"nrsfm"},

@@ -17,6 +17,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.outliers import find_outliers
 from deep_nrsfm_ros.large_arrays import empty, release
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible, rms_radius
+from deep_nrsfm_ros.wording import wording
 
 Bools = NDArray[np.bool_]
 
@@ -145,13 +146,17 @@ class Curated:
         judged = self.total - self.few_visible - self.near_duplicates
         if self.few_visible > 0.5 * self.total:
             warnings.append(
-                f"{self.few_visible} of {self.total} frames show too few keypoints; look at the "
-                "detector, --min-confidence and the keypoint layout"
+                f"{self.few_visible} of {self.total} frames show too few keypoints; "
+                + _look_at_the_detector()
             )
         if self.inconsistent > _SUSPICIOUS * judged:
             warnings.append(
                 f"{self.inconsistent} of {judged} frames contradict the rest; if they are rare "
-                "poses and not mistakes of the detector, --outlier-threshold 0 keeps them"
+                "poses and not mistakes of the detector, "
+                + wording(
+                    "--outlier-threshold 0 keeps them",
+                    python="the program `train` can keep them",
+                )
             )
         for name, count, total in self.hidden_by_keypoint:
             if count > _SUSPICIOUS * total:
@@ -159,6 +164,12 @@ class Curated:
                     f"{name} was an outlier in {count} of {total} frames: is it swapped?"
                 )
         return tuple(warnings)
+
+
+def _look_at_the_detector() -> str:
+    """Return what to do about frames with few keypoints."""
+    confidence = wording("--min-confidence", python="the confidence")
+    return f"look at the detector, {confidence} and the keypoint layout"
 
 
 def curate(
@@ -182,8 +193,8 @@ def curate(
     enough = dataset.visible.sum(1) >= options.min_visible
     if not enough.any():
         raise ValueError(
-            f"none of the {len(dataset)} frames shows {options.min_visible} keypoints; look at "
-            "the detector, --min-confidence and the keypoint layout"
+            f"none of the {len(dataset)} frames shows {options.min_visible} keypoints; "
+            + _look_at_the_detector()
         )
     frames = np.flatnonzero(enough)
     candidates = dataset if enough.all() else dataset[frames]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import preset
+from deep_nrsfm_ros.wording import wording
 
 Float32 = NDArray[np.float32]
 
@@ -89,7 +90,8 @@ def as_right_hands(hands: Dataset, side: str) -> Dataset:
     if lacking := [name for name in _PALM if name not in layout.keypoints]:
         raise ValueError(
             f"hands are {side!r}, but the object {layout.name!r} has no {', '.join(lacking)}: "
-            "leave this out, or name the object hand21 (--object, train.object)"
+            "leave this out, or name the object hand21 "
+            f"({wording('--object, train.object', python='object')})"
         )
     if side == "palms":
         left = _look_left(hands.points, layout)
@@ -128,8 +130,8 @@ def mixed_sides(hands: Dataset, least: float = _SOME) -> str:
     return (
         f"{100 * share:.0f} % of the hands look like those of the other side: if left and right "
         "hands are mixed, the model learns a mirrored depth, and no figure shows it. Say what they "
-        "are (--hands, train.hands): palms (each shows its palm: left ones are mirrored), right or "
-        "left"
+        f"are ({wording('--hands, train.hands', python='hands')}): palms (each shows its palm: "
+        "left ones are mirrored), right or left"
     )
 
 

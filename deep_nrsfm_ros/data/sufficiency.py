@@ -17,6 +17,7 @@ from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.hands import mixed_sides
 from deep_nrsfm_ros.nrsfm.geometry import centre_visible, on_one_line, polar, rms_radius
+from deep_nrsfm_ros.wording import wording
 
 Floats = NDArray[np.float64]
 
@@ -84,7 +85,8 @@ def assess_sufficiency(dataset: Dataset, *, has_start: bool = False) -> Sufficie
             frames,
             keypoints,
             f"only {keypoints} keypoints are visible ({', '.join(names) or 'none'}); NRSfM needs "
-            "at least 4, better 8; check the layout and lower --min-confidence",
+            "at least 4, better 8; check the layout and "
+            + wording("lower --min-confidence", python="the confidence"),
         )
     lines = np.zeros(len(dataset), bool)
     for part in slices(len(dataset)):
@@ -195,9 +197,7 @@ def _warnings(frames: int, span: float, deformation: float, has_start: bool) -> 
             "object from more sides to learn its depth"
             if has_start
             else f"{views}, so that depth rests on deformation alone and may come out mirrored; "
-            "record the object from more sides, start from a model of such an object (--from, "
-            "train.from), or let the layout help (--bone-length-weight, --handedness-weight, "
-            "or train.*)"
+            + how_to_learn_depth()
         )
     if deformation < _RIGID:
         warnings.append(
@@ -205,6 +205,17 @@ def _warnings(frames: int, span: float, deformation: float, has_start: bool) -> 
             "rigid shape; record it in other poses for more"
         )
     return tuple(warnings)
+
+
+def how_to_learn_depth() -> str:
+    """Return what helps where depth may come out mirrored, as a whole or in part."""
+    a_model = "a model of such an object"
+    start = wording(
+        f"start from {a_model} (--from, train.from), or let the layout help (--bone-length-weight, "
+        "--handedness-weight, or train.*)",
+        python=f"or start from {a_model} (start)",
+    )
+    return f"record the object from more sides, {start}"
 
 
 def _stacked(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> Floats:

@@ -21,6 +21,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, find_sentinel
 from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.wording import wording
 
 MAX_OBJECTS = 200
 """Objects of a sample: they take 2 to 10 ms a layout."""
@@ -208,10 +209,12 @@ def better_layout(
     best = fits[0]
     if best.layout.keypoints == current.keypoints or not is_clearly_better(best, residual):
         return None
+    name = best.layout.name
     return Finding(
         "layout",
-        f"poor fit as {current.name}: is it {best.layout.name}? It fits {best.residual:.2f} "
-        f"instead of {residual:.2f}; set the keypoint layout to {best.layout.name}",
+        f"poor fit as {current.name}: is it {name}? It fits {best.residual:.2f} instead of "
+        f"{residual:.2f}; "
+        + wording(f"set the keypoint layout to {name}", python=f"give layout={name!r}"),
     )
 
 

@@ -21,6 +21,7 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import outside_share
+from deep_nrsfm_ros.wording import wording
 
 Floats = NDArray[np.floating[Any]]
 Size = tuple[int, int]
@@ -424,8 +425,12 @@ def _sentinel(spot: Floats, times: int, total: int) -> Finding:
     return Finding(
         "sentinel",
         f"{times} of {total} visible keypoints lie at exactly ({x:g}, {y:g}), as detectors write "
-        "it for a missing keypoint: give them confidence 0, NaN or (0, 0), or name the value "
-        f"(--missing-value={x or y:g} for files, `missing` in a field mapping)",
+        "it for a missing keypoint: give them confidence 0, NaN or (0, 0)"
+        + wording(
+            f", or name the value (--missing-value={x or y:g} for files, `missing` in a field "
+            "mapping)",
+            python="",
+        ),
     )
 
 
@@ -460,8 +465,11 @@ def _coordinates(
             yield Finding(
                 "normalised",
                 f"keypoints lie between {low:.2f} and {high:.2f}{camera}: they are normalised, not "
-                "pixels; give the size of the image (image_width and image_height), or multiply x "
-                "by its width and y by its height",
+                "pixels; "
+                + wording(
+                    "give the size of the image (image_width and image_height), or ", python=""
+                )
+                + "multiply x by its width and y by its height",
             )
         return
     extent = _extent(points, visible)

@@ -6,11 +6,10 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,16 +37,18 @@ from deep_nrsfm_ros.training.data_check import (
 )
 from deep_nrsfm_ros.training.fine_tuning import inherit, start_from
 from deep_nrsfm_ros.training.limb_exchange import LimbExchange
-from deep_nrsfm_ros.training.python_names import in_python
 from deep_nrsfm_ros.training.same_name import check_not_shipped
+from deep_nrsfm_ros.wording import in_python
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.progress import Progress
 
 
+_CALLER = 3  # stack level of who calls `train`, above it and its decorator
 _MOST_SEQUENCES = 50  # that are checked one by one: each takes up to a second
 
 
+@in_python()
 def train(
     points: ArrayLike,
     confidence: ArrayLike | None = None,
@@ -131,32 +132,31 @@ def train(
     check_not_shipped("name", name)
     check_side("hands", hands)
     layout = layout_of("layout", layout, name)
-    with _python_names():
-        seen = from_arrays(points, confidence, layout)
-        starts = np.array(() if sequence_starts is None else sequence_starts, np.int64)
-        visible = seen.confidence > 0
-        data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
-        findings = _findings(points, confidence, seen, data)
-        if object is not None:
-            layout = layout_of("object", object, name)
-            mapped, weight = KeypointMap(data.layout, layout)(seen.points, seen.confidence)
-            data = Dataset(mapped, weight > 0, layout, "arrays", sequence_starts=starts)
-        if (is_seen := seen.confidence.any(1)).any():  # a frame that shows nothing is padding
-            data = data if is_seen.all() else data[np.flatnonzero(is_seen)]
-        if hands:
-            data = as_right_hands(data, hands)
-        curated = curate(data)
-        origin = _origin(start, layout)
-        sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
-        if sufficiency.refusal:
-            raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
+    seen = from_arrays(points, confidence, layout)
+    starts = np.array(() if sequence_starts is None else sequence_starts, np.int64)
+    visible = seen.confidence > 0
+    data = Dataset(seen.points, visible, layout, "arrays", sequence_starts=starts)
+    findings = _findings(points, confidence, seen, data)
+    if object is not None:
+        layout = layout_of("object", object, name)
+        mapped, weight = KeypointMap(data.layout, layout)(seen.points, seen.confidence)
+        data = Dataset(mapped, weight > 0, layout, "arrays", sequence_starts=starts)
+    if (is_seen := seen.confidence.any(1)).any():  # a frame that shows nothing is padding
+        data = data if is_seen.all() else data[np.flatnonzero(is_seen)]
+    if hands:
+        data = as_right_hands(data, hands)
+    curated = curate(data)
+    origin = _origin(start, layout)
+    sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
+    if sufficiency.refusal:
+        raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
     # A start passes its handedness on to a layout without one.
     missing = layout.warning if layout.handedness or not origin else ""
     unseen = never_seen(curated.dataset, origin)
     found = sentences(findings)
     for warning in (missing, unseen, *found, *curated.warnings, *sufficiency.warnings):
         if warning:
-            warnings.warn(in_python(warning), stacklevel=2)
+            warnings.warn(warning, stacklevel=_CALLER)
     rival = origin or _shipped(layout)
     frames = split(curated.dataset, Curation().held_out if rival else 0.0)
     preset = PRESETS["default"]._replace(recipe=recipe or Recipe())
@@ -172,31 +172,12 @@ def train(
     if origin:
         model = inherit(model, origin)
     judgement = judge(frames, model, rival, findings)
-    on_message(in_python(judgement.brief))
+    on_message(judgement.brief)
     if judgement.doubtful:
-        warnings.warn(in_python(judgement.brief), stacklevel=2)
+        warnings.warn(judgement.brief, stacklevel=_CALLER)
     date = time.strftime("%Y-%m-%d", time.gmtime())
-    model.provenance.update(date=date, judgement=_in_python(judgement.record()))
+    model.provenance.update(date=date, judgement=judgement.record())
     return model
-
-
-def _in_python(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of a judgement with its sentences in Python's words."""
-    return record | {
-        key: in_python(text) if isinstance(text, str) else [in_python(each) for each in text]
-        for key, text in record.items()
-        if key in ("reason", "faults")
-    }
-
-
-@contextmanager
-def _python_names() -> Iterator[None]:
-    """Name Python's arguments in the text of a ValueError."""
-    try:
-        yield
-    except ValueError as error:
-        error.args = (in_python(str(error)),)
-        raise
 
 
 def _findings(

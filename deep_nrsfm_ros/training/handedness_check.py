@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.lifted_sample import lift_sample
+from deep_nrsfm_ros.data.sufficiency import how_to_learn_depth
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import Floats
@@ -39,7 +40,5 @@ def disagreement(
     listing = ", ".join(f"{front} in {100 * share:.0f} %" for front, share in shares)
     return (
         f"the keypoints disagree on where the front is, so that depth is wrong in part ({listing} "
-        "of the frames where it belongs); record the object from more sides, start from a model "
-        "of such an object (--from, train.from), or let the layout help (--bone-length-weight, "
-        "--handedness-weight, or train.*)"
+        f"of the frames where it belongs); {how_to_learn_depth()}"
     )

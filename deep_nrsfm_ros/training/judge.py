@@ -36,6 +36,7 @@ from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
 from deep_nrsfm_ros.training.steps import FROM_RANDOM
+from deep_nrsfm_ros.wording import wording
 
 Floats = NDArray[Any]
 
@@ -283,7 +284,7 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
     figures, repeated = f"{_on(frames)}: {_shown(new, old, name)}", ""
     figures += _guessed(model)
     if old is None and not model.layout.handedness:
-        figures += f". These figures say nothing of depth: {MIRRORED_AS_A_WHOLE.format(model.name)}"
+        figures += f". These figures say nothing of depth: {_mirrored_as_a_whole(model.name)}"
     elif old is None and model.layout.warning:
         repeated = f". But {model.layout.warning}"
         figures += repeated
@@ -328,11 +329,18 @@ _IN_SENTENCES = {
     ALONE: "has no other to compare with",
     DOUBTFUL: "is doubtful",
 }
-MIRRORED_AS_A_WHOLE = (
-    "the layout names no handedness, so the whole may be a mirror image: look at it from the side "
-    "(replay FILE --model {} --html look.html), or name a handedness and train again"
-)
-"""What is said of a model whose depth nothing decides."""
+
+
+def _mirrored_as_a_whole(name: str) -> str:
+    """Return a sentence on a model whose depth nothing decides."""
+    look = wording(
+        f"it from the side (replay FILE --model {name} --html look.html)",
+        python="its shapes from the side",
+    )
+    return (
+        f"the layout names no handedness, so the whole may be a mirror image: look at {look}, or "
+        "name a handedness and train again"
+    )
 
 
 def _verdict(new: Figures, old: Figures | None) -> str:
@@ -406,8 +414,9 @@ def _guessed(model: Model) -> str:
     said = "only guessed"
     if "from" in model.provenance:
         said = "their guesses rest on the start"
-        if model.provenance["recipe"]["start_share"] < _SHARE_OF_SPEAKERS:
-            said += f"; --start-share {_SHARE_OF_SPEAKERS} keeps more of them"
+        if model.provenance["recipe"]["start_share"] < (share := _SHARE_OF_SPEAKERS):
+            option = wording(f"--start-share {share}", python=f"Recipe(start_share={share})")
+            said += f"; {option} keeps more of them"
     return f". Rarely shown: {', '.join(rare[:_MOST_NAMES])}{more} ({said})"
 
 
@@ -517,15 +526,22 @@ def _advice(model: Model, rival: str) -> str:
     if minutes := model.provenance.get("factorisation_needs_minutes"):
         advice.insert(0, f"more time (--minutes {minutes:g}, train.minutes, or no limit)")
     elif _has_few_steps(model):
-        advice.insert(0, f"more steps (--steps {FROM_RANDOM}, train.steps)")
+        steps = FROM_RANDOM
+        option = wording(f"--steps {steps}, train.steps", python=f"Recipe.steps, {steps} are usual")
+        advice.insert(0, f"more steps ({option})")
     if "from" in model.provenance:
         advice.append("fewer steps")
-        advice.append("a larger share of the start (--start-share, train.start_share)")
+        option = wording("--start-share, train.start_share", python="Recipe.start_share")
+        advice.append(f"a larger share of the start ({option})")
     else:
-        advice.append(f"a start from {rival or 'a model of such an object'} (--from, train.from)")
+        option = wording("--from, train.from", python="start")
+        advice.append(f"a start from {rival or 'a model of such an object'} ({option})")
     if model.layout.edges and model.layout.handedness:
-        options = "--bone-length-weight, --handedness-weight, --depth-penalty, or train.*"
-        advice.append(f"the layout's losses ({options})")
+        options = wording(
+            " (--bone-length-weight, --handedness-weight, --depth-penalty, or train.*)",
+            python=", which the program `train` offers,",
+        )
+        advice.append(f"the layout's losses{options}")
     return f"{', '.join(advice[:-1])} or {advice[-1]}"
 
 
