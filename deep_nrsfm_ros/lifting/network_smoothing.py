@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.nrsfm.geometry import Floats, rotation_from_vector, rotation_vector
 from deep_nrsfm_ros.nrsfm.metrics import rotation_angles
 
-MAX_TURN = 45.0
+MAX_TURN = 60.0
 """Degrees from the remembered rotation to a new one above which a frame is taken for turned."""
 MAX_AGREEMENT = 0.5
 """Most seconds for which turned frames are not believed."""
