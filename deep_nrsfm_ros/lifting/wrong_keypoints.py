@@ -26,7 +26,7 @@ from deep_nrsfm_ros.nrsfm.geometry import Floats, on_one_line
 
 MIN_RESIDUAL = 0.15
 """Residual of the network's fit above which an object is looked at; 0.07 to 0.1 is typical."""
-RESIDUAL_RATIO = 0.7
+RESIDUAL_RATIO = 0.6
 """The residual without a wrong keypoint is less than this times the one with it."""
 MIN_DISTANCE = 0.5
 """Least distance of a wrong keypoint from its place, in RMS radii of the visible keypoints."""
