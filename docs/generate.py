@@ -375,6 +375,16 @@ _API: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     (
+        "Lifting with a camera, over time",
+        (
+            "data.video_lifter:VideoLifter",
+            "data.video_lifter:VideoLifter.__call__",
+            "lifting.intrinsics:Intrinsics",
+            "lifting.intrinsics:Intrinsics.from_field_of_view",
+            "lifting.options:HistoryOptions",
+        ),
+    ),
+    (
         "Models and layouts",
         (
             "model_files.model_file:Model",
@@ -385,6 +395,25 @@ _API: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Training", ("training.from_arrays:train", "nrsfm.recipe:Recipe")),
 )
 """Sections of the Python API, and the module and the name of each entry."""
+_INTRODUCTIONS = {
+    "Lifting with a camera, over time": """\
+`Lifter` lifts each object by itself and centres it. `VideoLifter` puts it at its place before
+the camera, and remembers it from frame to frame, as the ROS node does:
+
+    from deep_nrsfm_ros import Intrinsics, Lifter, VideoLifter
+    camera = Intrinsics((1000, 1000), (640, 360))  # fx, fy and cx, cy in pixels
+    camera = Intrinsics.from_field_of_view(65, (1280, 720))  # or roughly: degrees of the width
+    video = VideoLifter(Lifter("human", layout="coco17"), camera)
+    for i, frame in enumerate(points):  # a person, or (n, 17, 2) of n people
+        lifted = video(frame, seconds=i / 30)
+        print(video.identities, lifted.shapes[0, 0])  # metres, from the camera
+
+Without `seconds` each object is lifted by itself: `video(points)` lifts all frames at once.
+[lift_video.py](../../examples/lift_video.py) does it with a real video and its calibration, and
+measures the answer against the true 3D with `nrsfm.metrics`; put your own arrays
+(frames, keypoints, 3) there.""",
+}
+"""Text at the beginning of a section of the Python API."""
 _MODULES = (
     *("network", "geometry", "normalisation", "losses", "metrics", "handedness", "neighbours"),
     *("bones", "recipe"),
@@ -392,6 +421,7 @@ _MODULES = (
 """Modules of `deep_nrsfm_ros.nrsfm` that the page lists."""
 _OF_PARAMETERS = {
     "LiftingOptions": "lifting",
+    "HistoryOptions": "lifting-over-time",
     "Recipe": "training-recipe",
 }
 """Dataclasses whose fields are parameters too, and the section of those."""
@@ -422,7 +452,8 @@ def python_page() -> str:
         "end. `help(NAME)` and [the API in full](python_full.md) have results and errors too.",
     ]
     for title, entries in _API:
-        parts += [f"## {title}", *map(_entry, entries)]
+        introduction = [_INTRODUCTIONS[title]] if title in _INTRODUCTIONS else []
+        parts += [f"## {title}", *introduction, *map(_entry, entries)]
     rows = ["| module | content |", "|---|---|"]
     for name in _MODULES:
         module = importlib.import_module(f"deep_nrsfm_ros.nrsfm.{name}")

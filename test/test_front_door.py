@@ -72,6 +72,17 @@ def test_the_lines_of_the_readme_run() -> None:
     assert np.isfinite(variables["lifted"].shapes).all()
 
 
+def test_the_lines_of_the_python_page_on_videos_run() -> None:
+    page = (ROOT / "docs/reference/python.md").read_text()
+    section = page.split("## Lifting with a camera, over time\n")[1].split("\n## ")[0]
+    lines = [line[4:] for line in section.splitlines() if line.startswith("    ")]
+    variables: dict[str, Any] = {"points": pixels(3, 17)}
+    exec("\n".join(lines), variables)
+    assert np.isfinite(variables["lifted"].shapes).all() and variables["lifted"].shapes[0, 0, 2] > 0
+    lifted = variables["video"](pixels(3, 17))
+    assert lifted.shapes.shape == (3, 25, 3)
+
+
 def test_one_object_and_many_in_any_dtype(human: Model) -> None:
     lifter, points = Lifter(human), pixels(100, 25)
     many = lifter(points)

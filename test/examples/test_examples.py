@@ -33,8 +33,16 @@ def test_arrays_are_lifted(tmp_path: Path) -> None:
     assert np.isfinite(np.load(tmp_path / "lifted.npz")["shapes"]).all()
 
 
+def test_a_video_is_lifted_and_measured(tmp_path: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / "lift_video.py")]
+    said = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True)
+    assert said.returncode == 0, said.stderr
+    aligned, in_camera, place = map(float, re.findall(r"([\d.]+) mm", said.stdout))
+    assert aligned < 80 and in_camera < 120 and place < 150
+
+
 def test_examples_are_short() -> None:
-    for name in ("lift_array", "publish_keypoints", "print_points", "elbow_angle"):
+    for name in ("lift_array", "lift_video", "publish_keypoints", "print_points", "elbow_angle"):
         lines = (EXAMPLES / f"{name}.py").read_text("utf-8").splitlines()
         assert len([line for line in lines if line.strip()]) <= 32
 
