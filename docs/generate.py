@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from deep_nrsfm_ros.commands import demo, doctor, evaluate, lift, models, replay, train
+from deep_nrsfm_ros.commands import demo, doctor, echo, evaluate, lift, models, replay, train
 from deep_nrsfm_ros.commands.cli import PROGRAMS
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.curation import Curation
@@ -75,6 +75,7 @@ PARSERS: dict[str, Callable[[], argparse.ArgumentParser]] = {
     "evaluate": evaluate.arguments,
     "models": models.arguments,
     "replay": replay.arguments,
+    "echo": echo.arguments,
     "doctor": doctor.arguments,
 }
 """The parser of each program that has one."""

@@ -40,6 +40,7 @@ NOT_RUN = {
     r"train .*door.yaml": "that of README.md with another name",
     r"train --resume": "needs a training that was cut off; test/training/test_resume.py",
     r"replay --serve": "serves until Ctrl-C; test/commands/test_replay.py, test_lifter_client.py",
+    r"echo": "prints until Ctrl-C; test/node/test_points_text.py",
     r"doctor": "starts two processes; test/commands/test_doctor.py",
     r"demo": "test/commands/test_demo.py",
     r"lifter .*--enclave": "needs a keystore; test/node/test_security_policy.py",
