@@ -176,7 +176,8 @@ def test_an_array_becomes_a_model_that_lifts(
     assert {warning.filename for warning in warned} == {__file__}
     assert ["factorisations" in message for message in messages] == [True, False]
     assert messages[-1] == model.provenance["judgement"]["reason"]
-    assert "look at its shapes from the side, or name a handedness" in messages[-1]
+    undo = "if it is one, lift with LiftingOptions.mirrored=True., or name a handedness"
+    assert re.search(f"look at its shapes from the side; {undo}", messages[-1])
     assert model.name == "thing" and model.layout == layout and progress
     assert "rival" not in model.provenance["judgement"]  # no model has such an object
     assert np.isfinite(Lifter(model)(points[:3]).shapes).all()

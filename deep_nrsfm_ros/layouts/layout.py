@@ -149,7 +149,7 @@ class KeypointLayout:
             return ""
         return (
             f"layout {self.name!r} names no handedness: depth may come out mirrored as a whole; "
-            "a layout file can name it"
+            "a layout file can name it, or lifting with `mirrored` undo it"
         )
 
     def edge_indices(self) -> list[tuple[int, int]]:
