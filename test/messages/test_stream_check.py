@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks.data.walking_person import IMAGE, in_layout
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
@@ -57,3 +58,21 @@ def test_pixels_outside_the_image_and_parts_that_it_cuts_off(
     found = stream.look(pipeline, IMAGE, camera, 0.5)
     assert [finding.code for finding in found if finding.code == "outside"] == expected
     assert not expected or found[0].code == "outside"
+
+
+def test_a_wrong_layout_is_the_one_cause_that_is_named() -> None:
+    """In the wrong order people come out upside down, which says nothing of the image."""
+    points, confidence = in_layout(BODY25)
+    model = load_model("human")
+    codes = []
+    for layout, turn in ((BODY25B, 1), (BODY25, 1), (BODY25, -1)):
+        seen = points[:16] * np.array([1, turn], np.float32)
+        lifted = Lifter(model, layout=layout)(seen, confidence[:16])
+        pipeline = Pipeline(model, layout, InputOptions(), LiftingOptions(), SmoothingOptions())
+        stream = StreamCheck(search=False)
+        reader: Any = Reader(PIXELS, Observation(seen, confidence[:16]))
+        stream.received("keypoints", reader, b"")
+        stream.lifted(lifted)
+        found = stream.look(pipeline, None, None, float(np.nanmedian(lifted.residual)))
+        codes.append([finding.code for finding in found])
+    assert codes == [["layout"], [], ["orientation"]]
