@@ -179,7 +179,7 @@ class StreamCheck:
         """
         if not self._recent:
             return []
-        topic = self._recent[-1][0]
+        topic, reader, _ = self._recent[-1]
         sample = self._sample(topic, pipeline, size, len(pipeline.source))
         if sample is None or not len(sample.points):
             return []
@@ -199,6 +199,14 @@ class StreamCheck:
                     "min-score",
                     f"min_score is {pipeline.min_score:g} and has no effect: the messages on "
                     f"{topic} give no object a score (a field mapping can name it)",
+                )
+            )
+        if field := reader.unused_confidence:
+            findings.append(
+                Finding(
+                    "confidence-field",
+                    f"the messages on {topic} have no field 'confidence', and their field "
+                    f"{field!r} is not used: all keypoints count as certain; call it confidence",
                 )
             )
         # Poor fit and low confidence are rated by the diagnostics, over all objects of a second.

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,11 @@ from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
-from deep_nrsfm_ros.messages.decoding import POLYGON, InputType, is_normalised
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, POLYGON, InputType, is_normalised
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
+from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.messages.stream_check import StreamCheck
 from deep_nrsfm_ros.model_files.model_file import load_model
 
@@ -33,6 +35,7 @@ class Reader:
 
     input_type: InputType
     observation: Observation
+    unused_confidence: str = ""
 
     def __call__(self, raw: bytes, *args: Any) -> tuple[None, Observation]:
         return None, self.observation
@@ -76,3 +79,35 @@ def test_a_wrong_layout_is_the_one_cause_that_is_named() -> None:
         found = stream.look(pipeline, None, None, float(np.nanmedian(lifted.residual)))
         codes.append([finding.code for finding in found])
     assert codes == [["layout"], [], ["orientation"]]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("x", "y", "score"), "no field 'confidence', and their field 'score' is not used"),
+        (("x", "y", "c"), "their field 'c' is not used"),
+        (("x", "y", "confidence"), ""),
+        (("x", "y", "z"), ""),
+    ],
+)
+def test_a_confidence_of_another_name_is_named(names: tuple[str, ...], expected: str) -> None:
+    points, confidence = in_layout(HUMAN17)
+    values = np.concatenate([points[:2], confidence[:2, :, None]], -1).astype("<f4")
+    cloud = SimpleNamespace(
+        header=SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=0), frame_id=""),
+        height=2,
+        width=17,
+        fields=[
+            SimpleNamespace(name=name, offset=4 * i, datatype=7) for i, name in enumerate(names)
+        ],
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * 17,
+        data=values.tobytes(),
+    )
+    model = load_model("human17")
+    pipeline = Pipeline(model, None, InputOptions(), LiftingOptions(), SmoothingOptions())
+    stream = StreamCheck(search=False)
+    stream.received("/keypoints", MessageReader(POINT_CLOUD, lambda raw: cloud), b"\0\1\0\0")
+    found = [f for f in stream.look(pipeline, None, None, 0.1) if f.code == "confidence-field"]
+    assert [expected in str(finding) for finding in found] == [True] * bool(expected)
