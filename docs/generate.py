@@ -189,8 +189,15 @@ def troubleshooting_page() -> str:
                 "`lift` says them at its end.",
                 "\n".join(kinds),
                 "## Nothing comes out\n\n`ros2 topic echo --once /diagnostics` names the topic, "
-                "the number of messages received and dropped, and the last reason. A message that "
-                "cannot be used is never answered by a guess.",
+                "the numbers of messages, and the last reason. A message that cannot be used is "
+                "never answered by a guess.",
+                "| on `/diagnostics` | counts since the start |\n|---|---|\n"
+                "| messages lifted | answered |\n"
+                "| messages without objects | received, nobody in them; not answered |\n"
+                "| messages rejected | received, and not usable: malformed, or no object with "
+                "enough keypoints; `last problem` says why; not answered |\n"
+                "| messages dropped | sent, and never received: they came while another was "
+                "lifted, or were lost on the way |",
             ]
         )
         + "\n"
