@@ -286,4 +286,13 @@ def run_program(
         few_frames=args.few_frames,
         limb_exchange=args.limb_exchange,
     )
-    print_tables(lambda: [benchmark(session)], session.output)
+    print_tables(lambda: [shortened(benchmark(session), session)], session.output)
+
+
+def shortened(table: Table, session: Session) -> Table:
+    """Return the table; its title says what a session of fewer steps or frames has left out."""
+    said = [f"{session.steps} steps a training (--steps)"] * bool(session.steps)
+    said += [f"each frame of {session.stride} (--stride)"] * (session.stride > 1)
+    if said:
+        table.title += f"; shortened: {', '.join(said)}"
+    return table

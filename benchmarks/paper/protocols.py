@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.baselines.batches import SPENT, add_total, chosen, solve
+from benchmarks.baselines.batches import SPENT, chosen, complete_legend, solve
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, figures
@@ -65,7 +65,7 @@ def benchmark(session: Session, words: Sequence[str] = ("",)) -> Table:
                 solved = solve(session, name, dataset)
                 shown = {f: x for f, x in solved.figures.items() if f in table.figures}
                 table.add((subject, protocol, solved.label), shown)
-    add_total(table)
+    complete_legend(table)
     return table
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.baselines.batches import SPENT, add_total, chosen, solve
+from benchmarks.baselines.batches import SPENT, chosen, complete_legend, solve
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, LIFTING, evaluate, figures
@@ -82,7 +82,7 @@ def benchmark(session: Session, recipes: Sequence[str] = tuple(OURS)) -> Table:
         for name in chosen(session):
             solved = solve(session, name, dataset)
             table.add((subject, solved.label), solved.figures)
-    add_total(table)
+    complete_legend(table)
     return table
 
 

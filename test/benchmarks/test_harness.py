@@ -229,6 +229,8 @@ def test_command_prints_and_writes(
     run_program(benchmark, "about", ("05",), options)
     assert capsys.readouterr().out.strip() == (tmp_path / "t.md").read_text().strip()
     assert (tmp_path / "t.csv").exists() and (tmp_path / "t.png").exists()
+    title = (tmp_path / "t.md").read_text().splitlines()[0]
+    assert title == "## T; shortened: 6 steps a training (--steps)"
 
 
 def test_command_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
