@@ -45,6 +45,7 @@ def echo(args: argparse.Namespace) -> str:
     from rclpy.signals import SignalHandlerOptions
 
     from deep_nrsfm_ros.node.points_text import PointsText
+    from deep_nrsfm_ros.node.shutdown import shut_down
 
     lifter = args.lifter.rstrip("/")
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # its own ones break a call
@@ -60,7 +61,7 @@ def echo(args: argparse.Namespace) -> str:
     except KeyboardInterrupt:
         return ""
     finally:
-        rclpy.try_shutdown()
+        shut_down()
 
 
 @program

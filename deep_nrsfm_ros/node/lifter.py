@@ -89,6 +89,7 @@ from deep_nrsfm_ros.node.detections_3d import DetectionsPublisher
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.entities import Entities
 from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
+from deep_nrsfm_ros.node.shutdown import shut_down
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
 from deep_nrsfm_ros.node.target_frame import TargetFrame, TargetOptions
@@ -900,7 +901,7 @@ def main() -> None:
         if not signals:
             raise
     finally:
-        rclpy.try_shutdown()
+        shut_down()
         # Launchers and terminals send the signal twice; the second must not kill Python's shutdown.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
