@@ -377,7 +377,6 @@ _API: tuple[tuple[str, tuple[str, ...]], ...] = (
             "model_files.model_file:load_model",
             "lifting.lifter:Lifter",
             "lifting.lifter:Lifter.__call__",
-            "lifting.lifter:Lifter.lift",
             "lifting.lifter:Lifted",
             "lifting.options:LiftingOptions",
         ),
