@@ -52,9 +52,9 @@ class Lifted(NamedTuple):
     Attributes:
         shapes: (n, p, 3) camera axes (x right, y down, z forward); centred, or at the object's
             position where the camera's intrinsics are known, as to `VideoLifter`. The reference
-            pair of the model's layout is `reference_length` of its options long: of people, neck to mid-hip is 0.5 by
-            default, so shapes are in metres. Without a pair, the RMS radius is so long, 1 by
-            default.
+            pair of the model's layout is `reference_length` of its options long: of people, neck
+            to mid-hip is 0.5 by default, so shapes are in metres. Without a pair, the RMS radius
+            is so long, 1 by default.
         rotations: (n, 3, 3) from object to camera axes, p_camera = R p_object, det +1.
         scale: (n,) pixels per unit of `shapes`.
         translation: (n, 2) projection of the shape's origin in the image, in pixels.
