@@ -72,10 +72,15 @@ def benchmark(session: Session, words: Sequence[str] = ("",)) -> Table:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--protocols", nargs="+", default=[""], metavar="WORD")
+    parser.add_argument(
+        "--protocols",
+        nargs="+",
+        default=[""],
+        metavar="WORD",
+        help="those alone whose name has one of these",
+    )
     known, others = parser.parse_known_args(argv)
-    description = f"{__doc__}\nWith --protocols WORD ... those alone whose name has one of them."
-    run_program(partial(benchmark, words=known.protocols), description, SUBJECTS, others)
+    run_program(partial(benchmark, words=known.protocols), __doc__, SUBJECTS, others, own=parser)
 
 
 if __name__ == "__main__":

@@ -89,11 +89,16 @@ def benchmark(session: Session, recipes: Sequence[str] = tuple(OURS)) -> Table:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--recipes", nargs="+", choices=tuple(OURS), default=tuple(OURS))
+    parser.add_argument(
+        "--recipes",
+        nargs="+",
+        choices=tuple(OURS),
+        default=tuple(OURS),
+        help="these trainings alone: that of the paper takes the most time",
+    )
     known, others = parser.parse_known_args(argv)
-    description = f"{__doc__}\nWith --recipes NAME ... these trainings alone: {', '.join(OURS)}."
     make = partial(benchmark, recipes=known.recipes)
-    run_program(make, description, SUBJECTS, others)
+    run_program(make, __doc__, SUBJECTS, others, own=parser)
 
 
 if __name__ == "__main__":
