@@ -363,7 +363,6 @@ class LifterNode(Node):
             self._lifter_diagnostics.empty()
             self._publish_bodies(source, scene)
             return
-        self._stream.lifted(scene.lifted)
         self._publish_points(scene, with_objects=with_objects)
         if self._camera.enabled and source.reader.input_type == YOLO.type:
             self._publish_detections(scene.header, scene.lifted, raw, places)
@@ -398,6 +397,8 @@ class LifterNode(Node):
             observation, intrinsics, identities, source.topic, moment, up
         )
         scene = Scene(header, lifted, identities, detected, moment)
+        if identities:
+            self._stream.lifted(lifted)  # in the camera's axes, before `target_frame`
         return self._placed(source, scene, up) if identities else scene, observation.places
 
     def _identities(
