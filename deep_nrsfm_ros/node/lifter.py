@@ -66,6 +66,7 @@ from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, is_person
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.detections_3d import Lifted3D
 from deep_nrsfm_ros.messages.field_mapping import YOLO
+from deep_nrsfm_ros.messages.gravity_check import GravityCheck
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
@@ -88,7 +89,7 @@ from deep_nrsfm_ros.node.depth import DepthOptions, DepthSubscription
 from deep_nrsfm_ros.node.detections_3d import DetectionsPublisher
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.entities import Entities
-from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
+from deep_nrsfm_ros.node.gravity import Gravity, GravityDirection, GravitySources
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
 from deep_nrsfm_ros.node.target_frame import TargetFrame, TargetOptions
@@ -241,6 +242,7 @@ class LifterNode(Node):
         self._frame_id, self._last_frame = camera.frame_id, ""
         self._camera = Camera(self, camera, self._view, self._pipeline.image_size)
         self._gravity = GravityDirection(self, self._gravity_sources)
+        self._gravity_check, self._gravity_source = GravityCheck(), ""
         depth = self._depth_options
         self._depth = DepthSubscription(self, depth, self._camera) if depth.topic else None
         self._floor = FloorScale(camera.camera_height) if camera.camera_height else None
@@ -300,6 +302,7 @@ class LifterNode(Node):
         self._keypoint_topics.close()
         self._pipeline.forget()
         self._bodies.forget()
+        self._gravity_check.forget()
         if self._floor:
             self._floor.forget()
         if self._depth is not None:
@@ -389,15 +392,22 @@ class LifterNode(Node):
         moment = self._moment(source, header.stamp if header else 0)
         identities = self._identities(source, observation, moment, with_objects=with_objects)
         header = self._in_frame(source, header or self._now())
-        up = self._gravity(self._up, header.frame_id, header.stamp)
-        if up is None and self._target.name:
-            up = self._target.up(header)
+        up = self._against_gravity(header).up
         detected = len(identities)
         lifted, identities = self._pipeline.lift(
             observation, intrinsics, identities, source.topic, moment, up
         )
+        if up is not None and is_person(self._pipeline.model.layout):
+            self._gravity_check.add(time.monotonic(), lifted.rotations, up)
         scene = Scene(header, lifted, identities, detected, moment)
         return self._placed(source, scene, up) if identities else scene, observation.places
+
+    def _against_gravity(self, header: Header) -> Gravity:
+        """Return the direction against gravity in the camera's axes, and its source."""
+        found = self._gravity.find(self._up, header.frame_id, header.stamp)
+        if found.up is None and self._target.name:
+            return self._target.gravity(header)
+        return found
 
     def _identities(
         self, source: KeypointTopic, observation: Observation, moment: Moment, *, with_objects: bool
@@ -611,7 +621,11 @@ class LifterNode(Node):
             values |= self._depth.report()
             if level == OK and self._depth.problem:
                 level, message = WARN, self._depth.problem
-        values["gravity"] = self._gravity.status(self._up, frame)
+        gravity = self._against_gravity(Header(frame_id=frame))
+        values["gravity"] = gravity.status
+        if gravity.up is not None and gravity.source != self._gravity_source:
+            self._gravity_source = gravity.source
+            self.get_logger().info(f"gravity: {gravity.status}")
         for identity, bones in self._pipeline.learned_bones().items():
             values[f"bones of {identity}"] = bones
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
@@ -651,6 +665,8 @@ class LifterNode(Node):
             self._findings = self._stream.look(
                 self._pipeline, size, self._camera.intrinsics, residual
             )
+            gravity = self._against_gravity(Header(frame_id=self._last_frame))
+            self._findings += self._gravity_check.find(gravity.source, gravity.mend)
             inputs = parameter_bridge.read(self, InputOptions)
             if bool(inputs.image_width) != bool(inputs.image_height):
                 text = (
@@ -756,6 +772,8 @@ class LifterNode(Node):
         self._pipeline = self._proposed
         self._camera.set_image_size(self._pipeline.image_size)
         self._up = parameter_bridge.read(self, GravityOptions, _GRAVITY).direction
+        if any(change.name.startswith(_GRAVITY) for change in changes):
+            self._gravity_check.forget()
         for warning in self._unused_options(changes):
             self.get_logger().warning(warning)
 

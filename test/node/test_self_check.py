@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from sensor_msgs.msg import PointCloud2
 from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
 from deep_nrsfm_ros.node.lifter_client import running_layout
-from test.node.conftest import Client, Connect, StartLifter
+from test.node.conftest import Client, Connect, StartLifter, values
 from test.node.test_lifter import cloud, unpack
 
 AUTO = {"model": "human", "input_type": "auto", "keypoint_layout": "auto"}
@@ -124,3 +125,53 @@ def test_qos_overrides_act_on_a_remapped_topic(start_lifter: StartLifter, connec
         lambda: client.node.get_subscriptions_info_by_topic("/detector/out"), "the subscription"
     )
     assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+CAMERA = {
+    "model": "human",
+    "keypoint_layout": "coco17",
+    "field_of_view": 65.2,
+    "image_width": IMAGE[0],
+    "image_height": IMAGE[1],
+}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "source", "mend"),
+    [
+        ({"gravity.up": [0.0, 1.0, 0.0]}, "gravity.up", "check its sign and its axes"),
+        (
+            {"target_frame": "base_link", "camera_pose": [0.0, 0.0, 1.4, 0.0, 0.0, 0.0, 1.0]},
+            "target_frame base_link and camera_pose",
+            "check the quaternion of camera_pose",
+        ),
+    ],
+)
+def test_a_wrong_direction_of_gravity_is_said(
+    start_lifter: StartLifter,
+    connect: Connect,
+    parameters: dict[str, Any],
+    source: str,
+    mend: str,
+) -> None:
+    lifter = start_lifter(**CAMERA, **parameters)
+    client = connect()
+    with stream(client, *in_layout(COCO17)):
+        status = client.wait_for_health(lambda s, v: "against gravity" in v["findings"])
+        assert status.level == b"\x01" and f"that {source} gives: {mend}" in status.message
+        assert values(status)["gravity"].endswith(f"in the camera's axes, by {source}")
+        lifter.wait_for_log(mend)
+        if source == "gravity.up":
+            assert not client.set_parameters(gravity__up=[0.0, -1.0, 0.0])
+            client.wait_for_health(lambda s, v: v["findings"] == "none" and s.level == b"\x00")
+
+
+def test_the_direction_of_a_target_frame_is_shown(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
+    pose = {"target_frame": "base_link", "camera_pose": [0.0, 0.0, 1.4, -0.5, 0.5, -0.5, 0.5]}
+    lifter = start_lifter(**CAMERA, **pose)
+    client = connect()
+    shown = "up is 0.00 -1.00 0.00 in the camera's axes, by target_frame base_link and camera_pose"
+    client.wait_for_health(lambda _, v: v["gravity"] == shown)
+    lifter.wait_for_log("gravity: up is")
