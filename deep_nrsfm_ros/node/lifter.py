@@ -49,11 +49,12 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from deep_nrsfm_ros.body.floor import FloorScale
+from deep_nrsfm_ros.body.depth import believed_scales
+from deep_nrsfm_ros.body.floor import FloorScale, floor_factor
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap, TooFewSharedError
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import (
@@ -66,10 +67,10 @@ from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, is_person
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
 from deep_nrsfm_ros.messages.detections_3d import Lifted3D
 from deep_nrsfm_ros.messages.field_mapping import YOLO
-from deep_nrsfm_ros.messages.gravity_check import GravityCheck
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
+from deep_nrsfm_ros.messages.scene_check import FloorCheck, GravityCheck
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
@@ -243,6 +244,8 @@ class LifterNode(Node):
         self._camera = Camera(self, camera, self._view, self._pipeline.image_size)
         self._gravity = GravityDirection(self, self._gravity_sources)
         self._gravity_check, self._gravity_source = GravityCheck(), ""
+        self._floor_check = FloorCheck()
+        self._floor_sizes: tuple[Sequence[str], NDArray[np.float32]] = ((), np.ones(0, np.float32))
         depth = self._depth_options
         self._depth = DepthSubscription(self, depth, self._camera) if depth.topic else None
         self._floor = FloorScale(camera.camera_height) if camera.camera_height else None
@@ -302,12 +305,17 @@ class LifterNode(Node):
         self._keypoint_topics.close()
         self._pipeline.forget()
         self._bodies.forget()
-        self._gravity_check.forget()
+        self._forget_scene()
         if self._floor:
             self._floor.forget()
         if self._depth is not None:
             self._depth.forget()
         self._stage = Stage.INACTIVE
+
+    def _forget_scene(self) -> None:
+        """Forget the people by whom gravity and the camera's height are checked."""
+        self._gravity_check.forget()
+        self._floor_check.forget()
 
     def clean_up(self) -> None:
         """Release the model, the topics and the services, and end a running training."""
@@ -472,9 +480,18 @@ class LifterNode(Node):
     ) -> Lifted:
         """Return objects at the size with which they stand on the floor; `placed` ones stay."""
         assert self._floor
-        scales = self._floor(names, lifted.shapes, up, moment.seconds).astype(np.float32)
+        layout = self._pipeline.model.layout
+        believed = believed_scales(layout, self._pipeline.reference_length)
+        if self._floor_check.is_due(now := time.monotonic()):
+            height = self._camera_options.camera_height
+            factors = floor_factor(lifted.shapes.astype(np.float64), up, height)
+            if placed is not None:
+                factors[placed] = np.nan
+            self._floor_check.add(now, factors, believed)
+        scales = self._floor(names, lifted.shapes, up, moment.seconds, believed).astype(np.float32)
         if placed is not None:
             scales[placed] = 1
+        self._floor_sizes = names, scales
         return lifted._replace(
             shapes=scales[:, None, None] * lifted.shapes, scale=lifted.scale / scales
         )
@@ -626,11 +643,26 @@ class LifterNode(Node):
         if gravity.up is not None and gravity.source != self._gravity_source:
             self._gravity_source = gravity.source
             self.get_logger().info(f"gravity: {gravity.status}")
+        if self._floor:
+            values["floor"] = self._floor_status(known=gravity.up is not None)
         for identity, bones in self._pipeline.learned_bones().items():
             values[f"bones of {identity}"] = bones
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
         node = self.get_fully_qualified_name()
         return status(f"{node}: lifting", level, message, values, node)
+
+    def _floor_status(self, *, known: bool) -> str:
+        """Return what the floor says of the last objects, for diagnostics.
+
+        Args:
+            known: whether the direction of gravity is.
+        """
+        text = f"{self._camera_options.camera_height:g} m below the camera"
+        if not known:
+            return f"{text}; not used: the direction of gravity is not known"
+        names, scales = self._floor_sizes
+        sizes = (f"{name.split(' ', 1)[-1]} {s:.2f}" for name, s in zip(names, scales, strict=True))
+        return f"{text}; times the assumed size: {', '.join(sizes) or 'nobody yet'}"
 
     def _layout_status(self) -> str:
         """Return the layout of the keypoints as text, for diagnostics."""
@@ -667,6 +699,10 @@ class LifterNode(Node):
             )
             gravity = self._against_gravity(Header(frame_id=self._last_frame))
             self._findings += self._gravity_check.find(gravity.source, gravity.mend)
+            layout, trunk = self._pipeline.model.layout, self._pipeline.reference_length
+            self._findings += self._floor_check.find(
+                self._camera_options.camera_height, trunk if layout.reference == TRUNK else None
+            )
             inputs = parameter_bridge.read(self, InputOptions)
             if bool(inputs.image_width) != bool(inputs.image_height):
                 text = (
@@ -772,8 +808,7 @@ class LifterNode(Node):
         self._pipeline = self._proposed
         self._camera.set_image_size(self._pipeline.image_size)
         self._up = parameter_bridge.read(self, GravityOptions, _GRAVITY).direction
-        if any(change.name.startswith(_GRAVITY) for change in changes):
-            self._gravity_check.forget()
+        self._forget_scene()
         for warning in self._unused_options(changes):
             self.get_logger().warning(warning)
 

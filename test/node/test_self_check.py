@@ -175,3 +175,33 @@ def test_the_direction_of_a_target_frame_is_shown(
     shown = "up is 0.00 -1.00 0.00 in the camera's axes, by target_frame base_link and camera_pose"
     client.wait_for_health(lambda _, v: v["gravity"] == shown)
     lifter.wait_for_log("gravity: up is")
+
+
+def test_a_height_of_the_camera_that_makes_giants_is_said(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
+    level = {"gravity.up": [0.0, -1.0, 0.0]}
+    lifter = start_lifter(**CAMERA, **level, camera_height=2.2)
+    client = connect()
+    client.wait_for_health(lambda _, v: v["floor"].endswith("assumed size: nobody yet"))
+    with stream(client, *in_layout(COCO17)):
+        status = client.wait_for_health(lambda s, v: "camera_height is 2.2" in v["findings"])
+        assert status.level == b"\x01" and "people on that floor would have a trunk of" in (
+            status.message
+        )
+        assert values(status)["floor"] == (
+            "2.2 m below the camera; times the assumed size: object1 1.00"
+        )
+        lifter.wait_for_log("camera_height is 2.2 and is not used")
+
+
+def test_a_right_height_of_the_camera_is_shown(start_lifter: StartLifter, connect: Connect) -> None:
+    level = {"gravity.up": [0.0, -1.0, 0.0]}
+    start_lifter(**CAMERA, **level, camera_height=0.95)
+    client = connect()
+    with stream(client, *in_layout(COCO17)):
+        shown = "times the assumed size: object1 1."
+        status = client.wait_for_health(
+            lambda _, v: shown in v["floor"] and int(v["messages lifted"]) > 400
+        )
+        assert values(status)["findings"] == "none"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A direction of gravity that people contradict, and scenes in which they do not."""
+"""Gravity and heights of a camera that people contradict, and scenes in which they do not."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from deep_nrsfm_ros.messages.gravity_check import WINDOW, GravityCheck
+from deep_nrsfm_ros.messages.scene_check import WINDOW, FloorCheck, GravityCheck
 
 LEVEL = np.array([0.0, -1, 0])
 DOWN, FORWARD = -LEVEL, np.array([0.0, 0, 1])
@@ -77,3 +77,40 @@ def test_a_moment_and_nobody_are_no_finding() -> None:
     for i in range(10):  # people of long ago do not count
         check.add(100 * i, people(LEVEL, 30), DOWN)
     assert not check.find("gravity.up", "")
+
+
+BELIEVED = (0.4, 1.3)
+
+
+def sizes(*factors: float) -> FloorCheck:
+    """Return a check of 10 s of objects with these factors in each message."""
+    check = FloorCheck()
+    for i in range(40):
+        assert check.is_due(i / 4)
+        check.add(i / 4, np.array(factors), BELIEVED)
+        assert not check.is_due(i / 4 + 0.1) or np.isnan(factors).all()
+    return check
+
+
+@pytest.mark.parametrize(
+    ("factor", "trunk", "said"),
+    [
+        (2.12, 0.5, "people on that floor would have a trunk of 1.06 m (0.2 to 0.65 m exist); "),
+        (0.2, 0.5, "have a trunk of 0.10 m"),
+        (3.0, None, "would be 3 times as large as reference_length says (0.4 to 1.3 are believed)"),
+        (np.inf, 0.5, "objects are higher than the camera; check it, the direction of gravity"),
+    ],
+)
+def test_sizes_that_do_not_exist_are_found(factor: float, trunk: float | None, said: str) -> None:
+    (finding,) = sizes(factor, np.nan).find(2.2, trunk)
+    assert finding.code == "floor" and said in str(finding)
+    assert str(finding).startswith("camera_height is 2.2 and is not used: ")
+
+
+def test_some_impossible_sizes_are_no_finding() -> None:
+    assert not sizes(1.0, 1.29, 0.41).find(1.4, 0.5)
+    assert not sizes(1.0, *[9.0] * 4).find(1.4, 0.5)  # hidden feet, somebody on a balcony
+    assert not sizes(np.nan).find(1.4, 0.5)
+    check = sizes(9.0)
+    check.forget()
+    assert not check.find(1.4, 0.5)
