@@ -120,6 +120,7 @@ _REPORT_PERIOD = 1.0  # seconds
 _FRAME_LOG_PERIOD = 60.0  # seconds
 _EARLY_CHECKS = 5  # reports at the start in each of which the input is looked at
 _CHECK_EVERY = 10  # reports between two looks at an input in which nothing looked wrong
+_PRESENT = 3.0  # seconds for which the objects of a topic's last message count as present
 _FINDING_PERIOD = 30.0  # seconds between two log entries of the same finding
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _TRAINING_GRACE = 1.0  # seconds in which a training may save its model when the node ends
@@ -245,6 +246,7 @@ class LifterNode(Node):
         self._gravity = GravityDirection(self, self._gravity_sources)
         self._gravity_check, self._gravity_source = GravityCheck(), ""
         self._floor_check = FloorCheck()
+        self._scenes: dict[str, tuple[float, Scene]] = {}  # the last of each topic, and when
         self._floor_sizes: tuple[Sequence[str], NDArray[np.float32]] = ((), np.ones(0, np.float32))
         depth = self._depth_options
         self._depth = DepthSubscription(self, depth, self._camera) if depth.topic else None
@@ -313,7 +315,8 @@ class LifterNode(Node):
         self._stage = Stage.INACTIVE
 
     def _forget_scene(self) -> None:
-        """Forget the people by whom gravity and the camera's height are checked."""
+        """Forget the last objects, by which gravity and the camera's height are checked too."""
+        self._scenes.clear()
         self._gravity_check.forget()
         self._floor_check.forget()
 
@@ -369,6 +372,7 @@ class LifterNode(Node):
             if self.context.ok():  # else a signal came meanwhile, and the message is not at fault
                 self._reject(source, problem)
             return
+        self._scenes[source.topic] = time.monotonic(), scene
         if not scene.identities:
             self._lifter_diagnostics.empty()
             self._publish_bodies(source, scene)
@@ -645,7 +649,7 @@ class LifterNode(Node):
             self.get_logger().info(f"gravity: {gravity.status}")
         if self._floor:
             values["floor"] = self._floor_status(known=gravity.up is not None)
-        for identity, bones in self._pipeline.learned_bones().items():
+        for identity, bones in self._pipeline.learned_bones(shown=self._present()).items():
             values[f"bones of {identity}"] = bones
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
         node = self.get_fully_qualified_name()
@@ -663,6 +667,17 @@ class LifterNode(Node):
         names, scales = self._floor_sizes
         sizes = (f"{name.split(' ', 1)[-1]} {s:.2f}" for name, s in zip(names, scales, strict=True))
         return f"{text}; times the assumed size: {', '.join(sizes) or 'nobody yet'}"
+
+    def _present(self) -> dict[str, NDArray[np.float32]]:
+        """Return the shape as published of each identity in the last message of its topic."""
+        since = time.monotonic() - _PRESENT
+        self._scenes = {topic: last for topic, last in self._scenes.items() if last[0] > since}
+        return {
+            name: shape
+            for _, scene in self._scenes.values()
+            for name, shape in zip(scene.identities, scene.lifted.shapes, strict=True)
+            if name and np.isfinite(shape).all()
+        }
 
     def _layout_status(self) -> str:
         """Return the layout of the keypoints as text, for diagnostics."""

@@ -205,3 +205,8 @@ def test_a_right_height_of_the_camera_is_shown(start_lifter: StartLifter, connec
             lambda _, v: shown in v["floor"] and int(v["messages lifted"]) > 400
         )
         assert values(status)["findings"] == "none"
+        bones = values(status)["bones of object1"].split(": ")[1].split(", ")
+        trunk = dict(bone.rsplit(" ", 1) for bone in bones)["neck-mid_hip"]
+        scale = values(status)["floor"].split("object1 ")[1]
+        assert float(trunk) == pytest.approx(0.5 * float(scale), rel=0.05)
+    client.wait_for_health(lambda _, v: "bones of object1" not in v)  # nobody is there
