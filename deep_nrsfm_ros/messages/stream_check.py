@@ -41,6 +41,7 @@ from deep_nrsfm_ros.lifting.sanity import (
 from deep_nrsfm_ros.messages.decoding import implied_layout, is_normalised, type_name
 from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import MessageReader
+from deep_nrsfm_ros.messages.stamps import check_stamps
 from deep_nrsfm_ros.model_files.model_file import Model
 
 _MESSAGES = 16  # kept; enough objects to tell layouts apart, few enough to read again in 1 ms
@@ -192,11 +193,11 @@ class StreamCheck:
             sample.confidence,
             intrinsics,
             size or pipeline.image_size,
-            sample.stamps,
-            self._lifted,
+            lifted=self._lifted,
             is_normalised=sample.is_normalised,
         )
         findings = confidence_scale(sample.given) + findings
+        findings += check_stamps(sample.stamps, topic)
         findings += [Finding("left-out", text) for text in sample.left_out]
         if pipeline.min_score and not sample.has_scores:
             findings.append(
