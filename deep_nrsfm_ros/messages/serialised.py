@@ -59,6 +59,11 @@ class Header(NamedTuple):
         """The stamp in ns."""
         return self.sec * 1_000_000_000 + self.nanosec
 
+    def later(self, nanoseconds: int) -> Header:
+        """Return the header with its stamp so much later."""
+        sec, nanosec = divmod(self.stamp + nanoseconds, 1_000_000_000)
+        return self._replace(sec=sec, nanosec=nanosec)
+
     def write_stamp(self, raw: bytearray) -> None:
         """Write the stamp into a serialised message that begins with a header."""
         _STAMP.pack_into(raw, _STAMP_OFFSET, self.sec, self.nanosec)

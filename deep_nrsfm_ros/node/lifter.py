@@ -117,6 +117,7 @@ _DEPTH = "depth."
 _BODY = "body."
 _TRAIN = "train."
 _REPORT_PERIOD = 1.0  # seconds
+_LOST_PERIOD = 0.5  # seconds between two looks for topics that have fallen silent
 _FRAME_LOG_PERIOD = 60.0  # seconds
 _EARLY_CHECKS = 5  # reports at the start in each of which the input is looked at
 _CHECK_EVERY = 10  # reports between two looks at an input in which nothing looked wrong
@@ -260,6 +261,9 @@ class LifterNode(Node):
         self._detections: DetectionsPublisher | None = None
         self._bodies = BodyPublishers(self, self._body_options, camera.tf_prefix)
         self._bodies.describe(self._pipeline.model.layout)
+        self.create_timer(
+            _LOST_PERIOD, self._tell_lost, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         self._training = TrainingService(
             self,
             self._training_request,
@@ -525,6 +529,16 @@ class LifterNode(Node):
         except Exception as problem:
             self.get_logger().warning(
                 f"joints of {source.topic} not published: {_error_text(problem)}",
+                throttle_duration_sec=LOG_PERIOD,
+            )
+
+    def _tell_lost(self) -> None:
+        """Publish who is lost on silent topics; a failure must not end the node."""
+        try:
+            self._bodies.tell_lost()
+        except Exception as problem:
+            self.get_logger().warning(
+                f"lost objects not published: {_error_text(problem)}",
                 throttle_duration_sec=LOG_PERIOD,
             )
 

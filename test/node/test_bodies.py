@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -231,6 +232,23 @@ def test_the_lifter_says_names_frames_angles_and_states(client: Client) -> None:
     assert track.name == "object1"
     x, y, z = (getattr(joints.transforms[0].translation, k) for k in "xyz")
     assert z > 0.5 and abs(x) < z and abs(y) < z
+
+
+def test_who_is_gone_is_lost_where_the_detector_falls_silent(client: Client) -> None:
+    heard = hear(client, {"/lifter/tracks": (DiagnosticArray, 10)})["/lifter/tracks"]
+    assert [s.message for s in heard[-1].status][0] in ("new", "tracked")
+    before = heard[-1].header.stamp
+
+    def lost() -> list[Any]:
+        return [m for m in heard if [(s.name, s.message) for s in m.status] == [("object1", LOST)]]
+
+    client.wait(lambda: len(lost()) > 1, "two messages of the lost object")
+    header = lost()[0].header
+    assert header.frame_id == "optical" and 1 <= header.stamp.sec - before.sec <= 3
+    assert lost()[0].status[0].level == DiagnosticStatus.STALE
+    told = time.monotonic()
+    client.wait(lambda: time.monotonic() > told + 3, "the end of the second")
+    assert len(lost()) <= 4  # told for a second
 
 
 def test_each_object_has_its_topics(client: Client) -> None:
