@@ -639,6 +639,7 @@ class LifterNode(Node):
         """Return how the lifting goes, for diagnostics; look at the input."""
         idle = self._lifter_diagnostics.idle
         self._keypoint_topics.update(idle=idle)
+        self._camera.update()
         residual = self._lifter_diagnostics.residual
         level, message, values = self._lifter_diagnostics.report()
         self._check_input(level, residual, idle=idle)
