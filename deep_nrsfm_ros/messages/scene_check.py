@@ -26,7 +26,7 @@ WINDOW = 15.0
 """Seconds that are looked at."""
 
 _INTERVAL = 0.2  # s between two messages that are kept
-_LEAST_SECONDS = 5.0  # of people
+_LEAST_SECONDS = 3.0  # of people
 _LEAST = 20  # people of all messages
 _UPRIGHT = 0.7  # cosine between a person's up axis and that of the image, of somebody upright
 _MOST = 0.6  # fraction of the people who must be upright in the image

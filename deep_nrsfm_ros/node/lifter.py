@@ -704,7 +704,8 @@ class LifterNode(Node):
     def _check_input(self, level: int, residual: float, *, idle: bool) -> None:
         """Look at the last messages; log what looks wrong, at a limited rate.
 
-        It looks in the first reports, while something looks wrong, and then once in 10 s.
+        It looks in the first reports, while something looks wrong, and then once in 10 s; at
+        gravity and the floor always.
 
         Args:
             level: of the diagnostics.
@@ -715,8 +716,9 @@ class LifterNode(Node):
             self._findings, self._checks = [], 0
             return
         self._checks += 1
-        early = self._checks <= _EARLY_CHECKS
-        if not (early or self._findings or level != OK or self._checks % _CHECK_EVERY == 0):
+        early, scene = self._checks <= _EARLY_CHECKS, self._scene_findings()
+        found = bool(self._findings or scene)
+        if not (early or found or level != OK or self._checks % _CHECK_EVERY == 0):
             return
         size = self._camera.size
         try:
@@ -727,12 +729,7 @@ class LifterNode(Node):
             self._findings = self._stream.look(
                 self._pipeline, size, self._camera.intrinsics, residual
             )
-            gravity = self._against_gravity(Header(frame_id=self._last_frame))
-            self._findings += self._gravity_check.find(gravity.source, gravity.mend)
-            layout, trunk = self._pipeline.model.layout, self._pipeline.reference_length
-            self._findings += self._floor_check.find(
-                self._camera_options.camera_height, trunk if layout.reference == TRUNK else None
-            )
+            self._findings += scene
             inputs = parameter_bridge.read(self, InputOptions)
             if bool(inputs.image_width) != bool(inputs.image_height):
                 text = (
@@ -750,6 +747,17 @@ class LifterNode(Node):
             if now - self._logged.get(finding.code, -math.inf) >= _FINDING_PERIOD:
                 self._logged[finding.code] = now
                 self.get_logger().warning(str(finding))
+
+    def _scene_findings(self) -> list[Finding]:
+        """Return whether the people of the last seconds contradict gravity or the floor."""
+        gravity = self._against_gravity(Header(frame_id=self._last_frame))
+        layout, trunk = self._pipeline.model.layout, self._pipeline.reference_length
+        return [
+            *self._gravity_check.find(gravity.source, gravity.mend),
+            *self._floor_check.find(
+                self._camera_options.camera_height, trunk if layout.reference == TRUNK else None
+            ),
+        ]
 
     def _build_pipeline(self, changes: Sequence[Parameter]) -> Pipeline:
         """Return the pipeline for the parameters after `changes`; raise ValueError if invalid."""

@@ -121,7 +121,7 @@ class TargetFrame:
         up = np.ascontiguousarray(found.rotation[2])
         if self._pose is None:
             return Gravity(up, by, FRAME_MEND)
-        return Gravity(up, f"{by} and camera_pose", _POSE_MEND)
+        return Gravity(up, f"camera_pose in {by}", _POSE_MEND)
 
     def __call__(self, header: Header, lifted: Lifted) -> tuple[Header, Lifted]:
         """Return objects in the target frame, and their header.

@@ -69,7 +69,7 @@ def test_who_bends_or_stands_on_the_head_for_a_while_is_no_finding() -> None:
 
 
 def test_a_moment_and_nobody_are_no_finding() -> None:
-    assert not codes(LEVEL, DOWN, 4.0)
+    assert not codes(LEVEL, DOWN, 3.0)
     check = GravityCheck()
     for i in range(100):
         check.add(i / 10, np.full((2, 3, 3), np.nan, np.float32), DOWN)

@@ -142,7 +142,7 @@ CAMERA = {
         ({"gravity.up": [0.0, 1.0, 0.0]}, "gravity.up", "check its sign and its axes"),
         (
             {"target_frame": "base_link", "camera_pose": [0.0, 0.0, 1.4, 0.0, 0.0, 0.0, 1.0]},
-            "target_frame base_link and camera_pose",
+            "camera_pose in target_frame base_link",
             "check the quaternion of camera_pose",
         ),
     ],
@@ -172,7 +172,7 @@ def test_the_direction_of_a_target_frame_is_shown(
     pose = {"target_frame": "base_link", "camera_pose": [0.0, 0.0, 1.4, -0.5, 0.5, -0.5, 0.5]}
     lifter = start_lifter(**CAMERA, **pose)
     client = connect()
-    shown = "up is 0.00 -1.00 0.00 in the camera's axes, by target_frame base_link and camera_pose"
+    shown = "up is 0.00 -1.00 0.00 in the camera's axes, by camera_pose in target_frame base_link"
     client.wait_for_health(lambda _, v: v["gravity"] == shown)
     lifter.wait_for_log("gravity: up is")
 
