@@ -619,6 +619,8 @@ class LifterNode(Node):
         if warning := self._name_check():
             self.get_logger().warning(warning)
         is_active = self._stage is Stage.ACTIVE
+        if self._stage is not Stage.UNCONFIGURED:
+            self._camera.update()
         statuses = [self._lifting_status() if is_active else self._waiting_status()]
         if self._stage is not Stage.UNCONFIGURED:
             statuses.append(self._training.status)
@@ -639,7 +641,6 @@ class LifterNode(Node):
         """Return how the lifting goes, for diagnostics; look at the input."""
         idle = self._lifter_diagnostics.idle
         self._keypoint_topics.update(idle=idle)
-        self._camera.update()
         residual = self._lifter_diagnostics.residual
         level, message, values = self._lifter_diagnostics.report()
         self._check_input(level, residual, idle=idle)
