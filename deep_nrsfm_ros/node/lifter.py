@@ -989,7 +989,8 @@ def main() -> None:
     except ExternalShutdownException:
         pass
     except Exception:
-        if not signals:
+        # The executor fails on a context that is shut down before Python has called our handler.
+        if not signals and rclpy.ok():
             raise
     finally:
         rclpy.try_shutdown()
