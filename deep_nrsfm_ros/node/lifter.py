@@ -91,6 +91,7 @@ from deep_nrsfm_ros.node.detections_3d import DetectionsPublisher
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.entities import Entities
 from deep_nrsfm_ros.node.gravity import Gravity, GravityDirection, GravitySources
+from deep_nrsfm_ros.node.shutdown import shut_down
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
 from deep_nrsfm_ros.node.target_frame import TargetFrame, TargetOptions
@@ -381,7 +382,6 @@ class LifterNode(Node):
             self._lifter_diagnostics.empty()
             self._publish_bodies(source, scene)
             return
-        self._stream.lifted(scene.lifted)
         self._publish_points(scene, with_objects=with_objects)
         if self._camera.enabled and source.reader.input_type == YOLO.type:
             self._publish_detections(scene.header, scene.lifted, raw, places)
@@ -416,6 +416,8 @@ class LifterNode(Node):
         if up is not None and is_person(self._pipeline.model.layout):
             self._gravity_check.add(time.monotonic(), lifted.rotations, up)
         scene = Scene(header, lifted, identities, detected, moment)
+        if identities:
+            self._stream.lifted(lifted)  # in the camera's axes, before `target_frame`
         return self._placed(source, scene, up) if identities else scene, observation.places
 
     def _against_gravity(self, header: Header) -> Gravity:
@@ -993,7 +995,7 @@ def main() -> None:
         if not signals and rclpy.ok():
             raise
     finally:
-        rclpy.try_shutdown()
+        shut_down()
         # Launchers and terminals send the signal twice; the second must not kill Python's shutdown.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
