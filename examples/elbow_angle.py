@@ -9,7 +9,6 @@ signal.signal(signal.SIGINT, lambda *_: os._exit(0))  # Ctrl-C, also during the 
 
 import rclpy
 from rclpy.qos import qos_profile_sensor_data
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
 
@@ -20,7 +19,7 @@ def show(message: JointState) -> None:
             print(f"{name}: {math.degrees(radians):5.1f} degrees", flush=True)
 
 
-rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # its own ones break a call
+rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)  # its own ones break a call
 node = rclpy.create_node("elbow_angle")
 node.create_subscription(JointState, "lifter/joint_states", show, qos_profile_sensor_data)
 print("waiting for joints of the lifter on /lifter/joint_states", flush=True)
