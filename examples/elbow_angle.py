@@ -19,7 +19,7 @@ def show(message: JointState) -> None:
             print(f"{name}: {math.degrees(radians):5.1f} degrees", flush=True)
 
 
-rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)  # its own ones break a call
+rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)  # its own break a call
 node = rclpy.create_node("elbow_angle")
 node.create_subscription(JointState, "lifter/joint_states", show, qos_profile_sensor_data)
 print("waiting for joints of the lifter on /lifter/joint_states", flush=True)
