@@ -19,6 +19,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.held_out import Split
 from deep_nrsfm_ros.data.lifted_sample import LiftedFrames, lift_sample
 from deep_nrsfm_ros.data.sufficiency import Sufficiency
+from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.model_files.matching_model import knows
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
@@ -45,7 +46,10 @@ _QUALITY = {
     "coherence": "coherence",
     "mirrored_share": "mirrored",
 }
-_FIGURES = ("residual", "bone_variation", "mirrored_share", "front_disagreement", "opposed")
+_FIGURES = (
+    *("residual", "bone_variation", "misfit"),
+    *("mirrored_share", "front_disagreement", "opposed"),
+)
 _CAMERA_TO_SCREEN = np.array([1, -1, -1])  # x right, y down, z forward to x right, y up, z back
 
 
@@ -121,6 +125,7 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         ["orbit.js", "viewer.js"],
         model=model,
         name=training.path.stem,
+        other_object=not knows(model.layout, HUMAN25),
         path=shlex.quote(str(training.path.resolve())),
         input_parameters=[
             (name, shlex.quote(value))
@@ -196,10 +201,9 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
 
 
 def _verdict(standing: Standing, model: Model) -> str:
-    """Return the verdict on a model; that on the one of the page counts its data, too."""
-    judgement = model.provenance.get("judgement", {})
-    is_faulty = standing.model is model and bool(judgement.get("faults"))
-    return "doubtful" if is_faulty else standing.verdict
+    """Return the verdict on a model; that on the one of the page is what its training said."""
+    said = model.provenance.get("judgement", {}) if standing.model is model else {}
+    return str(said.get("verdict", standing.verdict))
 
 
 def _shapes(

@@ -36,6 +36,7 @@ from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
 from deep_nrsfm_ros.training.steps import FROM_RANDOM
+from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL
 from deep_nrsfm_ros.wording import wording
 
 Floats = NDArray[Any]
@@ -106,10 +107,9 @@ _BESIDE = ("opposed", "turned")  # figures that need a model beside it
 _SHOWN = {
     "residual": "image error of the network before the correction {} of the size of the object",
     "bone_variation": "bone lengths vary by {}",
+    "misfit": "both together, the root of their summed squares, {}",
     "wrong_sides": "frames that look mirrored {}",
 }
-BETTER, AS_GOOD, ALONE, DOUBTFUL = "better", "as_good", "alone", "doubtful"
-"""Verdicts; alone: no other model has these keypoints."""
 MIN_SEEN_SHARE = 0.25
 """Share of an object's keypoints that a frame must show to tell its side: of 4 of 25 keypoints the
 mirror image is as good, and the network's prior alone decides."""
@@ -324,8 +324,10 @@ def _has_few_steps(model: Model) -> bool:
 
 
 _IN_SENTENCES = {
-    BETTER: "is better than model {!r}: it fits {}, and mirrors {} frames",
-    AS_GOOD: "is as good as model {!r}: both fit alike, and it mirrors no more frames",
+    BETTER: "is better than model {!r}: image error and bones together are {}, and it mirrors {} "
+    "frames",
+    AS_GOOD: "is as good as model {!r}: image error and bones together are alike, within "
+    f"{round(100 * SAME_MISFIT - 100)} %, and it mirrors no more frames",
     ALONE: "has no other to compare with",
     DOUBTFUL: "is doubtful",
 }
@@ -357,7 +359,7 @@ def _gains(new: Figures, old: Figures | None) -> tuple[str, str]:
     looser = new.misfit > SAME_MISFIT * old.misfit  # allowed beside a model that mirrors frames
     is_opposed = _or_zero(new.opposed) > MOST_OPPOSED
     fewer = is_opposed or old.wrong_sides > new.wrong_sides + MORE_WRONG_SIDES
-    fit = "more closely" if closer else "less closely" if looser else "alike"
+    fit = "smaller" if closer else "larger" if looser else "alike"
     return fit, "fewer" if fewer else "no more"
 
 
@@ -397,6 +399,8 @@ def _shown(new: Figures, old: Figures | None, name: str) -> str:
     ]
     texts = []
     for each, value, other in values:
+        if each == "misfit" and math.isnan(new.bone_variation):
+            continue  # it is the image error alone
         if each == "wrong_sides" and not _is_side_known(new):
             texts.append("neither other views nor a front tell which frames are mirrored")
         elif not math.isnan(value):
@@ -551,7 +555,7 @@ class Standing(NamedTuple):
     Attributes:
         model: the model.
         figures: beside the model at hand.
-        verdict: "at hand", "better" or "doubtful".
+        verdict: "at hand", or BETTER, AS_GOOD or DOUBTFUL beside it; "" where there is none.
         rank: orders the models.
     """
 
@@ -579,7 +583,7 @@ def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> li
         with suppress(ValueError):
             new = old if model is at_hand and old else comparison.figures(model, at_hand)
             place = rank(new, old)
-            verdict = "doubtful" if place.doubtful else "better" if old else ""
+            verdict = DOUBTFUL if place.doubtful else _verdict(new, old) if old else ""
             result.append(Standing(model, new, "at hand" if model is at_hand else verdict, place))
     return sorted(result, key=lambda each: each.rank)
 

@@ -57,7 +57,7 @@ def main() -> None:
                 f"{config['data']['bags'][0]}.safetensors", folder / f"{behaviour}.safetensors"
             )
         )
-    judgement = "doubtful" if behaviour == "doubtful" else "better"
+    judgement = behaviour if behaviour in ("doubtful", "as_good", "alone") else "better"
     say("finished", message="done", model=model, step=2, steps=2, judgement=judgement)
     if behaviour == "doubtful":
         sys.exit(3)  # its data looked wrong
