@@ -237,6 +237,7 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
         lines = [said, f"model {result.message}"]
         if judgement.doubtful:
             reporter.warnings.append(judgement.brief)  # for the page; the last line says it as well
+    reporter.judging("the report, beside your other models of this object")
     page = write_page(result, reporter)
     lines += [f"report {page}"] if page else []
     if not reporter.as_json and result.state == "finished":  # else the lifter says it

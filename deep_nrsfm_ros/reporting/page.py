@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shlex
 from collections.abc import Sequence
@@ -34,6 +35,7 @@ REPORT_SUFFIX = ".html"
 
 _OTHERS = 12  # other models in the comparison
 _FRAMES = 6  # best frames, and worst frames
+_SAME_ERROR = 1e-4  # rounding, of the error of the same weights
 _MIN_GAP = 0.005  # between two of these frames, as a share of the data
 _CURVES = {
     "loss": "reprojection error",
@@ -125,6 +127,7 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         ["orbit.js", "viewer.js"],
         model=model,
         name=training.path.stem,
+        start_share=_start_share(training),
         other_object=not knows(model.layout, HUMAN25),
         path=shlex.quote(str(training.path.resolve())),
         input_parameters=[
@@ -158,6 +161,16 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         provenance=_rows(model.provenance),
         scenes=embedded(scenes),
     )
+
+
+def _start_share(training: Training) -> float:
+    """Return the share of its start in a model's weights; 0 where it is not their mean."""
+    said, combined = training.model.provenance, training.model.quality.get("combined")
+    if "from" not in said or combined is None or not training.progress:
+        return 0.0
+    last = training.progress[-1]
+    is_mean = abs(math.hypot(last.loss, last.cycle_error) - combined) > _SAME_ERROR
+    return float(said["recipe"]["start_share"]) if is_mean else 0.0
 
 
 def _curve(progress: Sequence[Progress], field: str, label: str) -> Markup:

@@ -20,7 +20,7 @@ from deep_nrsfm_ros.training.config import TrainingConfig
 
 Value = str | int | float | None
 
-ACTIVE = ("starting", "reading", "curating", "training")
+ACTIVE = ("starting", "reading", "curating", "training", "judging")
 ENDED = ("finished", "failed", "cancelled")
 TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
 

@@ -141,6 +141,10 @@ def _train_and_save(
     from deep_nrsfm_ros.training.finish import finish
 
     dataset = prepared.dataset
+    reporter.judging(
+        "bones and errors of the new model; it takes some seconds, up to a minute where other "
+        "programs have the cores"
+    )
     people = read_people(config, dataset.layout, reporter)
     model = finish(trainer, config.output.name, dataset.layout, dataset.source, people)
     date = time.strftime("%Y-%m-%d", time.gmtime())
@@ -149,6 +153,8 @@ def _train_and_save(
         model = inherit(model, start)
     judgement, rival = None, rivals[0] if rivals else None
     if trainer.end_reason:
+        beside = f" beside model {rival.name!r}" if rival else ""
+        reporter.judging(f"the new model on {len(frames.held_out)} frames{beside}")
         judgement, rival = _judge(frames, model, rivals, findings)
         model.provenance["judgement"] = judgement.record()
     else:

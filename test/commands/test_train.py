@@ -134,10 +134,12 @@ def test_from_bag_to_model(
     assert in_process(*words) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     states = [line["state"] for line in lines]
-    order = ["reading", "curating", "training", "finished"]
+    order = ["reading", "curating", "training", "judging", "finished"]
     assert states[-1] == "finished" and [*dict.fromkeys(states)] == [
         s for s in order if s in states
     ]
+    judging = [line["message"] for line in lines if line["state"] == "judging"]
+    assert sum(text.startswith("judging: ") for text in judging) == 3
     progress = [line for line in lines if line["state"] == "training" and "step" in line]
     assert (progress[-1]["step"], progress[-1]["steps"]) == (30, 30)
     for field in ("loss", "cycle_error", "coherence", "seconds_left"):

@@ -216,6 +216,16 @@ def test_a_report_on_another_object_sets_the_layout_first(text: str) -> None:
     assert first not in text and other.index(first) < other.index("/lifter model mine")
 
 
+def test_a_model_that_is_the_mean_with_its_start_says_so() -> None:
+    whole, said = training_of(), "the mean of its start"
+    whole.model.provenance.update({"from": {"model": "human"}, "recipe": {"start_share": 0.6}})
+    last = whole.progress[-1]
+    whole.model.quality["combined"] = math.hypot(last.loss, last.cycle_error) + 0.05
+    assert said in page(whole)
+    whole.model.quality["combined"] -= 0.05  # of the same weights as the curves
+    assert said not in page(whole)
+
+
 def test_doubtful_models_stand_below_the_one_at_hand() -> None:
     whole = training_of()
     human = load_model("human")
