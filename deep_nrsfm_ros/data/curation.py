@@ -122,7 +122,7 @@ class Curated:
         """Return one sentence with every count; "" if nothing was dropped or hidden."""
         dropped = {
             "with too few visible keypoints": self.few_visible,
-            "near-duplicates": self.near_duplicates,
+            f"near-duplicates{_keep_duplicates()}": self.near_duplicates,
             "that contradict the rest": self.inconsistent,
         }
         parts = [f"{count} {reason}" for reason, count in dropped.items() if count]
@@ -164,6 +164,11 @@ class Curated:
                     f"{name} was an outlier in {count} of {total} frames: is it swapped?"
                 )
         return tuple(warnings)
+
+
+def _keep_duplicates() -> str:
+    """Return how near-duplicates are kept."""
+    return wording(" (--min-change 0, train.min_change 0: keep them)", python="")
 
 
 def _look_at_the_detector() -> str:

@@ -68,12 +68,15 @@ class Sufficiency:
         )
 
 
-def assess_sufficiency(dataset: Dataset, *, has_start: bool = False) -> Sufficiency:
+def assess_sufficiency(
+    dataset: Dataset, *, has_start: bool = False, near_duplicates: int = 0
+) -> Sufficiency:
     """Return whether a model can be learned from a dataset; deterministic, within a second.
 
     Args:
         dataset: the frames.
         has_start: whether the training starts from a model, which has learned depth elsewhere.
+        near_duplicates: number of frames that the curation left out as such.
     """
     counts = dataset.visible.sum(0) >= max(1, _MIN_VISIBLE_SHARE * len(dataset))
     frames, keypoints = len(dataset), int(counts.sum())
@@ -118,7 +121,7 @@ def assess_sufficiency(dataset: Dataset, *, has_start: bool = False) -> Sufficie
     deformation = float(np.sqrt(max(0.0, 1 - (values[:3] ** 2).sum())))
     figures = (frames, keypoints, tuple(values.tolist()), span, deformation)
     refusal = _flatness(values)
-    warnings = () if refusal else _warnings(frames, span, deformation, has_start)
+    warnings = () if refusal else _warnings(frames, span, deformation, has_start, near_duplicates)
     if sides := mixed_sides(dataset):
         warnings = (*warnings, sides)
     return Sufficiency(*figures, refusal, warnings)
@@ -180,18 +183,23 @@ def _flatness(values: Floats) -> str:
     return ""
 
 
-def _warnings(frames: int, span: float, deformation: float, has_start: bool) -> tuple[str, ...]:
+def _warnings(
+    frames: int, span: float, deformation: float, has_start: bool, near_duplicates: int
+) -> tuple[str, ...]:
     """Return a sentence for each figure that may make the model poor."""
     warnings = []
     if frames < _FEW_FRAMES:
+        others, differ = "", ""
+        if near_duplicates > frames:
+            others, differ = f", as {near_duplicates} more are near-duplicates", " that differ"
         warnings.append(
-            f"{frames} frames are few; expect a model of those frames alone, and record "
-            "thousands for a model of other frames too"
+            f"{frames} frames are few{others}; expect a model of those frames alone, and record "
+            f"thousands{differ} for a model of other frames too"
         )
     if span < _NARROW:
         views = f"the views span only {span:.0f} degrees around their mean"
         if span < 1:  # deformation hides a rotation that small, or looks like one
-            views = "the keypoints show no view from another side"
+            views = "the frames look as if all were seen from one side"
         warnings.append(
             f"{views}, so that depth rests on the model that the training starts from; record the "
             "object from more sides to learn its depth"

@@ -459,7 +459,9 @@ def prepare(
     curated = curate(dataset, curation, reporter.curating)
     if curated.summary:
         reporter.say(curated.summary)
-    sufficiency = assess_sufficiency(curated.dataset, has_start=has_start)
+    sufficiency = assess_sufficiency(
+        curated.dataset, has_start=has_start, near_duplicates=curated.near_duplicates
+    )
     if sufficiency.refusal:
         raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
     for warning in (*curated.warnings, *sufficiency.warnings):
