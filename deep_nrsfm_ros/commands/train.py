@@ -15,6 +15,7 @@ import stat
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,10 +40,12 @@ from deep_nrsfm_ros.training.activation import switch_commands
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.distributed import own_share, rank
 from deep_nrsfm_ros.training.handedness_check import handedness_warning
+from deep_nrsfm_ros.training.job import FOR_NODE
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments
 from deep_nrsfm_ros.training.run import TrainingResult, run
+from deep_nrsfm_ros.wording import in_node
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.judge import Judgement
@@ -307,8 +310,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     reporter = (SilentReporter if rank() else Reporter)(arguments.json_progress, should_stop)
     code = 0
     try:
-        if result := run(parse(arguments, reporter.say), reporter, should_stop):
-            report_end(result, reporter)
+        with in_node() if os.environ.get(FOR_NODE) else nullcontext():
+            result = run(parse(arguments, reporter.say), reporter, should_stop)
+            if result:
+                report_end(result, reporter)
+        if result:
             if result.state == "cancelled":
                 code = CANCELLED
             elif result.judgement and result.judgement.faults and not arguments.force:

@@ -155,6 +155,7 @@ class Curated:
                 "poses and not mistakes of the detector, "
                 + wording(
                     "--outlier-threshold 0 keeps them",
+                    node="train.outlier_threshold 0 keeps them",
                     python="the program `train` can keep them",
                 )
             )
@@ -168,12 +169,16 @@ class Curated:
 
 def _keep_duplicates() -> str:
     """Return how near-duplicates are kept."""
-    return wording(" (--min-change 0, train.min_change 0: keep them)", python="")
+    return wording(
+        " (--min-change 0, train.min_change 0: keep them)",
+        node=" (train.min_change 0 keeps them)",
+        python="",
+    )
 
 
 def _look_at_the_detector() -> str:
     """Return what to do about frames with few keypoints."""
-    confidence = wording("--min-confidence", python="the confidence")
+    confidence = wording("--min-confidence", node="min_confidence", python="the confidence")
     return f"look at the detector, {confidence} and the keypoint layout"
 
 

@@ -89,7 +89,9 @@ def assess_sufficiency(
             keypoints,
             f"only {keypoints} keypoints are visible ({', '.join(names) or 'none'}); NRSfM needs "
             "at least 4, better 8; check the layout and "
-            + wording("lower --min-confidence", python="the confidence"),
+            + wording(
+                "lower --min-confidence", node="lower min_confidence", python="the confidence"
+            ),
         )
     lines = np.zeros(len(dataset), bool)
     for part in slices(len(dataset)):
@@ -221,6 +223,8 @@ def how_to_learn_depth() -> str:
     start = wording(
         f"start from {a_model} (--from, train.from), or let the layout help (--bone-length-weight, "
         "--handedness-weight, or train.*)",
+        node=f"start from {a_model} (train.from), or let the layout help "
+        "(train.bone_length_weight, train.handedness_weight)",
         python=f"or start from {a_model} (start)",
     )
     return f"record the object from more sides, {start}"

@@ -24,7 +24,7 @@ from deep_nrsfm_ros.messages.options import AUTO
 from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model
 from deep_nrsfm_ros.node import publishing
-from deep_nrsfm_ros.node.diagnostics import ERROR, OK, status
+from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, status
 from deep_nrsfm_ros.training.activation import reason_to_stay, switch_commands
 from deep_nrsfm_ros.training.config import PARAMETERS, DataConfig, TrainingConfig
 from deep_nrsfm_ros.training.job import JobStatus, TrainingJob
@@ -32,7 +32,8 @@ from deep_nrsfm_ros.training.record import find_records, read_record
 from deep_nrsfm_ros.training.request import TrainingRequest, data_in_words
 from deep_nrsfm_ros.training.same_name import BEFORE
 from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
-from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER
+from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL
+from deep_nrsfm_ros.wording import in_node
 
 _SAMPLE = 16
 """Messages of a bag that are read before a training is accepted."""
@@ -167,6 +168,7 @@ class TrainingService:
         names = {"unfinished": ", ".join(record.name for record in records)} if records else {}
         self._publish(JobStatus("idle", message, {**names}))
 
+    @in_node()
     def _train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start a training and answer at once."""
         try:
@@ -295,11 +297,14 @@ class TrainingService:
     def _publish(self, progress: JobStatus) -> None:
         """Publish progress, and log it where the state changes or there is a message."""
         failed = progress.state == "failed"
+        warns = not progress.values and progress.message.startswith("warning: ")
+        warns |= bool(progress.values.get("warning"))
+        warns |= progress.values.get("judgement") == DOUBTFUL
         news = f"training of {self._name!r}: {progress.message}"
         if failed:
             self._node.get_logger().error(news)
             self._last_failure = news
-        elif not progress.values and progress.message.startswith("warning: "):
+        elif warns:
             self._node.get_logger().warning(news)
         elif progress.state != "idle" and (progress.state != self._state or not progress.values):
             self._node.get_logger().info(news)  # a new state, or no step but something to say
@@ -308,6 +313,6 @@ class TrainingService:
         self._state = progress.state
         node = self._node.get_fully_qualified_name()
         values = {"state": progress.state, **progress.values, "last failure": self._last_failure}
-        level = ERROR if failed else OK
+        level = ERROR if failed else WARN if warns else OK
         self._status = status(f"{node}: training", level, progress.message, values, node)
         self._publisher.publish(self._status)

@@ -337,6 +337,7 @@ def _mirrored_as_a_whole(name: str) -> str:
     """Return a sentence on a model whose depth nothing decides."""
     look = wording(
         f"it from the side (replay FILE --model {name} --html look.html)",
+        node="the shapes in the report",
         python="its shapes from the side",
     )
     return (
@@ -388,7 +389,7 @@ def _on(frames: Split) -> str:
     """Return on which frames models are compared."""
     count = len(frames.held_out)
     if frames.held_out is frames.training:
-        return f"on the {count} frames of its training, which is weak evidence"
+        return f"on the {count} frames of its training, as none were held out"
     return f"on {count} held-out frames, later ones that it was not trained on"
 
 
@@ -417,10 +418,14 @@ def _guessed(model: Model) -> str:
     more = f" and {len(rare) - _MOST_NAMES} more" if len(rare) > _MOST_NAMES else ""
     said = "only guessed"
     if "from" in model.provenance:
-        said = "their guesses rest on the start"
+        said = "guessed mostly as the start does"
         if model.provenance["recipe"]["start_share"] < (share := _SHARE_OF_SPEAKERS):
-            option = wording(f"--start-share {share}", python=f"Recipe(start_share={share})")
-            said += f"; {option} keeps more of them"
+            option = wording(
+                f"--start-share {share}",
+                node=f"train.start_share {share}",
+                python=f"Recipe(start_share={share})",
+            )
+            said += f"; {option} keeps more of that"
     return f". Rarely shown: {', '.join(rare[:_MOST_NAMES])}{more} ({said})"
 
 
@@ -528,21 +533,33 @@ def _advice(model: Model, rival: str) -> str:
     """Return what would help a doubtful model."""
     advice = ["more views", "more frames"]
     if minutes := model.provenance.get("factorisation_needs_minutes"):
-        advice.insert(0, f"more time (--minutes {minutes:g}, train.minutes, or no limit)")
+        limit = wording(
+            f"--minutes {minutes:g}, train.minutes", node=f"train.minutes {minutes:g}", python=""
+        )
+        advice.insert(0, f"more time ({limit}, or no limit)")
     elif _has_few_steps(model):
         steps = FROM_RANDOM
-        option = wording(f"--steps {steps}, train.steps", python=f"Recipe.steps, {steps} are usual")
+        option = wording(
+            f"--steps {steps}, train.steps",
+            node=f"train.steps {steps}",
+            python=f"Recipe.steps, {steps} are usual",
+        )
         advice.insert(0, f"more steps ({option})")
     if "from" in model.provenance:
         advice.append("fewer steps")
-        option = wording("--start-share, train.start_share", python="Recipe.start_share")
+        option = wording(
+            "--start-share, train.start_share",
+            node="train.start_share",
+            python="Recipe.start_share",
+        )
         advice.append(f"a larger share of the start ({option})")
     else:
-        option = wording("--from, train.from", python="start")
+        option = wording("--from, train.from", node="train.from", python="start")
         advice.append(f"a start from {rival or 'a model of such an object'} ({option})")
     if model.layout.edges and model.layout.handedness:
         options = wording(
             " (--bone-length-weight, --handedness-weight, --depth-penalty, or train.*)",
+            node=" (train.bone_length_weight, train.handedness_weight, train.depth_penalty)",
             python=", which the program `train` offers,",
         )
         advice.append(f"the layout's losses{options}")

@@ -358,7 +358,9 @@ class _Loop:
 
 def _mean_in_words(share: float, before: float, after: float) -> str:
     """Return a sentence on the mean with the start, and the combined error before and after it."""
-    option = wording("--start-share, train.start_share", python="Recipe.start_share")
+    option = wording(
+        "--start-share, train.start_share", node="train.start_share", python="Recipe.start_share"
+    )
     return (
         f"the model is the mean of its start, with a share of {share:g} ({option}), and of the "
         f"trained weights: combined is {after:.3f} on the frames of the training, and was "

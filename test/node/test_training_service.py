@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import Float32MultiArray
@@ -96,6 +97,8 @@ def test_a_training_from_request_to_use(
     client.set_parameters(train__name="doubtful")
     assert client.call("/lifter/train").success
     doubted = client.wait_for_training("finished")
+    levels = {s.message: s.level for s in client.heard["/lifter/training_status"]}
+    assert levels["warning: 60 frames are few"] == doubted.level == DiagnosticStatus.WARN
     assert "not in use" in doubted.message and values(doubted)["judgement"] == "doubtful"
     assert (models / "doubtful.safetensors").exists()
     client.heard["/lifter/training_status"].clear()
@@ -150,6 +153,7 @@ def test_every_model_that_is_not_doubtful_is_used(
     assert client.call("/lifter/train").success
     finished = client.wait_for_training("finished")
     assert values(finished)["judgement"] == judgement and "in use from now on" in finished.message
+    assert finished.level == DiagnosticStatus.OK
 
 
 def test_the_way_to_a_model_of_another_object_is_one_that_works(
@@ -252,6 +256,8 @@ def test_the_real_training_turns_a_bag_into_the_model_in_use(
     assert "starting from model 'person'" in accepted.message
     finished = client.wait_for_training("finished")
     assert "in use from now on" in finished.message
+    said = [s.message for s in client.heard["/lifter/training_status"]]
+    assert any("train.held_out" in text for text in said) and not [s for s in said if "--" in s]
     assert values(finished)["judgement"] in ("better", "as_good", "doubtful")
     assert load_model(models / "fresh.safetensors").name == "fresh"
     client.wait_for_health(lambda _, v: v["model"] == "fresh")

@@ -325,7 +325,7 @@ def test_standings_have_the_best_first_and_doubtful_ones_last(
 def test_a_judgement_on_the_frames_of_the_training_says_so(frames: Split, good: Model) -> None:
     few = frames.training[:40]
     judgement = judge(Split(few, few), good, None)
-    assert "on the 40 frames of its training" in str(judgement)
+    assert "on the 40 frames of its training, as none were held out: " in str(judgement)
 
 
 def test_the_figures_are_named_and_short(frames: Split, good: Model, bad: Model) -> None:
