@@ -23,6 +23,7 @@ from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.track_matching import keypoint_tolerances
+from deep_nrsfm_ros.model_files.matching_model import map_to_model
 from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, reprojection_error, weak_perspective
 
 _CAUSAL = OverTime()
@@ -87,7 +88,7 @@ def lift_recording(
         ValueError: too few keypoints of the layout are keypoints of the model.
     """
     target = lifter.model.layout
-    to_model = KeypointMap(source, target)
+    to_model = map_to_model(source, target)
     if lifter.layout != source:
         history = lifter.constants.history
         lifter = Lifter(lifter.model, lifter.options, layout=source, history=history)

@@ -23,6 +23,7 @@ from deep_nrsfm_ros.lifting.layout_fit import (
     fit_layouts,
 )
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, is_person
+from deep_nrsfm_ros.model_files.matching_model import model_of_count
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.wording import wording
 
@@ -78,9 +79,13 @@ def resolve_layout(
         return ResolvedLayout(layout, f"{q} keypoints; no object has enough of them to try it")
     if q == len(preferred):
         return ResolvedLayout(preferred, f"the order of {preferred.name}, {q} keypoints")
+    other = model_of_count(q)
+    options = f"--model {other}; to train --object {other}"
+    hint = f", but model {other!r} lifts objects of {q} keypoints ({options})" if other else ""
     raise ValueError(
         f"the objects have {q} keypoints; no layout of {q} keypoints is known that model "
-        f"{model.name!r} ({len(model.layout)} keypoints) can lift: name one with {layout_option()}"
+        f"{model.name!r} ({len(model.layout)} keypoints) can lift{hint}: name one with "
+        f"{layout_option()}"
     )
 
 
