@@ -192,8 +192,8 @@ def curate(
     Args:
         dataset: is not changed.
         options: what to drop; None = defaults.
-        on_progress: called after each few thousand frames of both passes; an exception ends the
-            curation.
+        on_progress: called after each few thousand frames of both passes, of which the second
+            counts as many as the first; an exception ends the curation.
 
     Raises:
         ValueError: an option is out of range, or no frame has enough visible keypoints.
@@ -207,7 +207,7 @@ def curate(
             + _look_at_the_detector()
         )
     frames = np.flatnonzero(enough)
-    candidates = dataset if enough.all() else dataset[frames]
+    candidates, count = dataset if enough.all() else dataset[frames], len(frames)
     if options.min_change:
         changed = changed_frames(
             candidates.points,
@@ -227,7 +227,7 @@ def curate(
             candidates.points,
             visible,
             options.outlier_threshold,
-            lambda done, total: on_progress(total + done, 2 * total),
+            lambda done, total: on_progress(count + round(count * done / total), 2 * count),
         )
     number = outliers.sum(1)
     keep = (number <= _MAX_OUTLIER_SHARE * visible.sum(1)) & (

@@ -294,6 +294,11 @@ class _Reader:
                 count = f"{reading.unreadable} of {reading.messages}"
                 reporter.warn(f"{count} messages could not be read: {reading.reason}")
             whole = _in_pixels(reading.dataset, options)
+            if len(whole) > reading.messages:
+                reporter.say(
+                    f"{reading.messages} messages hold {len(whole)} objects; each is a frame of "
+                    "the training"
+                )
             ends = [start for _, start in reading.starts[1:]] + [len(whole)]
             kept = list[tuple[str, Dataset]]()
             for (bag, start), end in zip(reading.starts, ends, strict=True):

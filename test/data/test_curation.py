@@ -235,3 +235,10 @@ def test_new_frames_at_once_are_those_that_are_found_one_by_one(missing: float) 
     assert f / 10 < len(kept) < f
     found = changed_frames(points.astype(np.float32), visible, 0.05)
     assert np.flatnonzero(found).tolist() == kept
+
+
+def test_progress_counts_to_one_total() -> None:
+    still = dataset(10)[np.repeat(np.arange(10), 50)]
+    counts: list[tuple[int, int]] = []
+    curate(still, Curation(), lambda done, total: counts.append((done, total)))
+    assert len(still) == 500 and counts == [(500, 1000), (1000, 1000)]
