@@ -23,6 +23,7 @@ Floats = NDArray[Any]
 SHELF, CLIP, STANDING = "shelf_dev", "clip, balancing", "clip, standing"
 HUMANEVA, HUMANEVA_NOISY = "humaneva_s1", "humaneva_s1, noise"
 CMU, CMU_STILL = "CMU 03, 131", "CMU 03, 131, still"
+CMU_LIGHT = "CMU 03, 131, light noise"
 SHELF_RATE = 25.0  # Hz
 HELD_OUT = ("03", "131")
 """CMU subjects that `human` was not trained on."""
@@ -37,6 +38,10 @@ that is new in each frame, seconds that the rest stays alike; as measured on she
 next two lines."""
 DROPOUTS, DROPOUT_TIME = 0.09, 0.37  # share of the keypoints, mean duration in seconds
 WRONG, WRONG_TIME, WRONG_STEP = 0.01, 0.2, 0.25  # the same, and their error in RMS radii
+LIGHT_NOISE, LIGHT_DROPOUTS = 0.02, 0.05
+"""As above, of noise that is new in each frame; no keypoint is wrong."""
+GROSS = 1.0
+"""Standard deviation in RMS radii of a coordinate of a keypoint at a wrong place."""
 _SIDES = ("left", "right")
 HUMANEVA15 = KeypointLayout(
     "humaneva15",
@@ -121,17 +126,19 @@ def people_scenes(
             for name, views in ((CLIP, balancing), (STANDING, standing)):
                 if wanted(name):
                     yield name, [clip_track(scene) for scene in views]
-    if not wanted(CMU, CMU_STILL):
+    if not wanted(CMU, CMU_LIGHT, CMU_STILL):
         return
-    moving, still = [], []
+    moving, light, still = [], [], []
     for seed, motion in enumerate(list(held_out_motions(data / "cmu"))[::stride]):
         poses = motion[np.linspace(0, len(motion) - 1, STILL_POSES + 2).astype(int)[1:-1]]
-        moving += [noisy(filmed(motion, azimuth, seed), seed) for azimuth in AZIMUTHS]
+        exact = [filmed(motion, azimuth, seed) for azimuth in AZIMUTHS]
+        moving += [noisy(track, seed) for track in exact]
+        light += [lightly_noisy(track, seed) for track in exact]
         for i, pose in enumerate(poses):
             azimuth = AZIMUTHS[i % len(AZIMUTHS)]
             held = np.repeat(pose[None], STILL_FRAMES, 0)
             still.append(noisy(filmed(held, azimuth, seed), STILL_POSES * seed + i))
-    for name, tracks in ((CMU, moving), (CMU_STILL, still)):
+    for name, tracks in ((CMU, moving), (CMU_LIGHT, light), (CMU_STILL, still)):
         if wanted(name):
             yield name, tracks
 
@@ -263,14 +270,10 @@ def filmed(motion: Floats, azimuth: float, seed: int) -> Track:
 
 
 def noisy(track: Track, seed: int) -> Track:
-    """Return the track with noise like a detector's: correlated in time, wrong and missing joints.
-
-    Neck and mid-hip follow from the other joints, as detectors have them.
-    """
+    """Return the track with noise like a detector's: lasting, with wrong and missing joints."""
     rng = np.random.default_rng(seed)
     f, q = track.confidence.shape
     steps = np.diff(track.seconds, prepend=track.seconds[0])
-    size = np.sqrt(np.square(track.points - track.points.mean(1, keepdims=True)).sum(2).mean(1))
     missing = _bursts(rng, steps, q, DROPOUTS, DROPOUT_TIME)
     wrong = _bursts(rng, steps, q, WRONG, WRONG_TIME)
     lasting, value = np.zeros((f, q, 2)), rng.standard_normal((q, 2))
@@ -281,7 +284,49 @@ def noisy(track: Track, seed: int) -> Track:
     scattered = rng.standard_normal((f, q, 2))
     error = np.sqrt(NEW_NOISE) * scattered + np.sqrt(1 - NEW_NOISE) * lasting
     error *= np.where(wrong, WRONG_STEP, NOISE)[..., None]
-    points: Floats = track.points + size[:, None, None] * error
+    return _detected(track, error, missing)
+
+
+def lightly_noisy(track: Track, seed: int) -> Track:
+    """Return the track with a little noise, new in each frame, and some missing joints."""
+    rng = np.random.default_rng(seed)
+    f, q = track.confidence.shape
+    steps = np.diff(track.seconds, prepend=track.seconds[0])
+    missing = _bursts(rng, steps, q, LIGHT_DROPOUTS, DROPOUT_TIME)
+    return _detected(track, LIGHT_NOISE * rng.standard_normal((f, q, 2)), missing)
+
+
+def displaced(track: Track, share: float, seed: int) -> Track:
+    """Return the track with a share of the keypoints at wrong places, for a random time each.
+
+    The places are as far from the right ones as the person is large: see `GROSS`.
+    """
+    rng = np.random.default_rng(seed)
+    f, q = track.confidence.shape
+    steps = np.diff(track.seconds, prepend=track.seconds[0])
+    wrong = _bursts(rng, steps, q, share, WRONG_TIME) & (track.confidence > 0)
+    offset = rng.standard_normal((f, q, 2))
+    for i in range(1, f):
+        offset[i] = np.where((wrong[i] & wrong[i - 1])[:, None], offset[i - 1], offset[i])
+    moved = GROSS * _size(track)[:, None, None] * offset
+    return track._replace(points=track.points + np.where(wrong[..., None], moved, 0))
+
+
+def _size(track: Track) -> Floats:
+    """Return the RMS radius (f,) of the visible keypoints in pixels."""
+    shown = (track.confidence > 0)[..., None]
+    count = np.maximum(shown.sum(1, keepdims=True), 1)
+    apart = (track.points - (track.points * shown).sum(1, keepdims=True) / count) * shown
+    size: Floats = np.sqrt(np.square(apart).sum((1, 2)) / count[:, 0, 0])
+    return size
+
+
+def _detected(track: Track, error: Floats, missing: NDArray[np.bool_]) -> Track:
+    """Return the track with errors (f, q, 2) in RMS radii and missing keypoints (f, q).
+
+    Neck and mid-hip follow from the other joints, as detectors have them.
+    """
+    points: Floats = track.points + _size(track)[:, None, None] * error
     confidence = np.where(missing, 0, track.confidence)
     at = track.layout.index
     for middle, part in (("neck", "shoulder"), ("mid_hip", "hip")):

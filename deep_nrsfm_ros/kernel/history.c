@@ -11,8 +11,9 @@
 /* Parts of a state; see StateLayout of lifting/history.py. */
 #define STATE_TIME 0
 #define STATE_MISFIT 1
-#define STATE_ROTATION 3
-#define STATE_SHAPE 12
+#define STATE_AGREEMENT 3
+#define STATE_ROTATION 4
+#define STATE_SHAPE 13
 
 ptrdiff_t state_size(const Plan *k) { return STATE_SHAPE + 3 * (ptrdiff_t)k->p + 2 * (ptrdiff_t)k->bones; }
 
@@ -83,10 +84,20 @@ static void turn(const double *V, int transposed, rotation R, rotation out) {
         }
 }
 
+/* Return what becomes of the remembered rotation if the new one is `step` away from it: 0, it is smoothed on; 1, it
+   stays; -1, the new one takes its place. Update the agreement: weigh_turns of network_smoothing.py. */
+static int weigh_turn(const Plan *k, Object *o, rotation step) {
+    double *agreement = o->state + STATE_AGREEMENT, trace = step[0][0] + step[1][1] + step[2][2];
+    int turned = trace < 1 + 2 * k->history.cosine_of_turn;
+    if (turned) *agreement -= o->seconds;
+    else *agreement = fmin(*agreement + o->seconds, k->history.max_agreement);
+    return !turned ? 0 : *agreement > 0 ? 1 : -1;
+}
+
 void smooth_network(Plan *k, Object *o) {
-    int p = k->p, stride = k->stride;
+    int p = k->p, stride = k->stride, held = 0;
     double *Z = o->state + STATE_SHAPE, mean[3], size = 0, old_size = 0;
-    rotation R, step;
+    rotation R, old = {{0}}, step = {{0}};
     for (int r = 0; r < 3; r++) {
         mean[r] = 0;
         for (int i = 0; i < p; i++) mean[r] += o->S[r * stride + i];
@@ -101,8 +112,18 @@ void smooth_network(Plan *k, Object *o) {
         return;
     }
     int goes_on = o->goes_on && old_size < INFINITY;
-    double seen = goes_on ? gain(o->seconds, k->history.shape_time) : 1;
-    double hidden = goes_on ? gain(o->seconds, k->history.hidden_time) : 1;
+    turn(o->view, 1, o->R, R);
+    if (goes_on) {
+        rotation back;
+        memcpy(old, o->state + STATE_ROTATION, sizeof(old));
+        transpose(old, back);
+        turn(&R[0][0], 0, back, step);
+        int weighed = k->history.rotation_time > 0 ? weigh_turn(k, o, step) : 0;
+        held = weighed > 0, goes_on = weighed >= 0;
+    }
+    if (!goes_on) o->state[STATE_AGREEMENT] = 0;
+    double seen = held ? 0 : goes_on ? gain(o->seconds, k->history.shape_time) : 1;
+    double hidden = held ? 0 : goes_on ? gain(o->seconds, k->history.hidden_time) : 1;
     double ratio = goes_on ? sqrt(size) / fmax(sqrt(old_size), 1e-9) : 0;
     for (int i = 0; i < p; i++) {
         double part = o->visible[i] ? seen : hidden;
@@ -112,12 +133,8 @@ void smooth_network(Plan *k, Object *o) {
             o->S[r * stride + i] = (float)(Z[3 * i + r] + mean[r]);
         }
     }
-    turn(o->view, 1, o->R, R);
-    if (goes_on) {
-        rotation old, back;
-        memcpy(old, o->state + STATE_ROTATION, sizeof(old));
-        transpose(old, back);
-        turn(&R[0][0], 0, back, step);
+    if (held) memcpy(R, old, sizeof(R));
+    else if (goes_on) {
         rotation_part(step, gain(o->seconds, k->history.rotation_time), step);
         turn(&step[0][0], 0, old, R);
     }

@@ -44,8 +44,7 @@ static double residual_of(Plan *k, const Object *o, int perspective, const float
     return reprojection_error(moments(p, o->W, P, stride, o->visible));
 }
 
-/* Set S, M and residual of n objects: means over rotations and mirror images, weighted by their residuals. */
-static void average_rotations(Plan *k, int n, Object *const *objects, int perspective) {
+void average_rotations(Plan *k, int n, Object *const *objects, int perspective) {
     int stride = k->stride, size = 3 * stride, t = k->rotations, all = t * (1 + k->mirrored);
     for (int mirrored = 0; mirrored <= k->mirrored; mirrored++)
         forward(k, n, objects, mirrored, k->shapes + (size_t)mirrored * n * t * size,
@@ -83,6 +82,8 @@ static void fit_block(Plan *k, int n, Object *const *objects, int perspective) {
     int p = k->p, apart = DOUBLES_OF(p);
     for (int i = 0; i < n; i++) normalise(k, objects[i]);
     average_rotations(k, n, objects, perspective);
+    for (int i = 0; i < n; i++)
+        if (objects[i]->first && k->leave_out_wrong) leave_out_wrong(k, objects[i], perspective);
     for (int j = 0; j < n; j++) {
         Object *o = objects[j];
         double square = 0;
@@ -207,10 +208,9 @@ static int detected_count(const Plan *k, const Object *o) {
     return n;
 }
 
-/* Return whether an object is lifted: enough keypoints are detected, and not all lie on one line. */
-static int is_lifted(Plan *k, const Object *o) {
+int is_lifted(const Plan *k, const Object *o, int fewest) {
     return !on_one_line(moments(k->p, o->image_points, o->S, k->stride, o->visible)) &&
-           detected_count(k, o) >= k->min_visible;
+           detected_count(k, o) >= fewest;
 }
 
 /* Write a fitted object as row i of the outputs; return 1 if it is not lifted. */
@@ -269,8 +269,8 @@ void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, in
             o->image_points = points + 2 * p * (start + i), o->confidence = confidence + p * (start + i);
             memcpy(o->input, o->image_points, 2 * p * sizeof(float));
             set_weights(k, o);
-            recall(k, o, context, start + i, context && is_lifted(k, o));
-            o->last = !k->refill_rounds || o->visible_count >= p;
+            recall(k, o, context, start + i, context && is_lifted(k, o, k->min_visible));
+            o->first = 1, o->last = !k->refill_rounds || o->visible_count >= p;
         }
         fit_block(k, block, k->incomplete, perspective);
         for (int i = 0; i < block; i++)
@@ -278,7 +278,7 @@ void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, in
         for (int round = 0; round < k->refill_rounds && incomplete; round++) {
             for (int i = 0; i < incomplete; i++) {
                 refill_input(k, k->incomplete[i], perspective);
-                k->incomplete[i]->last = round == k->refill_rounds - 1;
+                k->incomplete[i]->first = 0, k->incomplete[i]->last = round == k->refill_rounds - 1;
             }
             fit_block(k, incomplete, k->incomplete, perspective);
         }

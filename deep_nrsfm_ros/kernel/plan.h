@@ -36,6 +36,7 @@ typedef struct {
     const double *view;     /* (3, 3) from the camera to the view that is lifted; NULL: they are the same */
     double time, seconds;   /* of this frame; since the last one */
     int last;               /* whether the next fit is the last one, which updates the state */
+    int first;              /* whether it is the first one, which looks for wrong keypoints */
     int goes_on, updates;   /* whether the state is smoothed on, and changed at all */
     int upright;            /* whether gravity is known */
     double up[3];           /* against gravity, in the view */
@@ -53,12 +54,14 @@ typedef struct {
 /* Constants of lifting/history.py, own_bones.py and gravity.py, in the order of the plan's doubles. */
 typedef struct {
     double shape_time, hidden_time, rotation_time, bones_time, max_gap, max_back, outlier, max_step, max_seconds,
-        memory, max_variance_reduction, misfit_time, misfit_ratio, change_evidence, doubted_evidence, lean_deviation, free_lean;
+        memory, max_variance_reduction, misfit_time, misfit_ratio, change_evidence, doubted_evidence, lean_deviation, free_lean,
+        cosine_of_turn, max_agreement;
 } HistoryConstants;
 #define HISTORY_NUMBERS ((int)(sizeof(HistoryConstants) / sizeof(double)))
 
 typedef struct {
     int p, stride, layers, rotations, refill_rounds, reference[2], min_visible, bones, derivations;
+    int leave_out_wrong, fewest_left, candidates, most_wrong; /* lifting/wrong_keypoints.py */
     int mirrored, whitened, scale_by_rms, corrected, has_axis;           /* flags */
     const int *widths, *partners, *bone_ends;                            /* (layers), (p), (bones, 2) */
     const int *derivation_pairs; /* (derivations, 2): a keypoint, and one that it follows from */
@@ -72,8 +75,8 @@ typedef struct {
     const double *bone_correlation;                                      /* (bones, bones), symmetric */
     const double *axis;                                                  /* (p) from bottom to top */
     HistoryConstants history;
-    double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, residual_offset,
-        trusted_weight, full_ratio, extent_offset, min_known;
+    double noise, reference_length, unknown_variance, min_relative_depth, residual_scale, min_residual,
+        residual_ratio, min_distance, residual_offset, trusted_weight, full_ratio, extent_offset, min_known;
     void *constants, *scratch; /* the memory of all above, and of all below */
     int busy;                  /* whether a lift computes in the scratch memory */
     /* Scratch memory, for `block` objects at a time. Rows of doubles are filled up to multiples of DOUBLES. */
@@ -91,6 +94,8 @@ typedef struct {
     double *precision, *no_growth; /* (bones) length / deviation of the model; 0 */
     double *spread;               /* (DOUBLES, 2, p) of bones and keypoints in the image */
     double *gap;                  /* (p) deviation of a missing keypoint given the visible ones */
+    double *apart;                /* (p) distances of the keypoints from their projections */
+    float *shown;                 /* (2, p) which keypoints are visible, with and without the wrong ones */
 } Plan;
 
 #define COEFFICIENTS 7 /* of the log odds of a keypoint: Coefficients of lifting/confidence.py */
@@ -99,6 +104,7 @@ typedef struct {
 #define MAX_ROTATIONS 1024
 #define MAX_BONES 65536
 #define MAX_DERIVATIONS 65536
+#define MAX_CANDIDATES 8 /* for a wrong keypoint */
 #define MAX_REFILL 1000 /* rounds; so that no plan makes a lift endless */
 
 /* Check the numbers of a plan's header (length): counts, flags, widths and indices of keypoints. Returns what is
@@ -122,6 +128,18 @@ void normalise(Plan *k, Object *o);
 /* Set shapes (n, rotations, 3, stride) and cameras (n, rotations) of n objects from the rotations of W, or of its
    mirror image. */
 void forward(Plan *k, int n, Object *const *objects, int mirrored, float *shapes, camera *cameras);
+
+/* Set S in camera axes, M and residual of n objects: means over rotations and mirror images, weighted by their
+   residuals. */
+void average_rotations(Plan *k, int n, Object *const *objects, int perspective);
+
+/* Return whether an object is lifted: enough keypoints are detected, and not all lie on one line. `fewest`: that many
+   are enough. */
+int is_lifted(const Plan *k, const Object *o, int fewest);
+
+/* Take keypoints that contradict the others as missing, after `average_rotations` of an object, and set its S, M and
+   residual anew. */
+void leave_out_wrong(Plan *k, Object *o, int perspective);
 
 /* Return the doubles of a state. */
 ptrdiff_t state_size(const Plan *k);

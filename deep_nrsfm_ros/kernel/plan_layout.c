@@ -11,8 +11,8 @@
 /* Of two lengths; rounding may take the 1 of a length with itself a little above it. */
 #define MAX_CORRELATION 1.001
 
-#define HEADER_LENGTH 13
-#define SCALARS 10 /* doubles at the end of a plan */
+#define HEADER_LENGTH 17
+#define SCALARS 13 /* doubles at the end of a plan */
 
 static int in_range(int value, int first, int last) { return first <= value && value <= last; }
 
@@ -25,7 +25,7 @@ static int all_keypoints(const int *indices, ptrdiff_t n, int p) {
 
 const char *check_header(const int *h, ptrdiff_t length) {
     if (length < HEADER_LENGTH) return "the header is too short";
-    int p = h[0], layers = h[1], bones = h[11], derivations = h[12];
+    int p = h[0], layers = h[1], bones = h[15], derivations = h[16];
     if (!in_range(p, 1, MAX_KEYPOINTS)) return "the number of keypoints is out of range";
     if (!in_range(layers, 1, MAX_LAYERS)) return "the number of dictionaries is out of range";
     if (!in_range(h[2], 1, MAX_ROTATIONS)) return "the number of rotations is out of range";
@@ -34,6 +34,10 @@ const char *check_header(const int *h, ptrdiff_t length) {
     if (!in_range(h[7], 0, MAX_REFILL)) return "the number of refill rounds is out of range";
     if (!(h[8] == -1 && h[9] == -1) && !all_keypoints(h + 8, 2, p)) return "the reference is no pair of keypoints";
     if (h[10] < 0) return "min_visible is negative";
+    if (!in_range(h[11], 0, 1)) return "a flag is neither 0 nor 1";
+    if (!in_range(h[12], 0, MAX_KEYPOINTS)) return "the fewest keypoints are out of range";
+    if (!in_range(h[13], 0, MAX_CANDIDATES)) return "the number of candidates is out of range";
+    if (!in_range(h[14], 0, MAX_KEYPOINTS)) return "the number of wrong keypoints is out of range";
     if (!in_range(bones, 0, MAX_BONES)) return "the number of bones is out of range";
     if (!in_range(derivations, 0, MAX_DERIVATIONS)) return "the number of derivations is out of range";
     /* All five are bounded: the sum cannot overflow. */
@@ -80,7 +84,8 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     Items f_items = {n_floats, 0}, d_items = {n_doubles, 0};
     k->p = *h++, k->layers = *h++, k->rotations = *h++, k->mirrored = *h++, k->whitened = *h++;
     k->scale_by_rms = *h++, k->corrected = *h++, k->refill_rounds = *h++, k->reference[0] = *h++;
-    k->reference[1] = *h++, k->min_visible = *h++, k->bones = *h++, k->derivations = *h++;
+    k->reference[1] = *h++, k->min_visible = *h++, k->leave_out_wrong = *h++;
+    k->fewest_left = *h++, k->candidates = *h++, k->most_wrong = *h++, k->bones = *h++, k->derivations = *h++;
     int p = k->p, stride = k->stride = FLOATS_OF(p), last;
     k->widths = h, h += k->layers;
     k->partners = h, h += p;
@@ -115,7 +120,8 @@ const char *lay_out(Plan *k, const int *header, const float *floats, const doubl
     if (f_items.exceeded || f_items.left) return "the array of float32 has another length";
     if (d_items.exceeded || d_items.left) return "the array of float64 has another length";
     k->noise = *d++, k->reference_length = *d++, k->unknown_variance = *d++, k->min_relative_depth = *d++;
-    k->residual_scale = *d++, k->residual_offset = *d++, k->trusted_weight = *d++, k->full_ratio = *d++;
+    k->residual_scale = *d++, k->min_residual = *d++, k->residual_ratio = *d++, k->min_distance = *d++;
+    k->residual_offset = *d++, k->trusted_weight = *d++, k->full_ratio = *d++;
     k->extent_offset = *d++, k->min_known = *d++;
     const double *scalars = &d[-SCALARS];
     for (int i = 0; i < SCALARS; i++)
@@ -182,6 +188,8 @@ int lay_out_scratch(Plan *k, char *memory, size_t *size) {
     k->no_growth = room(a, sizeof(double), k->bones, 1);
     for (int b = 0; memory && b < k->bones; b++) k->precision[b] = k->bone_lengths[2 * b] / k->bone_lengths[2 * b + 1];
     k->gap = room(a, sizeof(double), p, 1);
+    k->apart = room(a, sizeof(double), p, 1);
+    k->shown = room(a, sizeof(float), p, 2);
     k->missing = room(a, sizeof(int), p, 1);
     k->incomplete = room(a, sizeof(Object *), n, 1);
     k->objects = room(a, sizeof(Object), n, 1);

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,9 +22,18 @@ from deep_nrsfm_ros.lifting.confidence import (
 )
 from deep_nrsfm_ros.lifting.correction import UNKNOWN_VARIANCE
 from deep_nrsfm_ros.lifting.history import Context
+from deep_nrsfm_ros.lifting.network_smoothing import MAX_AGREEMENT, MAX_TURN
 from deep_nrsfm_ros.lifting.numpy_backend import MIN_RELATIVE_DEPTH, RESIDUAL_SCALE, LifterConstants
 from deep_nrsfm_ros.lifting.options import HistoryOptions
 from deep_nrsfm_ros.lifting.weights import FULL_RATIO, TRUSTED_RATIO
+from deep_nrsfm_ros.lifting.wrong_keypoints import (
+    CANDIDATES,
+    FEWEST,
+    MIN_DISTANCE,
+    MIN_RESIDUAL,
+    MOST,
+    RESIDUAL_RATIO,
+)
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.network import completion_matrix, point_precision
 
@@ -53,6 +63,7 @@ class CompiledBackend:
         header += [constants.covariance is not None]
         header += [constants.refill, *(constants.reference or (-1, -1)), constants.min_visible]
         bones = constants.bones or Bones(np.zeros((2, 0), np.int32), np.zeros(0), np.zeros(0))
+        header += [constants.leave_out_wrong, *(FEWEST, CANDIDATES, MOST)]
         header += [len(bones.lengths), len(constants.derivations), *options.widths]
         header += [*(constants.partners or range(p)), *bones.ends.T.flat]
         header += [*constants.derivations.flat, *constants.bone_partners]
@@ -87,6 +98,7 @@ class CompiledBackend:
             MIN_RELATIVE_DEPTH,
             RESIDUAL_SCALE,
         ]
+        doubles += [MIN_RESIDUAL, RESIDUAL_RATIO, MIN_DISTANCE]
         doubles += [RESIDUAL_OFFSET, TRUSTED_RATIO**6, FULL_RATIO, EXTENT_OFFSET, MIN_KNOWN]
         self._plan = _kernel.plan(
             np.array(header, np.int32), _joined(floats, np.float32), _joined(doubles, np.float64)
@@ -136,6 +148,7 @@ def _history_constants(options: HistoryOptions) -> list[float]:
         *(own_bones.MAX_VARIANCE_REDUCTION, own_bones.MISFIT_TIME, own_bones.MISFIT_RATIO),
         *(own_bones.CHANGE_EVIDENCE, own_bones.DOUBTED_EVIDENCE),
         *(gravity.LEAN_DEVIATION, gravity.FREE_LEAN),
+        *(math.cos(math.radians(MAX_TURN)), MAX_AGREEMENT),
     ]
 
 

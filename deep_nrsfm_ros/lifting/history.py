@@ -42,17 +42,18 @@ class StateLayout(NamedTuple):
     @property
     def size(self) -> int:
         """Numbers of a row."""
-        return 12 + 3 * self.p + 2 * self.b
+        return 13 + 3 * self.p + 2 * self.b
 
     def split(self, rows: Floats) -> State:
         """Return the parts of rows (n, size), as views of their memory."""
-        shape_end = 12 + 3 * self.p
+        shape_end = 13 + 3 * self.p
         n = len(rows)
         return State(
             rows[:, 0],
             rows[:, 1:3],
-            rows[:, 3:12].reshape(n, 3, 3),
-            rows[:, 12:shape_end].reshape(n, self.p, 3),
+            rows[:, 3],
+            rows[:, 4:13].reshape(n, 3, 3),
+            rows[:, 13:shape_end].reshape(n, self.p, 3),
             rows[:, shape_end : shape_end + self.b],
             rows[:, shape_end + self.b :],
         )
@@ -64,6 +65,8 @@ class State(NamedTuple):
     Attributes:
         time: (n,) of the last frame, seconds; NaN: there was none.
         misfit: (n, 2) recent deviation of the bones from the learned lengths, and from the model's.
+        agreement: (n,) seconds for which the network has agreed with the rotation that is
+            remembered; see `network_smoothing.weigh_turns`.
         rotation: (n, 3, 3) smoothed, from object to camera axes.
         shape: (n, p, 3) smoothed, in object axes, in units of the network.
         growth: (n, b) logarithm of each bone's length relative to the model's.
@@ -72,6 +75,7 @@ class State(NamedTuple):
 
     time: Floats
     misfit: Floats
+    agreement: Floats
     rotation: Floats
     shape: Floats
     growth: Floats

@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.lifting.correction import ErrorModel
 from deep_nrsfm_ros.lifting.gravity import Upright
 from deep_nrsfm_ros.lifting.history import MAX_BACK, MAX_GAP, Context, State, StateLayout
-from deep_nrsfm_ros.lifting.network_smoothing import smooth_rotations, smooth_shapes
+from deep_nrsfm_ros.lifting.network_smoothing import (
+    smooth_rotations,
+    smooth_shapes,
+    weigh_turns,
+)
 from deep_nrsfm_ros.lifting.own_bones import Learned, learn, measure, own_bones
 from deep_nrsfm_ros.nrsfm.geometry import Floats
 
@@ -72,6 +76,13 @@ class HistoryUpdate:
         self._updates &= np.isfinite(shape).all((1, 2))
         moves = self._goes_on & self._updates & np.isfinite(state.shape).all((1, 2))
         times = options.shape_time, options.hidden_time
+        agreement = np.zeros(n)
+        if options.rotation_time:
+            held, begins, agreement[moves] = weigh_turns(
+                state.rotation[moves], rotation[moves], state.agreement[moves], self._seconds[moves]
+            )
+            self._hold(moves, held, shape, rotation)
+            moves[moves] = ~(held | begins)
         shape[moves] = smooth_shapes(
             state.shape[moves], shape[moves], visible[moves], self._seconds[moves], times
         )
@@ -79,9 +90,29 @@ class HistoryUpdate:
             state.rotation[moves], rotation[moves], self._seconds[moves], options.rotation_time
         )
         self._new = self._new._replace(
-            time=np.full(n, self._context.time), shape=shape, rotation=rotation
+            time=np.full(n, self._context.time),
+            agreement=agreement,
+            shape=shape,
+            rotation=rotation,
         )
         return (shape + mean).astype(S.dtype), (self._to_view @ rotation).astype(R.dtype)
+
+    def _hold(
+        self, moves: NDArray[np.bool_], held: NDArray[np.bool_], S: Floats, R: Floats
+    ) -> None:
+        """Put what is remembered of the held ones in the place of S and R, at the size of S.
+
+        Args:
+            moves: (n,) objects that go on.
+            held: (m,) those of them whose new rotation is not believed.
+            S: (n, p, 3) centred shapes.
+            R: (n, 3, 3).
+        """
+        rows = np.flatnonzero(moves)[held]
+        known = self._state.shape[rows]
+        visible = np.zeros(known.shape[:2], bool)
+        S[rows] = smooth_shapes(known, S[rows], visible, np.zeros(len(rows)), (1.0, 1.0))
+        R[rows] = self._state.rotation[rows]
 
     def learn(self, X: Floats, R: Floats, weight: Floats) -> None:
         """Learn the lengths of the bones from the first stage X (n, p, 3) of the correction."""

@@ -337,6 +337,7 @@ def _constants(
         reference_length=options.length_for(model.layout),
         reference=pair and (model.layout.index(pair[0]), model.layout.index(pair[1])),
         min_visible=options.min_visible,
+        leave_out_wrong=options.leave_out_wrong,
         derivations=to_model.derivations,
         history=history,
         bone_partners=partner_bones(ends, model.layout.sides()),

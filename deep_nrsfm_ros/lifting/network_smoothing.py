@@ -8,6 +8,9 @@ follows slowly. A filter after the correction would lag in the image.
 
 A keypoint that is missing in the image keeps its place in the object for longer.
 
+Where a network turns an object over from one frame to the next, as a person whose front it takes
+for the back, no smoothing helps: the mean of both is neither. So frames vote.
+
 Symbols: n objects, p keypoints, S (n, p, 3) shapes in object axes, R (n, 3, 3) from object axes to
 those of the camera.
 
@@ -20,6 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.nrsfm.geometry import Floats, rotation_from_vector, rotation_vector
+from deep_nrsfm_ros.nrsfm.metrics import rotation_angles
+
+MAX_TURN = 60.0
+"""Degrees from the remembered rotation to a new one above which a frame is taken for turned."""
+MAX_AGREEMENT = 0.5
+"""Most seconds for which turned frames are not believed."""
 
 
 def gain(seconds: Floats, time_constant: float) -> Floats:
@@ -53,6 +62,27 @@ def smooth_shapes(
     seen, hidden = (gain(seconds, time)[:, None] for time in times)
     smoothed: Floats = predicted + np.where(visible, seen, hidden)[..., None] * (S - predicted)
     return smoothed
+
+
+def weigh_turns(
+    previous: Floats, R: Floats, agreement: Floats, seconds: Floats
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Floats]:
+    """Return which new rotations are not believed, which are begun anew with, and the agreement.
+
+    The agreement is the time for which the network has found rotations near the remembered one, at
+    most `MAX_AGREEMENT`. The time of turned frames is taken off. While some is left, the object
+    stays as it is remembered; when it is used up, the new rotation is the remembered one.
+
+    Args:
+        previous: (n, 3, 3) remembered rotations.
+        R: (n, 3, 3) new rotations.
+        agreement: (n,) seconds, before the frame.
+        seconds: (n,) since the last frames.
+    """
+    turned = rotation_angles(R @ previous.swapaxes(1, 2)) > MAX_TURN
+    left = np.where(turned, agreement - seconds, np.minimum(agreement + seconds, MAX_AGREEMENT))
+    begins = turned & ~(left > 0)
+    return turned & ~begins, begins, np.where(begins, 0, left)
 
 
 def smooth_rotations(previous: Floats, R: Floats, seconds: Floats, time: float) -> Floats:

@@ -22,6 +22,7 @@ from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.history_update import HistoryUpdate
 from deep_nrsfm_ros.lifting.options import HistoryOptions
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, relative_confidence, trusted
+from deep_nrsfm_ros.lifting.wrong_keypoints import MIN_RESIDUAL, Fit, without_wrong
 from deep_nrsfm_ros.nrsfm.bones import Bones
 from deep_nrsfm_ros.nrsfm.geometry import (
     centre,
@@ -63,6 +64,7 @@ class LifterConstants(NamedTuple):
             `reference` is None.
         reference: indices of the reference pair; None: the RMS radius is the reference.
         min_visible: objects with fewer detected keypoints are not lifted.
+        leave_out_wrong: whether keypoints that contradict the others are taken as missing.
         derivations: (m, 2) keypoints that do not count as detected, as in `KeypointMap`.
         history: time constants of what is remembered.
         bone_partners: (b,) of each bone the one of the other side; see `own_bones`.
@@ -83,6 +85,7 @@ class LifterConstants(NamedTuple):
     reference_length: float
     reference: tuple[int, int] | None
     min_visible: int
+    leave_out_wrong: bool
     derivations: NDArray[np.int32]
     history: HistoryOptions
     bone_partners: NDArray[np.int32]
@@ -137,7 +140,6 @@ class NumpyBackend:
         """
         weight = keypoint_weight(confidence)
         visible = trusted(weight)
-        seen = Keypoints(points, weight, visible, perspective)
         not_lifted = on_one_line(points, visible)
         not_lifted |= (
             detected_count(visible, self.constants.derivations) < self.constants.min_visible
@@ -145,6 +147,11 @@ class NumpyBackend:
         history = None
         if context is not None and self.constants.covariance is not None:
             history = HistoryUpdate(self.constants, context, not_lifted)
+        if self.constants.leave_out_wrong:
+            right = self._without_wrong(points, visible, perspective)
+            weight[visible & ~right] = 0
+            visible = right
+        seen = Keypoints(points, weight, visible, perspective)
         mask = visible[..., None].astype(np.float32)
         complete = np.ones_like(mask)
         rounds = 0 if visible.all() else self.constants.refill
@@ -170,6 +177,35 @@ class NumpyBackend:
         S *= self.constants.reference_length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
         return (S, R, scale, translation, residual, probability), not_lifted
+
+    def _without_wrong(
+        self, points: Float32, visible: NDArray[np.bool_], perspective: bool
+    ) -> NDArray[np.bool_]:
+        """Return which visible keypoints (n, p) do not contradict the others."""
+        constants = self.constants
+        right = visible.copy()
+        for i in np.flatnonzero(self._fit(points, visible, perspective).residual > MIN_RESIDUAL):
+
+            def fit(shown: NDArray[np.bool_], own: Float32 = points[i, None]) -> Fit:
+                return Fit(*(part[0] for part in self._fit(own, shown[None], perspective)))
+
+            pairs, fewest = constants.derivations, constants.min_visible
+            right[i] = without_wrong(fit, points[i], visible[i], pairs, fewest)
+        return right
+
+    def _fit(self, points: Float32, visible: NDArray[np.bool_], perspective: bool) -> Fit:
+        """Return the network's fit of n objects to their visible keypoints (n, p)."""
+        constants, shown = self.constants, visible[..., None]
+        W, gain, unit, origin = normalise(
+            constants.network, constants.normaliser, points, shown.astype(np.float32)
+        )
+        S, _, residual = self._average(gain * W, W, visible, unit if perspective else None)
+        P = S[..., :2]
+        if perspective:
+            P = P / np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
+        radius = np.sqrt((W * W * shown).sum((1, 2)) / np.maximum(visible.sum(1), 1))
+        apart = np.linalg.norm((points - origin) / unit - P, axis=2)
+        return Fit(residual, apart / np.maximum(radius, np.float32(1e-9))[:, None])
 
     def _solve(
         self,

@@ -68,6 +68,12 @@ class LiftingOptions:
         low=3,
         high=1000,
     )
+    leave_out_wrong: bool = option(
+        True,
+        "whether a keypoint at a wrong place is taken as missing: one without which the network "
+        "fits the others much better, and which is far from where they say that it should be; at "
+        "least 8 detected keypoints must be left, and at most 3 of an object are left out",
+    )
     reference_length: float = option(
         0.0,
         "length in the output of the layout's reference pair (of people: neck to mid-hip), or of "

@@ -23,7 +23,7 @@ class Recipe:
     steps: int = option(
         AUTOMATIC,
         "gradient steps of the training; -1 = 30000 from random weights; where it starts from a "
-        "model of the same keypoints a third of the number of frames, at least 300, of other "
+        "model of the same keypoints a third of the number of frames, at least 100, of other "
         "keypoints ten times as many, at most 30000; 0 = keep the network of the model to start "
         "from and learn only its error covariance and bones anew",
         low=AUTOMATIC,

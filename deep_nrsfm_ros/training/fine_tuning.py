@@ -35,7 +35,7 @@ RARELY_SHOWN = "rarely_shown"
 _FEWEST = 4  # keypoints, as for lifting: fewer than a tetrahedron has are no 3D shape
 
 _FRAMES_A_STEP = 3  # 64 a batch are 21 passes over the frames
-_MIN_STEPS = 300
+_MIN_STEPS = 100
 _WITHOUT_WHITENING = 10  # times as many steps, as new keypoints are learned from nothing
 
 

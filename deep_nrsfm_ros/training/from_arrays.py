@@ -103,7 +103,7 @@ def train(
         start: model to start from, its name or its file. "" is a model that comes with the package
             and has most keypoints of the layout, if there is one; "none" is random weights.
         recipe: steps, seed and all else of the training; None stands for the defaults: from a
-            model of the same keypoints a step for each three frames, at least 300 steps; from
+            model of the same keypoints a step for each three frames, at least 100 steps; from
             random weights 30000 steps, which take minutes. `Recipe(steps=3000, seed=1)` is a first
             look.
         sequence_starts: first frames of the recordings, views or people in the points, the frames

@@ -25,8 +25,8 @@ COMPILED: Any = kernel._kernel  # the calls break its signatures
 REFUSALS = (TypeError, ValueError, RuntimeError)
 HUGE = (2**31 - 1, 2**32, 2**60, 2**62, 2**63 - 1, 2**63, -(2**63), 2**70, -(2**70))
 OBJECTS: tuple[Any, ...] = (None, "x", b"", 1.5, object(), [], (), 10**400, datetime.datetime_CAPI)
-PAST = 17  # constants of what is remembered
-COEFFICIENTS, SCALARS = 7, 10  # of the confidence; numbers at the end of a plan
+PAST = 19  # constants of what is remembered
+COEFFICIENTS, SCALARS = 7, 13  # of the confidence; numbers at the end of a plan
 GUARD, GUARDED = 64, 77  # items before and after an output, and their value
 
 Arguments = list[Any]
@@ -82,8 +82,9 @@ def plan(spoiler: Spoiler, network: Sizes | None = None) -> Arguments:
     reference = spoiler.choice(([-1, -1], [0, p - 1]))
     flags = [spoiler.randint(0, 1) for _ in range(4)]
     derivations = spoiler.choice((0, 0, 1, 3))
-    header = [p, len(widths), rotations, *flags, spoiler.randint(0, 2), *reference, 3, bones]
-    header += [derivations]
+    header = [p, len(widths), rotations, *flags, spoiler.randint(0, 2), *reference, 3]
+    wrong = [spoiler.randint(0, 1), spoiler.randint(0, p), spoiler.randint(0, 8), 3]
+    header += [*wrong, bones, derivations]
     header += [*widths, *spoiler.sample(range(p), p)]
     header += [spoiler.randrange(p) for _ in range(2 * (bones + derivations))]
     header += [spoiler.randrange(bones) for _ in range(bones)]
@@ -111,7 +112,7 @@ def lift(spoiler: Spoiler, network: Sizes | None = None, made: object = None) ->
     if made is None:
         arguments = plan(spoiler, network)
         made = COMPILED.plan(*arguments)
-        context = spoiler.choice((None, history(spoiler, n, p, int(arguments[0][11]))))
+        context = spoiler.choice((None, history(spoiler, n, p, int(arguments[0][15]))))
     perspective = spoiler.choice((False, True))
     return [made, floats(spoiler, n, p, 2), confidence, perspective, context, *arrays]
 
@@ -119,7 +120,7 @@ def lift(spoiler: Spoiler, network: Sizes | None = None, made: object = None) ->
 def history(spoiler: Spoiler, n: int, p: int, bones: int) -> tuple[Any, ...]:
     """Return a context of n objects; some of its states are random, some of objects to come."""
     capacity = spoiler.choice((0, 1, 5))
-    states = output(capacity, 12 + 3 * p + 2 * bones, dtype=np.float64)
+    states = output(capacity, 13 + 3 * p + 2 * bones, dtype=np.float64)
     states[:] = floats(spoiler, *states.shape)
     states[: spoiler.randint(0, 5)] = np.nan
     rows = np.array([spoiler.randrange(-1, capacity) for _ in range(n)], np.int32)

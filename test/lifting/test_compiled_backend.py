@@ -119,6 +119,7 @@ each_vectors = [HealthCheck.function_scoped_fixture]
         test_time_rotations=st.integers(1, 5),
         test_time_mirror=st.booleans(),
         min_visible=st.integers(3, 5),
+        leave_out_wrong=st.booleans(),
         reference_length=st.sampled_from([0.0, 2.0]),
     ),
     missing=st.sampled_from([0.0, 0.3, 0.7, 1.0]),

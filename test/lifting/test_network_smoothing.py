@@ -3,12 +3,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from deep_nrsfm_ros.lifting.network_smoothing import gain, smooth_rotations, smooth_shapes
-from deep_nrsfm_ros.nrsfm.geometry import centre
+from deep_nrsfm_ros.lifting.network_smoothing import (
+    MAX_AGREEMENT,
+    gain,
+    smooth_rotations,
+    smooth_shapes,
+    weigh_turns,
+)
+from deep_nrsfm_ros.nrsfm.geometry import Floats, centre
 
 RNG = np.random.default_rng(0)
 S = centre(RNG.standard_normal((1, 6, 3)))
@@ -64,3 +72,38 @@ def test_rotations_go_the_short_way_at_one_speed() -> None:
     np.testing.assert_allclose(
         left.magnitude(), (1 - np.exp(-1)) * step.magnitude(), rtol=1e-6, atol=1e-9
     )
+
+
+def votes(degrees: Sequence[float], seconds: float) -> str:
+    """Return what becomes of each frame: "." it is smoothed, "h" it is not believed, "n" anew.
+
+    Args:
+        degrees: angle of each new rotation; the first is remembered.
+        seconds: between the frames.
+    """
+    rotations = Rotation.from_euler("y", degrees, degrees=True).as_matrix()[:, None]
+    remembered, became = rotations[0], ""
+    agreement: Floats = np.zeros(1)
+    for R in rotations[1:]:
+        held, begins, agreement = weigh_turns(remembered, R, agreement, np.array([seconds]))
+        remembered = remembered if held[0] else R
+        became += "h" if held[0] else "n" if begins[0] else "."
+    return became
+
+
+def test_a_few_turned_frames_are_not_believed() -> None:
+    assert votes([0] * 9 + [180] * 3 + [0] * 3, 1 / 30) == "." * 8 + "hhh" + "..."
+
+
+def test_an_object_that_has_turned_is_believed_after_a_while() -> None:
+    became = votes([0] * 60 + [100] * 30, 1 / 30)[59:]
+    assert became == "h" * 15 + "n" + "." * 14  # 15 frames are half a second
+    assert became.index("n") / 30 == pytest.approx(MAX_AGREEMENT)
+
+
+def test_a_short_wrong_beginning_is_outvoted() -> None:
+    assert votes([180, 180, 0, 0, 0, 0], 1 / 30) == ".n..."
+
+
+def test_slow_streams_are_believed_at_once() -> None:
+    assert votes([0, 0, 100, 200], MAX_AGREEMENT) == ".nn"

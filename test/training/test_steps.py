@@ -26,6 +26,11 @@ def test_a_training_from_a_model_takes_few_steps_and_more_for_more_frames() -> N
     assert counts[2] < FROM_RANDOM / 10 and counts[-1] == FROM_RANDOM
 
 
+def test_a_training_of_few_frames_takes_few_steps() -> None:
+    assert [steps(frames) for frames in (1, 300, 411)] == [100, 100, 137]
+    assert [steps(frames, OTHER_KEYPOINTS) for frames in (1, 411)] == [1000, 1370]
+
+
 @pytest.mark.parametrize("frames", [1, 1000, 10_000_000])
 def test_other_keypoints_need_more(frames: int) -> None:
     assert steps(frames) <= steps(frames, OTHER_KEYPOINTS) <= steps(frames, None) == FROM_RANDOM

@@ -78,8 +78,8 @@ def test_a_row_for_each_recipe(tmp_path: Path, start: Model) -> None:
     assert [row.labels for row in table.rows] == [
         ("clip", "0", ""),
         ("clip", "1", "0.6"),
-        ("clip", "300, default", "0.0"),
-        ("clip", "300, default", "0.6"),
+        ("clip", "100, default", "0.0"),
+        ("clip", "100, default", "0.6"),
     ]
     later = fine_tuning.read("clip", tmp_path)[1]
     first, *others = (row.figures for row in table.rows)

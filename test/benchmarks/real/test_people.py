@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.data import people_scenes
-from benchmarks.data.people_scenes import Track, filmed, noisy
+from benchmarks.data.people_scenes import Track, displaced, filmed, lightly_noisy, noisy
 from benchmarks.real import people
 from benchmarks.real.mediapipe_comparison import mean_person
 from deep_nrsfm_ros.data.pose2sim import JOINTS
@@ -93,6 +93,31 @@ def test_noise_hides_and_moves_keypoints(walking: Any) -> None:
     assert (shown[:, neck] <= shown[:, shoulders[0]]).all()
 
 
+def test_displaced_keypoints_are_a_share_and_stay_for_a_while(walking: Any) -> None:
+    exact = filmed(walking(3000), 0.0, 1)
+    moved = displaced(exact, 0.05, 2)
+    apart = np.linalg.norm(moved.points - exact.points, axis=2) > 0
+    assert apart.mean() == pytest.approx(0.05, rel=0.2)
+    lasting = apart[1:] & apart[:-1]
+    offset = moved.points - exact.points
+    size = np.sqrt(np.square(exact.points - exact.points.mean(1, keepdims=True)).sum(2).mean(1))
+    relative = offset / size[:, None, None]
+    np.testing.assert_allclose(relative[1:][lasting], relative[:-1][lasting])
+    assert relative[apart].std() == pytest.approx(people_scenes.GROSS, rel=0.1)
+
+
+def test_light_noise_is_new_in_each_frame(walking: Any) -> None:
+    exact = filmed(walking(3000), 0.0, 1)
+    track = lightly_noisy(exact, 2)
+    shown = (track.confidence > 0)[:, LIMBS]
+    assert 1 - shown.mean() == pytest.approx(people_scenes.LIGHT_DROPOUTS, rel=0.3)
+    size = np.sqrt(np.square(exact.points - exact.points.mean(1, keepdims=True)).sum(2).mean(1))
+    error = ((track.points - exact.points) / size[:, None, None])[:, LIMBS]
+    assert error[shown].std() == pytest.approx(people_scenes.LIGHT_NOISE, rel=0.1)
+    both = shown[1:] & shown[:-1]
+    assert abs(np.corrcoef(error[1:][both].ravel(), error[:-1][both].ravel())[0, 1]) < 0.05
+
+
 def write_shelf(folder: Path, motion: np.ndarray) -> None:
     """Write a scene of one person before two cameras, in the layout BODY25."""
     folder.mkdir(parents=True)
@@ -156,7 +181,7 @@ def test_the_program_prints_a_row_for_each_system(
     assert "no rows of the pose2sim clip: no clip here" in printed
     rows = list(csv.DictReader((tmp_path / "out" / "people.csv").open()))
     systems = {(row["scene"], row["system"], row["intrinsics"]) for row in rows}
-    names = ("shelf_dev", "CMU 03, 131", "CMU 03, 131, still")
+    names = ("shelf_dev", "CMU 03, 131", "CMU 03, 131, light noise", "CMU 03, 131, still")
     known = ("yes", "0.5", "no")
     assert systems == {
         *((scene, system, i) for scene in names for system in chosen for i in known),
