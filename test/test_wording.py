@@ -34,6 +34,7 @@ NOT_SAID = {
     ("lifting/observation.py", "--keypoint-layout"): "of a message",
     ("lifting/options.py", "image_width"): "of the node",
     ("messages/field_mapping.py", "image_width"): "of a message",
+    ("model_files/matching_model.py", "--model"): "of what is lifted",
 }
 """Options that files of Python's `train` name by the words of the programs alone, and why."""
 
