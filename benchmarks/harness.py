@@ -234,12 +234,21 @@ def run_program(
     subjects: Sequence[str],
     argv: Sequence[str] | None = None,
     seeds: Sequence[int] = (0, 1),
+    own: argparse.ArgumentParser | None = None,
 ) -> None:
     """Run a benchmark as a program: parse options, print and write its table.
 
     Exit code 2 for bad input.
+
+    Args:
+        benchmark: returns the table of a session.
+        description: of the program.
+        subjects: default of --subjects.
+        argv: the command line without the options of `own`; None: that of the process.
+        seeds: default of --seeds.
+        own: options of this benchmark alone, which --help lists too.
     """
-    parser = argparse.ArgumentParser(description=description)
+    parser = argparse.ArgumentParser(description=description, parents=[own] if own else [])
     parser.add_argument("--data", type=Path, required=True, help="folder that holds cmu/")
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
     parser.add_argument("--subjects", nargs="+", default=list(subjects), help="CMU subjects")
@@ -286,4 +295,13 @@ def run_program(
         few_frames=args.few_frames,
         limb_exchange=args.limb_exchange,
     )
-    print_tables(lambda: [benchmark(session)], session.output)
+    print_tables(lambda: [shortened(benchmark(session), session)], session.output)
+
+
+def shortened(table: Table, session: Session) -> Table:
+    """Return the table; its title says what a session of fewer steps or frames has left out."""
+    said = [f"{session.steps} steps a training (--steps)"] * bool(session.steps)
+    said += [f"each frame of {session.stride} (--stride)"] * (session.stride > 1)
+    if said:
+        table.title += f"; shortened: {', '.join(said)}"
+    return table

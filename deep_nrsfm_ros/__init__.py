@@ -18,12 +18,15 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
 __all__ = [
+    "HistoryOptions",
+    "Intrinsics",
     "KeypointLayout",
     "Lifted",
     "Lifter",
     "LiftingOptions",
     "Model",
     "Recipe",
+    "VideoLifter",
     "__version__",
     "load_model",
     "save_model",
@@ -31,20 +34,25 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from deep_nrsfm_ros.data.video_lifter import VideoLifter
     from deep_nrsfm_ros.layouts.layout import KeypointLayout
+    from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
     from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
-    from deep_nrsfm_ros.lifting.options import LiftingOptions
+    from deep_nrsfm_ros.lifting.options import HistoryOptions, LiftingOptions
     from deep_nrsfm_ros.model_files.model_file import Model, load_model, save_model
     from deep_nrsfm_ros.nrsfm.recipe import Recipe
     from deep_nrsfm_ros.training.from_arrays import train
 
 _HOMES = {
+    "HistoryOptions": "lifting.options",
+    "Intrinsics": "lifting.intrinsics",
     "KeypointLayout": "layouts.layout",
     "Lifted": "lifting.lifter",
     "Lifter": "lifting.lifter",
     "LiftingOptions": "lifting.options",
     "Model": "model_files.model_file",
     "Recipe": "nrsfm.recipe",
+    "VideoLifter": "data.video_lifter",
     "load_model": "model_files.model_file",
     "save_model": "model_files.model_file",
     "train": "training.from_arrays",

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from deep_nrsfm_ros.commands import demo, doctor, evaluate, lift, models, replay, train
+from deep_nrsfm_ros.commands import demo, doctor, echo, evaluate, lift, models, replay, train
 from deep_nrsfm_ros.commands.cli import PROGRAMS
 from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.curation import Curation
@@ -75,6 +75,7 @@ PARSERS: dict[str, Callable[[], argparse.ArgumentParser]] = {
     "evaluate": evaluate.arguments,
     "models": models.arguments,
     "replay": replay.arguments,
+    "echo": echo.arguments,
     "doctor": doctor.arguments,
 }
 """The parser of each program that has one."""
@@ -188,8 +189,15 @@ def troubleshooting_page() -> str:
                 "`lift` says them at its end.",
                 "\n".join(kinds),
                 "## Nothing comes out\n\n`ros2 topic echo --once /diagnostics` names the topic, "
-                "the number of messages received and dropped, and the last reason. A message that "
-                "cannot be used is never answered by a guess.",
+                "the numbers of messages, and the last reason. A message that cannot be used is "
+                "never answered by a guess.",
+                "| on `/diagnostics` | counts since the start |\n|---|---|\n"
+                "| messages lifted | answered |\n"
+                "| messages without objects | received, nobody in them; not answered |\n"
+                "| messages rejected | received, and not usable: malformed, or no object with "
+                "enough keypoints; `last problem` says why; not answered |\n"
+                "| messages dropped | sent, and never received: they came while another was "
+                "lifted, or were lost on the way |",
             ]
         )
         + "\n"
@@ -369,9 +377,18 @@ _API: tuple[tuple[str, tuple[str, ...]], ...] = (
             "model_files.model_file:load_model",
             "lifting.lifter:Lifter",
             "lifting.lifter:Lifter.__call__",
-            "lifting.lifter:Lifter.lift",
             "lifting.lifter:Lifted",
             "lifting.options:LiftingOptions",
+        ),
+    ),
+    (
+        "Lifting with a camera, over time",
+        (
+            "data.video_lifter:VideoLifter",
+            "data.video_lifter:VideoLifter.__call__",
+            "lifting.intrinsics:Intrinsics",
+            "lifting.intrinsics:Intrinsics.from_field_of_view",
+            "lifting.options:HistoryOptions",
         ),
     ),
     (
@@ -385,6 +402,25 @@ _API: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("Training", ("training.from_arrays:train", "nrsfm.recipe:Recipe")),
 )
 """Sections of the Python API, and the module and the name of each entry."""
+_INTRODUCTIONS = {
+    "Lifting with a camera, over time": """\
+`Lifter` lifts each object by itself and centres it. `VideoLifter` puts it at its place before
+the camera, and remembers it from frame to frame, as the ROS node does:
+
+    from deep_nrsfm_ros import Intrinsics, Lifter, VideoLifter
+    camera = Intrinsics((1000, 1000), (640, 360))  # fx, fy and cx, cy in pixels
+    camera = Intrinsics.from_field_of_view(65, (1280, 720))  # or roughly: degrees of the width
+    video = VideoLifter(Lifter("human", layout="coco17"), camera)
+    for i, frame in enumerate(points):  # a person, or (n, 17, 2) of n people
+        lifted = video(frame, seconds=i / 30)
+        print(video.identities, lifted.shapes[0, 0])  # metres, from the camera
+
+Without `seconds` each object is lifted by itself: `video(points)` lifts all frames at once.
+[lift_video.py](../../examples/lift_video.py) does it with a real video and its calibration, and
+measures the answer against the true 3D with `nrsfm.metrics`; put your own arrays
+(frames, keypoints, 3) there.""",
+}
+"""Text at the beginning of a section of the Python API."""
 _MODULES = (
     *("network", "geometry", "normalisation", "losses", "metrics", "handedness", "neighbours"),
     *("bones", "recipe"),
@@ -392,6 +428,7 @@ _MODULES = (
 """Modules of `deep_nrsfm_ros.nrsfm` that the page lists."""
 _OF_PARAMETERS = {
     "LiftingOptions": "lifting",
+    "HistoryOptions": "lifting-over-time",
     "Recipe": "training-recipe",
 }
 """Dataclasses whose fields are parameters too, and the section of those."""
@@ -422,7 +459,8 @@ def python_page() -> str:
         "end. `help(NAME)` and [the API in full](python_full.md) have results and errors too.",
     ]
     for title, entries in _API:
-        parts += [f"## {title}", *map(_entry, entries)]
+        introduction = [_INTRODUCTIONS[title]] if title in _INTRODUCTIONS else []
+        parts += [f"## {title}", *introduction, *map(_entry, entries)]
     rows = ["| module | content |", "|---|---|"]
     for name in _MODULES:
         module = importlib.import_module(f"deep_nrsfm_ros.nrsfm.{name}")

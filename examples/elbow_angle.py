@@ -24,4 +24,5 @@ rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # its own ones break
 node = rclpy.create_node("elbow_angle")
 node.create_subscription(JointState, "lifter/joint_states", show, qos_profile_sensor_data)
 print("waiting for joints of the lifter on /lifter/joint_states", flush=True)
-rclpy.spin(node)
+while True:
+    rclpy.spin_once(node, timeout_sec=0.1)  # rclpy.spin would hold Ctrl-C back

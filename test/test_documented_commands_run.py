@@ -40,9 +40,11 @@ NOT_RUN = {
     r"train .*door.yaml": "that of README.md with another name",
     r"train --resume": "needs a training that was cut off; test/training/test_resume.py",
     r"replay --serve": "serves until Ctrl-C; test/commands/test_replay.py, test_lifter_client.py",
+    r"echo": "prints until Ctrl-C; test/node/test_points_text.py",
     r"doctor": "starts two processes; test/commands/test_doctor.py",
     r"demo": "test/commands/test_demo.py",
     r"lifter .*--enclave": "needs a keystore; test/node/test_security_policy.py",
+    r"lifter .*target_frame:=base_link$": "needs tf2_msgs of ROS; test/node/test_target_frame.py",
     r"lifter .*ros2 pkg": "needs a detector's package; test/messages/test_field_mapping.py",
     r"mediapipe_detector": "needs MediaPipe; test/examples/test_mediapipe_detector.py",
 }

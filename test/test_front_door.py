@@ -72,6 +72,17 @@ def test_the_lines_of_the_readme_run() -> None:
     assert np.isfinite(variables["lifted"].shapes).all()
 
 
+def test_the_lines_of_the_python_page_on_videos_run() -> None:
+    page = (ROOT / "docs/reference/python.md").read_text()
+    section = page.split("## Lifting with a camera, over time\n")[1].split("\n## ")[0]
+    lines = [line[4:] for line in section.splitlines() if line.startswith("    ")]
+    variables: dict[str, Any] = {"points": pixels(3, 17)}
+    exec("\n".join(lines), variables)
+    assert np.isfinite(variables["lifted"].shapes).all() and variables["lifted"].shapes[0, 0, 2] > 0
+    lifted = variables["video"](pixels(3, 17))
+    assert lifted.shapes.shape == (3, 25, 3)
+
+
 def test_one_object_and_many_in_any_dtype(human: Model) -> None:
     lifter, points = Lifter(human), pixels(100, 25)
     many = lifter(points)
@@ -165,7 +176,8 @@ def test_an_array_becomes_a_model_that_lifts(
     assert {warning.filename for warning in warned} == {__file__}
     assert ["factorisations" in message for message in messages] == [True, False]
     assert messages[-1] == model.provenance["judgement"]["reason"]
-    assert "look at its shapes from the side, or name a handedness" in messages[-1]
+    undo = "if it is one, lift with LiftingOptions.mirrored=True., or name a handedness"
+    assert re.search(f"look at its shapes from the side; {undo}", messages[-1])
     assert model.name == "thing" and model.layout == layout and progress
     assert "rival" not in model.provenance["judgement"]  # no model has such an object
     assert np.isfinite(Lifter(model)(points[:3]).shapes).all()

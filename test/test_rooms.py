@@ -34,9 +34,14 @@ FLOORS = (
 """The rooms from the ground up: a room imports itself and what is below it."""
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 FRONT_DOOR = {"__init__", "__main__"}
-ROS_PROGRAMS = {"commands/demo/client.py", "commands/replay.py"}
+ROS_PROGRAMS = {"commands/demo/client.py", "commands/echo.py", "commands/replay.py"}
 """The programs that import ROS themselves."""
-NODE_CLIENTS = {"commands/doctor.py", "commands/lifter.py", "commands/replay.py"}
+NODE_CLIENTS = {
+    "commands/doctor.py",
+    "commands/echo.py",
+    "commands/lifter.py",
+    "commands/replay.py",
+}
 """The programs that import the node's room."""
 ROS = ("rclpy", "rosidl", "builtin_interfaces", "rcl_interfaces", "std_srvs", "tf2_ros")
 

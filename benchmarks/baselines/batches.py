@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.baselines.methods import BASELINES, BATCH, Setting, shuffled_batches
-from benchmarks.harness import Session
+from benchmarks.harness import LIFTING_LEGEND, Session
 from benchmarks.table import Table
 from deep_nrsfm_ros.commands.evaluate import figures
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -87,8 +87,20 @@ def chosen(session: Session) -> list[str]:
     return [name for name in BASELINES if words is None or any(word in name for word in words)]
 
 
-def add_total(table: Table) -> None:
-    """Add the CPU time of all baselines of the table to its legend."""
+def complete_legend(table: Table) -> None:
+    """Leave notes of rows that the table has not out of its legend; add the baselines' CPU time."""
+    rows = [label for row in table.rows for label in row.labels if label[:7] != "paper: "]
+    known = {*LIFTING_LEGEND, *BASELINES}
+
+    def is_of_a_row(name: str) -> bool:
+        words = [name] if name in known else name.split(", ")
+        return any(word in row for word in words for row in rows)
+
+    table.legend = {
+        name: text
+        for name, text in table.legend.items()
+        if name not in LIFTING_LEGEND | LEGEND or is_of_a_row(name)
+    }
     minutes = [row.figures["CPU min"] for row in table.rows if "ms" in row.figures]
     if minutes:
         table.legend = {

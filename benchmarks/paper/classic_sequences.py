@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.baselines.batches import add_total, true_shapes
+from benchmarks.baselines.batches import complete_legend, true_shapes
 from benchmarks.baselines.methods import block_matrix, em_ppca, rigid
 from benchmarks.data import mat_files
 from benchmarks.data.synthetic_furniture import CATEGORIES
@@ -171,7 +171,7 @@ def benchmark(session: Session) -> Table:
             if session.baselines is None or any(word in method for word in session.baselines):
                 label, row = factorised(session, method, sequence)
                 table.add((*labels, label), row)
-    add_total(table)
+    complete_legend(table)
     return table
 
 

@@ -132,14 +132,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(add_help=False)
     recipes = (*_RECIPES, _PAPER)
-    parser.add_argument("--recipes", nargs="+", choices=recipes, default=recipes)
+    parser.add_argument(
+        "--recipes", nargs="+", choices=recipes, default=recipes, help="these alone"
+    )
     chosen, others = parser.parse_known_args(argv)
-    description = (
-        f"{__doc__}\nWith --recipes NAME ... those alone: {', '.join(map(repr, recipes))}."
-    )
-    run_program(
-        partial(benchmark, recipes=chosen.recipes), description, SUBJECTS, others, seeds=SEEDS
-    )
+    make = partial(benchmark, recipes=chosen.recipes)
+    run_program(make, __doc__, SUBJECTS, others, seeds=SEEDS, own=parser)
 
 
 if __name__ == "__main__":

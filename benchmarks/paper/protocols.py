@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.baselines.batches import SPENT, add_total, chosen, solve
+from benchmarks.baselines.batches import SPENT, chosen, complete_legend, solve
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import CONVENTIONS, LIFTING, evaluate, figures
@@ -65,17 +65,22 @@ def benchmark(session: Session, words: Sequence[str] = ("",)) -> Table:
                 solved = solve(session, name, dataset)
                 shown = {f: x for f, x in solved.figures.items() if f in table.figures}
                 table.add((subject, protocol, solved.label), shown)
-    add_total(table)
+    complete_legend(table)
     return table
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--protocols", nargs="+", default=[""], metavar="WORD")
+    parser.add_argument(
+        "--protocols",
+        nargs="+",
+        default=[""],
+        metavar="WORD",
+        help="those alone whose name has one of these",
+    )
     known, others = parser.parse_known_args(argv)
-    description = f"{__doc__}\nWith --protocols WORD ... those alone whose name has one of them."
-    run_program(partial(benchmark, words=known.protocols), description, SUBJECTS, others)
+    run_program(partial(benchmark, words=known.protocols), __doc__, SUBJECTS, others, own=parser)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.baselines.batches import SPENT, add_total, chosen, solve
+from benchmarks.baselines.batches import SPENT, chosen, complete_legend, solve
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE, CONVENTIONS, LIFTING, evaluate, figures
@@ -82,18 +82,23 @@ def benchmark(session: Session, recipes: Sequence[str] = tuple(OURS)) -> Table:
         for name in chosen(session):
             solved = solve(session, name, dataset)
             table.add((subject, solved.label), solved.figures)
-    add_total(table)
+    complete_legend(table)
     return table
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--recipes", nargs="+", choices=tuple(OURS), default=tuple(OURS))
+    parser.add_argument(
+        "--recipes",
+        nargs="+",
+        choices=tuple(OURS),
+        default=tuple(OURS),
+        help="these trainings alone: that of the paper takes the most time",
+    )
     known, others = parser.parse_known_args(argv)
-    description = f"{__doc__}\nWith --recipes NAME ... these trainings alone: {', '.join(OURS)}."
     make = partial(benchmark, recipes=known.recipes)
-    run_program(make, description, SUBJECTS, others)
+    run_program(make, __doc__, SUBJECTS, others, own=parser)
 
 
 if __name__ == "__main__":

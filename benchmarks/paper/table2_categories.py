@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines.batches import LEGEND as BASELINE_LEGEND
-from benchmarks.baselines.batches import SPENT, add_total, chosen, solve
+from benchmarks.baselines.batches import SPENT, chosen, complete_legend, solve
 from benchmarks.data.mat_files import observed, read_category
 from benchmarks.data.synthetic_furniture import CATEGORIES
 from benchmarks.harness import LIFTING_LEGEND, Session, run_program
@@ -116,7 +116,7 @@ def benchmark(session: Session) -> Table:
             solved = solve(session, name, dataset)
             shown = {figure: x for figure, x in solved.figures.items() if figure in table.figures}
             table.add((category, solved.label), shown)
-    add_total(table)
+    complete_legend(table)
     return table
 
 

@@ -114,11 +114,13 @@ def hide(dataset: Dataset, column: str, seed: int = 0) -> Dataset:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--trained", nargs="+", choices=tuple(TRAINED), default=tuple(TRAINED))
+    names = tuple(TRAINED)
+    parser.add_argument(
+        "--trained", nargs="+", choices=names, default=names, help="these trainings alone"
+    )
     known, others = parser.parse_known_args(argv)
-    names = ", ".join(map(repr, TRAINED))
-    description = f"{__doc__}\nWith --trained NAME ... these trainings alone: {names}."
-    run_program(partial(benchmark, trainings=known.trained), description, SUBJECTS, others)
+    make = partial(benchmark, trainings=known.trained)
+    run_program(make, __doc__, SUBJECTS, others, own=parser)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ PROGRAMS = {
     "evaluate": "compare models with motion capture or with real cameras",
     "models": "list the models that are installed",
     "replay": "show a recording, or a running lifter, in a browser",
+    "echo": "print the points of a running lifter as numbers",
     "doctor": "check the installation and say how to mend it",
     "lifter": "run the ROS node that lifts",
 }

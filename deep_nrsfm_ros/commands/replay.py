@@ -204,6 +204,7 @@ def watch(args: argparse.Namespace, model: Model, layout: KeypointLayout | None)
     from rclpy.executors import ExternalShutdownException
 
     from deep_nrsfm_ros.node.lifter_client import LifterClient, LifterTopics, running_layout
+    from deep_nrsfm_ros.node.shutdown import shut_down
 
     lifter = args.lifter or _LIFTER
     if layout is None:
@@ -229,7 +230,7 @@ def watch(args: argparse.Namespace, model: Model, layout: KeypointLayout | None)
         except ExternalShutdownException:
             raise KeyboardInterrupt from None
         finally:
-            rclpy.try_shutdown()
+            shut_down()
 
     serve(live_page(source, model.layout, f"live: {lifter}"), args.port, work)
 

@@ -53,7 +53,12 @@ def right_hands(points: Float32, *, mirrored_image: bool = False) -> Float32:
 
     Returns:
         (2f, 21, 2): the right hands, then the left ones, mirrored.
+
+    Raises:
+        ValueError: the points have another shape.
     """
+    single = "; single hands are sorted by palms_as_right_hands, left ones mirrored by mirrored"
+    points = _checked(points, 2, 21, 2, hint=single)
     if mirrored_image:
         points = mirrored(points)
     order = points[..., 0].mean(2).argsort(1)
@@ -65,9 +70,22 @@ def palms_as_right_hands(points: Float32) -> Float32:
     """Return single hands (f, 21, 2) as right hands, as if each showed its palm to the camera.
 
     For gestures shown to a camera, where nothing else tells left from right.
+
+    Raises:
+        ValueError: the points have another shape.
     """
+    points = _checked(points, 21, 2)
     left = _look_left(points, preset("hand21"))
     return np.where(left[:, None, None], mirrored(points), points)
+
+
+def _checked(points: Float32, *shape: int, hint: str = "") -> Float32:
+    """Return points as an array; raise ValueError unless they are of frames of the shape."""
+    given = np.asarray(points)
+    if given.shape[1:] != shape or not given.ndim:
+        needed = f"(f, {', '.join(map(str, shape))})"
+        raise ValueError(f"points are {given.shape}; hands need {needed}{hint}")
+    return given
 
 
 def check_side(option: str, side: str) -> None:

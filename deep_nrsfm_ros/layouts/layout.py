@@ -138,7 +138,7 @@ class KeypointLayout:
     def warning(self) -> str:
         """A warning for whoever trains on this layout; "" if there is none."""
         for left, right, *_ in self.handedness[:1]:  # another four may be upside down, as a knee's
-            if _side(left) == "right" and _side(right) == "left":
+            if side_in_name(left) == "right" and side_in_name(right) == "left":
                 return (
                     f"layout {self.name!r}: its handedness has left: {left} and right: {right}, "
                     "against their names. Left and right are the object's own, as seen from "
@@ -149,7 +149,7 @@ class KeypointLayout:
             return ""
         return (
             f"layout {self.name!r} names no handedness: depth may come out mirrored as a whole; "
-            "a layout file can name it"
+            "a layout file can name it, or lifting with `mirrored` undo it"
         )
 
     def edge_indices(self) -> list[tuple[int, int]]:
@@ -196,7 +196,7 @@ class KeypointLayout:
         return cls(name=f"points{p}", keypoints=tuple(f"point_{i}" for i in range(p)))
 
 
-def _side(keypoint: str) -> str:
+def side_in_name(keypoint: str) -> str:
     """Return "left" or "right" where the name of a keypoint has it as a word or letter, else ""."""
     words = re.split(r"[\W_]+|(?<=[a-z])(?=[A-Z])", keypoint)
     found = {SIDE_WORDS[word.lower()] for word in words if word.lower() in SIDE_WORDS}

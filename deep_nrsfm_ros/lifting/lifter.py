@@ -51,10 +51,10 @@ class Lifted(NamedTuple):
 
     Attributes:
         shapes: (n, p, 3) camera axes (x right, y down, z forward); centred, or at the object's
-            position where the camera's intrinsics are known. The reference pair of the model's
-            layout is `reference_length` of its options long: of people, neck to mid-hip is 0.5 by
-            default, so shapes are in metres. Without a pair, the RMS radius is so long, 1 by
-            default.
+            position where the camera's intrinsics are known, as to `VideoLifter`. The reference
+            pair of the model's layout is `reference_length` of its options long: of people, neck
+            to mid-hip is 0.5 by default, so shapes are in metres. Without a pair, the RMS radius
+            is so long, 1 by default.
         rotations: (n, 3, 3) from object to camera axes, p_camera = R p_object, det +1.
         scale: (n,) pixels per unit of `shapes`.
         translation: (n, 2) projection of the shape's origin in the image, in pixels.
@@ -105,8 +105,7 @@ class Lifter:
             layout: the detector's layout of q keypoints, as an object, by the name of a preset
                 or a layout file ("coco17"), or a list of the keypoints' names; its keypoints are
                 mapped to the model's by name. None: the model's layout.
-            history: what is remembered of identities, for lifts with a `Memory`; None: all
-                defaults.
+            history: what is remembered of identities, by `VideoLifter`; None: all defaults.
 
         Raises:
             ValueError: the model or the layout does not exist, they share fewer than 4 keypoints,

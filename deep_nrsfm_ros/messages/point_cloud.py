@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,10 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.lifting.observation import MessageError, check_keypoints
 
+CONFIDENCE = "confidence"
+"""Name of the field with the confidence of keypoints."""
+
+_LIKE_CONFIDENCE = re.compile(r"(?i)conf|scor|prob|likel|certain|visib|^[cps]$")
 _FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField datatypes FLOAT32 and FLOAT64
 
 
@@ -83,7 +88,7 @@ def point_cloud_format(message: Any, keypoints: int) -> PointCloudFormat:
             f"{keypoints}"
         )
     check_keypoints(width, keypoints, "width")
-    names = ["x", "y"] + ["confidence"] * any(f.name == "confidence" for f in message.fields)
+    names = ["x", "y"] + [CONFIDENCE] * any(f.name == CONFIDENCE for f in message.fields)
     formats, offsets = zip(*(_field(message.fields, name, step) for name in names), strict=True)
     order = ">" if message.is_bigendian else "<"
     formats = tuple(order + form for form in formats)
@@ -100,6 +105,21 @@ def point_cloud_format(message: Any, keypoints: int) -> PointCloudFormat:
     if size < needed:
         raise MessageError(f"data has {size} bytes; {height} x {width} points need {needed}")
     return cloud
+
+
+def unused_confidence(message: Any) -> str:
+    """Return the field of a PointCloud2 that may be meant as confidence, and is not read.
+
+    Args:
+        message: a PointCloud2 of rclpy or rosbags.
+
+    Returns:
+        Its name; "" if there is none, or a field `confidence`.
+    """
+    names = [str(field.name) for field in message.fields]
+    if CONFIDENCE in names:
+        return ""
+    return next((name for name in names if _LIKE_CONFIDENCE.search(name)), "")
 
 
 def _field(fields: Sequence[Any], name: str, point_step: int) -> tuple[str, int]:

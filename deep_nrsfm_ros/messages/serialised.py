@@ -29,7 +29,11 @@ from deep_nrsfm_ros.messages.decoding import (
     read_observation,
 )
 from deep_nrsfm_ros.messages.field_mapping import Size
-from deep_nrsfm_ros.messages.point_cloud import PointCloudFormat, point_cloud_format
+from deep_nrsfm_ros.messages.point_cloud import (
+    PointCloudFormat,
+    point_cloud_format,
+    unused_confidence,
+)
 
 _LITTLE_ENDIAN = b"\x00\x01"  # the first bytes of plain little-endian CDR
 _STAMP = struct.Struct("<iI")
@@ -132,6 +136,8 @@ class MessageReader:
 
     Attributes:
         input_type: type of the messages.
+        unused_confidence: as the function of that name says of the last message whose format was
+            new; "" of any other type.
     """
 
     def __init__(self, input_type: InputType, decode: Callable[[bytes], Any]) -> None:
@@ -142,6 +148,7 @@ class MessageReader:
             decode: returns a message for its bytes, or raises.
         """
         self.input_type, self._decode = input_type, decode
+        self.unused_confidence = ""
         self._formats: list[SerialisedFormat] = []  # the latest first
 
     def __call__(
@@ -164,6 +171,8 @@ class MessageReader:
         message = self._decode(raw)
         observation = read_observation(message, self.input_type, keypoints, min_confidence, size)
         header = read_header(message)
+        if self.input_type == POINT_CLOUD:
+            self.unused_confidence = unused_confidence(message)
         if self.input_type == POINT_CLOUD and header:
             self._add_format(raw, message, header, point_cloud_format(message, keypoints))
         return header, observation

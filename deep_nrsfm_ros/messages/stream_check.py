@@ -179,7 +179,7 @@ class StreamCheck:
         """
         if not self._recent:
             return []
-        topic = self._recent[-1][0]
+        topic, reader, _ = self._recent[-1]
         sample = self._sample(topic, pipeline, size, len(pipeline.source))
         if sample is None or not len(sample.points):
             return []
@@ -201,21 +201,31 @@ class StreamCheck:
                     f"{topic} give no object a score (a field mapping can name it)",
                 )
             )
+        if field := reader.unused_confidence:
+            findings.append(
+                Finding(
+                    "confidence-field",
+                    f"the messages on {topic} have no field 'confidence', and their field "
+                    f"{field!r} is not used: all keypoints count as certain; call it confidence",
+                )
+            )
         # Poor fit and low confidence are rated by the diagnostics, over all objects of a second.
         findings = [f for f in findings if f.code not in ("poor-fit", "low-confidence")]
         if self._ambiguity and self._ambiguity[0].keypoints == pipeline.source.keypoints:
             findings.insert(0, self._ambiguity[1])
+        turned: list[Finding] = []
         if self._lifted is not None and is_person(pipeline.model.layout):
             used = size or pipeline.image_size if intrinsics or sample.is_normalised else None
-            findings += orientation(self._lifted.rotations, used)
+            turned = orientation(self._lifted.rotations, used)
         outside = [finding for finding in findings if finding.code == "outside"]
         if outside:  # the cause of whatever else looks wrong
-            return outside + [finding for finding in findings if finding.code != "outside"]
+            others = [finding for finding in findings if finding.code != "outside"]
+            return outside + others + turned
         if residual >= POOR_RESIDUAL:
             fits = fit_layouts(sample.points, sample.confidence, pipeline.model)
-            better = better_layout(fits, pipeline.source, residual)
-            findings += [better] if better else []
-        return findings
+            if better := better_layout(fits, pipeline.source, residual):
+                return [better, *findings]  # in the wrong order people may lie or stand anyhow
+        return findings + turned
 
     def _has_objects(self) -> bool:
         """Return whether the last message may have objects."""

@@ -89,6 +89,7 @@ from deep_nrsfm_ros.node.detections_3d import DetectionsPublisher
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.entities import Entities
 from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
+from deep_nrsfm_ros.node.shutdown import shut_down
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
 from deep_nrsfm_ros.node.target_frame import TargetFrame, TargetOptions
@@ -363,7 +364,6 @@ class LifterNode(Node):
             self._lifter_diagnostics.empty()
             self._publish_bodies(source, scene)
             return
-        self._stream.lifted(scene.lifted)
         self._publish_points(scene, with_objects=with_objects)
         if self._camera.enabled and source.reader.input_type == YOLO.type:
             self._publish_detections(scene.header, scene.lifted, raw, places)
@@ -398,6 +398,8 @@ class LifterNode(Node):
             observation, intrinsics, identities, source.topic, moment, up
         )
         scene = Scene(header, lifted, identities, detected, moment)
+        if identities:
+            self._stream.lifted(lifted)  # in the camera's axes, before `target_frame`
         return self._placed(source, scene, up) if identities else scene, observation.places
 
     def _identities(
@@ -902,7 +904,7 @@ def main() -> None:
         if not signals:
             raise
     finally:
-        rclpy.try_shutdown()
+        shut_down()
         # Launchers and terminals send the signal twice; the second must not kill Python's shutdown.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)

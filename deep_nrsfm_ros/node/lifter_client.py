@@ -28,6 +28,7 @@ from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES, read_observation, read_points
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.node.message_types import message_class
+from deep_nrsfm_ros.node.shutdown import shut_down
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
 
@@ -70,7 +71,7 @@ def running_layout(lifter: str, seconds: float, domain: int | None = None) -> st
     finally:
         executor.shutdown()
         node.destroy_node()
-        rclpy.try_shutdown(context=context)
+        shut_down(context)
     return found[0].split(" (")[0] if found else ""
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import KeypointLayout, side_in_name
 
 Points = NDArray[Any]
 Line = Sequence[tuple[float, float]]
@@ -156,17 +156,20 @@ def scene(
 
 
 def edge_colours(layout: KeypointLayout) -> list[str]:
-    """Return the colour of each edge by the names of its keypoints: left, right or neither."""
-    return [
-        COLOURS.get(side, MIDDLE) if (side := _side(a)) and side == _side(b) else MIDDLE
-        for a, b in layout.edges
-    ]
+    """Return the colour of each edge by the names of its keypoints: left, right or neither.
 
-
-def _side(name: str) -> str:
-    """Return "left" or "right" if a keypoint's name begins with it, else ""."""
-    word = name.partition("_")[0]
-    return word if word in COLOURS else ""
+    An edge is of a side if both ends are, or one end that has no other edge of its side, as an ear.
+    """
+    sides = {name: side_in_name(name) for name in layout.keypoints}
+    own = [sides[a] if sides[a] == sides[b] else "" for a, b in layout.edges]
+    limbs = {name for edge, side in zip(layout.edges, own, strict=True) if side for name in edge}
+    colours = []
+    for (a, b), side in zip(layout.edges, own, strict=True):
+        single = {sides[name] for name in (a, b) if sides[name] and name not in limbs}
+        if not side and not (sides[a] and sides[b]) and single:
+            side = single.pop()
+        colours.append(COLOURS.get(side, MIDDLE))
+    return colours
 
 
 def _round_step(least: float) -> float:

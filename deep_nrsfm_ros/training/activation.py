@@ -39,6 +39,6 @@ def reason_to_stay(new: Model, present: Model) -> str:
     if not new.layout.handedness and "from" not in new.provenance:  # a start passes its own on
         reasons.append(
             f"layout {new.layout.name!r} names no handedness, so depth may be mirrored as a whole: "
-            "look at the shapes in the report first"
+            "look at the shapes in the report first, and set mirrored where they are mirror images"
         )
     return "; ".join(reasons)

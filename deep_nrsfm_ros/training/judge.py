@@ -340,9 +340,14 @@ def _mirrored_as_a_whole(name: str) -> str:
         node="the shapes in the report",
         python="its shapes from the side",
     )
+    undo = wording(
+        "mirrored (lift --mirrored, the lifter's parameter mirrored)",
+        node="the parameter mirrored",
+        python="LiftingOptions(mirrored=True)",
+    )
     return (
-        f"the layout names no handedness, so the whole may be a mirror image: look at {look}, or "
-        "name a handedness and train again"
+        f"the layout names no handedness, so the whole may be a mirror image: look at {look}; if "
+        f"it is one, lift with {undo}, or name a handedness and train again"
     )
 
 

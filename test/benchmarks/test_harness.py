@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ import pytest
 
 from benchmarks import harness
 from benchmarks.harness import Session, errors_by_column, run_program, with_proper
+from benchmarks.paper import mirrored_frames, protocols, table1_cmu
+from benchmarks.robustness import missing_keypoints
 from benchmarks.table import Table, bars
 from deep_nrsfm_ros.commands.evaluate import ALONE
 from deep_nrsfm_ros.data.dataset import Dataset
@@ -229,6 +232,18 @@ def test_command_prints_and_writes(
     run_program(benchmark, "about", ("05",), options)
     assert capsys.readouterr().out.strip() == (tmp_path / "t.md").read_text().strip()
     assert (tmp_path / "t.csv").exists() and (tmp_path / "t.png").exists()
+    title = (tmp_path / "t.md").read_text().splitlines()[0]
+    assert title == "## T; shortened: 6 steps a training (--steps)"
+
+
+@pytest.mark.parametrize("program", [table1_cmu, protocols, mirrored_frames, missing_keypoints])
+def test_help_lists_the_options_of_a_benchmark_alone(
+    program: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        program.main(["--help"])
+    listed = re.findall(r"^  --(recipes|protocols|trained) ", capsys.readouterr().out, re.MULTILINE)
+    assert end.value.code == 0 and len(listed) == 1
 
 
 def test_command_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ import pytest
 from benchmarks import harness
 from benchmarks.baselines import batches, pursuit
 from benchmarks.baselines.methods import BASELINES, Baseline, block_matrix
-from benchmarks.harness import Session
+from benchmarks.harness import LIFTING_LEGEND, Session
 from benchmarks.paper import (
     ablation,
     coherence,
@@ -234,8 +234,22 @@ def test_time_of_all_baselines_stands_below_the_table(session: Session, dataset:
     table.add(("network",), {"CPU min": 90.0})
     for i, spent in enumerate((1.5, 2.25)):
         table.add((f"baseline {i}",), {"CPU min": spent, "ms": 1.0})
-    batches.add_total(table)
+    batches.complete_legend(table)
     assert "together: 3.8 CPU min" in table.markdown()
+
+
+def test_a_legend_has_notes_of_the_rows_that_are_there() -> None:
+    notes = {"shape %": "error", **LIFTING_LEGEND, **batches.LEGEND, "other": "kept"}
+    table = Table("t", "T", ("method",), ("shape %",), notes, lambda table, figure: None)
+    table.add(("paper: Simple",), {"shape %": 1.0})
+    table.add(("default recipe, as shipped",), {"shape %": 1.0})
+    batches.complete_legend(table)
+    assert list(table.legend) == ["shape %", "as shipped", "other"]
+    table.legend = notes
+    table.add(("Simple, K = 5",), {"shape %": 1.0})
+    batches.complete_legend(table)
+    shown = {"Simple, EM-SfM, Sparse, SfC"} | ({"Simple"} & set(batches.LEGEND))
+    assert set(table.legend) == {"shape %", "as shipped", "other"} | shown
 
 
 def test_baselines_are_solved_once(

@@ -47,6 +47,17 @@ def test_a_mirrored_image_is_mirrored_back() -> None:
     np.testing.assert_array_equal(right_hands(mirrored(pair), mirrored_image=True)[0], right)
 
 
+@pytest.mark.parametrize("shape", [(4, 21, 2), (4, 1, 21, 2), (4, 2, 20, 2), (2, 21)])
+def test_both_hands_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(
+        ValueError, match=r"points are .*; hands need \(f, 2, 21, 2\); single hands"
+    ):
+        right_hands(np.zeros(shape, np.float32))
+    if shape != (4, 21, 2):
+        with pytest.raises(ValueError, match=r"hands need \(f, 21, 2\)$"):
+            palms_as_right_hands(np.zeros(shape, np.float32))
+
+
 def hands(right: int, left: int) -> Dataset:
     """Return so many right and left palms."""
     palm = right_palm()

@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.commands.demo.domain import take_domain
+from deep_nrsfm_ros.data.clip import read_clip
+from deep_nrsfm_ros.data.pose2sim import JOINTS
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -33,10 +35,21 @@ def test_arrays_are_lifted(tmp_path: Path) -> None:
     assert np.isfinite(np.load(tmp_path / "lifted.npz")["shapes"]).all()
 
 
+def test_a_video_is_lifted_and_measured(tmp_path: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / "lift_video.py")]
+    said = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True)
+    assert said.returncode == 0, said.stderr
+    aligned, in_camera, place = map(float, re.findall(r"([\d.]+) mm", said.stdout))
+    assert aligned < 80 and in_camera < 120 and place < 150
+
+
 def test_examples_are_short() -> None:
-    for name in ("lift_array", "publish_keypoints", "print_points", "elbow_angle"):
+    for name, most in {
+        **dict.fromkeys(("lift_array", "lift_video", "publish_keypoints", "elbow_angle"), 32),
+        **dict.fromkeys(("print_points", "point_at_wrist"), 45),
+    }.items():
         lines = (EXAMPLES / f"{name}.py").read_text("utf-8").splitlines()
-        assert len([line for line in lines if line.strip()]) <= 32
+        assert len([line for line in lines if line.strip()]) <= most
 
 
 def test_the_notebook_lifts_draws_and_trains() -> None:
@@ -83,6 +96,7 @@ runpy.run_path(script, run_name="__main__")
         ("imports", "publish_keypoints"),
         ("imports", "print_points"),
         ("imports", "elbow_angle"),
+        ("imports", "point_at_wrist"),
         ("publish", "publish_keypoints"),
     ],
 )
@@ -104,15 +118,32 @@ def test_an_interrupt_at_any_moment_ends_an_example_without_an_error(
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
-def test_a_published_person_is_printed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["elbow_angle", "point_at_wrist", "print_points"])
+def test_an_interrupt_ends_an_example_to_which_nothing_comes(name: str) -> None:
+    domain = {"ROS_DOMAIN_ID": str(take_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    command = [sys.executable, str(EXAMPLES / f"{name}.py")]
+    live = environment() | domain
+    with subprocess.Popen(command, env=live, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout and process.stdout.readline().startswith("waiting for ")
+        time.sleep(0.5)  # until it spins
+        process.send_signal(signal.SIGINT)
+        try:
+            assert process.wait(20) == 0
+        finally:
+            process.kill()
+
+
+def played(tmp_path: Path, example: str, *parameters: str) -> list[str]:
+    """Return what an example says of the published person, lifted with parameters."""
     live = environment() | {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_DOMAIN_ID": str(take_domain()),
     }
     commands = (
-        ["-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-p", "keypoint_layout:=body25b"],
+        ["-m", "deep_nrsfm_ros.node.lifter", "--ros-args", "-p", "keypoint_layout:=body25b"]
+        + [word for parameter in parameters for word in ("-p", parameter)],
         [str(EXAMPLES / "publish_keypoints.py")],
-        [str(EXAMPLES / "print_points.py")],
+        [str(EXAMPLES / f"{example}.py")],
     )
     logs = [tmp_path / f"{number}.log" for number in range(len(commands))]
     running = []
@@ -133,8 +164,39 @@ def test_a_published_person_is_printed(tmp_path: Path) -> None:
             process.kill()
             process.wait()
     assert not any("Traceback" in path.read_text() for path in logs)
-    waiting, first, *_ = logs[2].read_text().splitlines()
+    return logs[2].read_text().splitlines()
+
+
+def test_a_published_person_is_printed(tmp_path: Path) -> None:
+    waiting, first, *_ = played(tmp_path, "print_points")
     assert waiting == "waiting for points of the lifter on /lifter/points"
     x, y, z, confidence = re.findall(r"-?\d+\.\d+", first)
     assert np.linalg.norm(np.array([x, y, z], float)) < 2  # metres from the middle of the person
     assert 0 < float(confidence) < 1  # of whatever frame came first
+
+
+def test_a_wrist_is_pointed_at_in_the_frame_of_the_robot(tmp_path: Path) -> None:
+    view = read_clip().session.views[0]
+    camera = view.camera
+    focal, (width, height) = camera.intrinsics.focal[0], camera.size
+    pose = "camera_pose:=[0.5, 0.0, 1.4, -0.5, 0.5, -0.5, 0.5]"  # level, looks along x
+    waiting, *lines = played(
+        tmp_path,
+        "point_at_wrist",
+        *("target_frame:=base_link", pose, f"image_width:={width}", f"image_height:={height}"),
+        f"field_of_view:={2 * np.degrees(np.arctan(width / 2 / focal)):.1f}",
+    )
+    assert waiting == "waiting for people of the lifter on /lifter/points"
+    said = re.compile(
+        r"object1: \((.*), (.*), (.*)\) m in base_link: "
+        r"pan (.*), tilt (.*) degrees, confidence (.*)"
+    )
+    found = [said.fullmatch(line) for line in lines]
+    assert found and all(found)
+    x, y, z, pan, tilt, confidence = np.array([each.groups() for each in found if each], float).T
+    assert (confidence >= 0.495).all()
+    np.testing.assert_allclose(pan, np.degrees(np.arctan2(y, x)), atol=1)
+    np.testing.assert_allclose(tilt, np.degrees(np.arctan2(z, np.hypot(x, y))), atol=1)
+    wrist = np.nanmedian(view.truth[:, JOINTS.index("left_wrist")], 0) / 1000
+    expected = [0.5 + wrist[2], -wrist[0], 1.4 - wrist[1]]
+    np.testing.assert_allclose([x[0], y[0], z[0]], expected, atol=0.4)

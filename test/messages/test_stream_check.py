@@ -4,21 +4,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.data.walking_person import IMAGE, in_layout
-from deep_nrsfm_ros.layouts.presets import HUMAN17
+from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
+from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
-from deep_nrsfm_ros.messages.decoding import POLYGON, InputType, is_normalised
+from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, POLYGON, InputType, is_normalised
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
+from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.messages.stream_check import StreamCheck
 from deep_nrsfm_ros.model_files.model_file import load_model
 
@@ -32,6 +35,7 @@ class Reader:
 
     input_type: InputType
     observation: Observation
+    unused_confidence: str = ""
 
     def __call__(self, raw: bytes, *args: Any) -> tuple[None, Observation]:
         return None, self.observation
@@ -57,3 +61,53 @@ def test_pixels_outside_the_image_and_parts_that_it_cuts_off(
     found = stream.look(pipeline, IMAGE, camera, 0.5)
     assert [finding.code for finding in found if finding.code == "outside"] == expected
     assert not expected or found[0].code == "outside"
+
+
+def test_a_wrong_layout_is_the_one_cause_that_is_named() -> None:
+    """In the wrong order people come out upside down, which says nothing of the image."""
+    points, confidence = in_layout(BODY25)
+    model = load_model("human")
+    codes = []
+    for layout, turn in ((BODY25B, 1), (BODY25, 1), (BODY25, -1)):
+        seen = points[:16] * np.array([1, turn], np.float32)
+        lifted = Lifter(model, layout=layout)(seen, confidence[:16])
+        pipeline = Pipeline(model, layout, InputOptions(), LiftingOptions(), SmoothingOptions())
+        stream = StreamCheck(search=False)
+        reader: Any = Reader(PIXELS, Observation(seen, confidence[:16]))
+        stream.received("keypoints", reader, b"")
+        stream.lifted(lifted)
+        found = stream.look(pipeline, None, None, float(np.nanmedian(lifted.residual)))
+        codes.append([finding.code for finding in found])
+    assert codes == [["layout"], [], ["orientation"]]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("x", "y", "score"), "no field 'confidence', and their field 'score' is not used"),
+        (("x", "y", "c"), "their field 'c' is not used"),
+        (("x", "y", "confidence"), ""),
+        (("x", "y", "z"), ""),
+    ],
+)
+def test_a_confidence_of_another_name_is_named(names: tuple[str, ...], expected: str) -> None:
+    points, confidence = in_layout(HUMAN17)
+    values = np.concatenate([points[:2], confidence[:2, :, None]], -1).astype("<f4")
+    cloud = SimpleNamespace(
+        header=SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=0), frame_id=""),
+        height=2,
+        width=17,
+        fields=[
+            SimpleNamespace(name=name, offset=4 * i, datatype=7) for i, name in enumerate(names)
+        ],
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * 17,
+        data=values.tobytes(),
+    )
+    model = load_model("human17")
+    pipeline = Pipeline(model, None, InputOptions(), LiftingOptions(), SmoothingOptions())
+    stream = StreamCheck(search=False)
+    stream.received("/keypoints", MessageReader(POINT_CLOUD, lambda raw: cloud), b"\0\1\0\0")
+    found = [f for f in stream.look(pipeline, None, None, 0.1) if f.code == "confidence-field"]
+    assert [expected in str(finding) for finding in found] == [True] * bool(expected)

@@ -9,11 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.data.walking_person import IMAGE, in_layout
+from deep_nrsfm_ros.layouts.presets import COCO17
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.node.camera import Camera, CameraOptions
 from deep_nrsfm_ros.node.target_frame import TargetFrame, TargetOptions
+from test.node.conftest import Connect, StartLifter
 from test.node.test_publishing import lifted
+from test.node.test_self_check import stream
 
 LEVEL = (2.0, 0.0, 1.4, -0.5, 0.5, -0.5, 0.5)  # looks along x, 1.4 m high
 NODE: Any = None
@@ -115,3 +119,23 @@ def test_a_height_without_a_camera_is_refused() -> None:
 def test_without_tf2_a_pose_is_needed() -> None:
     with pytest.raises(ValueError, match=r"target_frame is 'map': .*tf2_msgs.*or set camera_pose"):
         target((0.0,) * 7)
+
+
+def test_people_are_upright_in_the_image_whatever_the_target(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
+    """In a frame whose y axis points up nobody is upside down: the image says it, not the frame."""
+    pose = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    start_lifter(
+        model="human",
+        keypoint_layout="coco17",
+        field_of_view=65.0,
+        image_width=IMAGE[0],
+        image_height=IMAGE[1],
+        target_frame="map",
+        camera_pose=pose,
+    )
+    client = connect()
+    with stream(client, *in_layout(COCO17)):
+        status = client.wait_for_health(lambda _, v: int(v["messages lifted"]) > 60)
+    assert "upside down: y must point down" not in str(status)

@@ -36,7 +36,11 @@ def with_sides() -> KeypointLayout:
         (model_of(HUMAN17), model_of(HUMAN25), []),  # both are of people
         (model_of(with_sides()), model_of(FLY), []),
         (model_of(FLY, has_start=True), model_of(FLY), []),  # the sides are those of its start
-        (model_of(FLY), model_of(FLY), ["'fly' names no handedness"]),
+        (
+            model_of(FLY),
+            model_of(FLY),
+            ["'fly' names no handedness", "and set mirrored where they are"],
+        ),
         (model_of(with_sides()), model_of(HUMAN25), ["'fly', and the lifter lifts 'human25'"]),
         (model_of(FLY), model_of(HUMAN25), ["the lifter lifts", "mirrored as a whole: look at"]),
     ],

@@ -358,6 +358,7 @@ def test_the_whole_may_be_mirrored_where_a_layout_names_no_handedness(
     )
     assert "These figures say nothing of depth" in text and "may be a mirror image" in text
     assert "replay FILE --model good --html look.html" in text and "handedness" in text
+    assert "if it is one, lift with mirrored (lift --mirrored, the lifter's parameter" in text
     assert "mirror image" not in str(judge(Split(*parts), model, good))  # its start knows the side
 
 
