@@ -24,8 +24,8 @@ CLEARANCE = 0.04
 """Metres from the floor to the lowest keypoint of a person who stands: a toe, or an ankle less."""
 
 
-def floor_scale(shapes: Floats, up: Floats, height: float) -> Floats:
-    """Return the factor (n,) that puts the lowest point of each shape on the floor.
+def floor_factor(shapes: Floats, up: Floats, height: float) -> Floats:
+    """Return the factor (n,) that puts the lowest point of each shape on the floor, however large.
 
     Args:
         shapes: (n, p, 3) at their positions before the camera.
@@ -33,12 +33,26 @@ def floor_scale(shapes: Floats, up: Floats, height: float) -> Floats:
         height: of the camera above the floor, in metres.
 
     Returns:
-        NaN for an object above the camera, or with a factor beyond 0.4 to 2.5.
+        Infinity for an object above the camera, NaN for a shape that is NaN.
     """
     lowest = (-(shapes @ up)).max(1)
-    scale = (height - CLEARANCE) / np.where(lowest > 0, lowest, np.nan)
-    believed = (scale >= RANGE[0]) & (scale <= RANGE[1])
-    return np.where(believed, scale, np.nan)
+    below = np.where(lowest <= 0, np.nan, lowest)
+    return np.where(lowest <= 0, np.inf, (height - CLEARANCE) / below)
+
+
+def floor_scale(
+    shapes: Floats, up: Floats, height: float, believed: tuple[float, float] = RANGE
+) -> Floats:
+    """Return `floor_factor` (n,), and NaN where it is no size of the object.
+
+    Args:
+        shapes: (n, p, 3) at their positions before the camera.
+        up: (3,) unit vector against gravity in the same axes.
+        height: of the camera above the floor, in metres.
+        believed: least and largest factor.
+    """
+    scale = floor_factor(shapes, up, height)
+    return np.where((scale >= believed[0]) & (scale <= believed[1]), scale, np.nan)
 
 
 class FloorScale:
@@ -50,7 +64,12 @@ class FloorScale:
         self._mean = MeanScale()
 
     def __call__(
-        self, identities: Sequence[str], shapes: Floats, up: Floats, seconds: float
+        self,
+        identities: Sequence[str],
+        shapes: Floats,
+        up: Floats,
+        seconds: float,
+        believed: tuple[float, float] = RANGE,
     ) -> Floats:
         """Return the factors (n,) of the objects of a message; 1 where nothing is known.
 
@@ -59,8 +78,9 @@ class FloorScale:
             shapes: (n, p, 3) at their positions.
             up: (3,) against gravity.
             seconds: time of the message.
+            believed: least and largest factor; see `believed_scales`.
         """
-        found = floor_scale(shapes.astype(np.float64), up, self._height)
+        found = floor_scale(shapes.astype(np.float64), up, self._height, believed)
         for identity, scale in zip(identities, found.tolist(), strict=True):
             self._mean.update(identity, scale, seconds)
         means = np.array([self._mean(identity) for identity in identities])

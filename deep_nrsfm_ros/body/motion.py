@@ -22,8 +22,11 @@ NEW_TIME = 0.5
 """Seconds after its first sight for which an identity is new."""
 LOST_TIME = 1.0
 """Seconds without sight after which an identity is lost."""
+INTERVALS = 3.0
+"""Intervals of a slower stream for which an identity is not lost, and has a velocity."""
+LOST_SHOWN = 1.0
+"""Seconds for which a lost identity is told, since a message may get lost too."""
 _MAX_STEP = 1.0  # s between two messages over which there is no velocity
-_INTERVALS = 3.0  # the same in intervals of a slower stream
 
 
 class Motion(NamedTuple):
@@ -35,7 +38,7 @@ class Motion(NamedTuple):
         states: n of `NEW`, `TRACKED`, `BRIDGED` (kept by smoothing over a gap), and `LOST` for an
             object that is not lifted.
         ages: (n,) seconds since the first sight.
-        lost: identities that are lost since the last message.
+        lost: identities that are lost since `LOST_SHOWN` seconds, or since the last message.
     """
 
     velocities: Floats
@@ -79,6 +82,11 @@ class MotionTracker:
         """
         self._time_constant = time_constant
         self._tracks: dict[str, _Track] = {}
+        self._lost: dict[str, float] = {}  # when each was found to be lost
+
+    def __len__(self) -> int:
+        """Return the number of identities that are not lost."""
+        return len(self._tracks)
 
     def __call__(
         self,
@@ -98,9 +106,10 @@ class MotionTracker:
             bridged: number of the last objects that the message did not contain.
         """
         n = len(identities)
-        limit = max(_MAX_STEP, _INTERVALS * period)
+        limit = max(_MAX_STEP, INTERVALS * period)
         if self._tracks and seconds < max(t.last for t in self._tracks.values()) - limit:
             self._tracks.clear()  # the clock begins anew
+            self._lost.clear()
         lifted = np.asarray(np.isfinite(points).all((1, 2)), bool)
         velocities, ages = np.full(points.shape, np.nan), np.zeros(n)
         states: list[str] = []
@@ -117,8 +126,12 @@ class MotionTracker:
                     velocities[i] = track.velocity
             fresh = NEW if ages[i] < NEW_TIME else TRACKED
             states.append(fresh if seen else BRIDGED if lifted[i] else LOST)
-        oldest = seconds - max(LOST_TIME, _INTERVALS * period)
+        oldest = seconds - max(LOST_TIME, INTERVALS * period)
         lost = tuple(name for name, track in self._tracks.items() if track.last < oldest)
         for name in lost:
             del self._tracks[name]
-        return Motion(velocities, tuple(states), ages, lost)
+        since = seconds - LOST_SHOWN
+        known = {n: t for n, t in self._lost.items() if since <= t <= seconds}
+        self._lost = {n: t for n, t in known.items() if n not in self._tracks}
+        self._lost |= dict.fromkeys(lost, seconds)
+        return Motion(velocities, tuple(states), ages, tuple(self._lost))

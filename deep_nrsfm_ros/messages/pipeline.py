@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +31,8 @@ from deep_nrsfm_ros.messages.serialised import Header, MessageReader
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.model_files.matching_model import map_to_model
 from deep_nrsfm_ros.model_files.model_file import Model
+
+Floats = NDArray[Any]
 
 _DEFAULT_HISTORY = HistoryOptions()
 
@@ -153,20 +158,46 @@ class Pipeline:
         self._smoothers.clear()
         self._memories.clear()
 
-    def learned_bones(self, most: int = 8) -> dict[str, str]:
+    def learned_bones(
+        self, most: int = 8, shown: Mapping[str, Floats] | None = None
+    ) -> dict[str, str]:
         """Return the bone lengths that are learned of each identity, as text for diagnostics.
 
         Args:
             most: identities, those lifted last; 8 typical.
+            shown: shape (p, 3) of each identity that is present, in the unit that the lengths are
+                to have; None: all that are remembered, in units of the reference length.
         """
         learned: dict[str, str] = {}
         for memory in self._memories.values():
-            for identity in memory.latest(most - len(learned)):
+            latest = memory.latest(len(memory))
+            present = [name for name in latest if shown is None or name in shown]
+            for identity in present[: most - len(learned)]:
                 lengths, seconds = self._lifter.learned_lengths(memory, identity)
+                if shown is not None:
+                    unit = self._unit(lengths, shown[identity])
+                    lengths = {name: unit * length for name, length in lengths.items()}
                 if seconds:
                     bones = ", ".join(f"{name} {length:.3f}" for name, length in lengths.items())
                     learned[identity] = f"{seconds:.1f} s of sight: {bones}"
         return learned
+
+    def _unit(self, lengths: Mapping[str, float], shape: Floats) -> float:
+        """Return the factor from the unit of bone lengths to that of a shape of the object.
+
+        The bone of the reference pair says it, since it has its length in each shape. Where no
+        bone joins that pair, all bones together do.
+        """
+        layout, spans = self.model.layout, {}
+        for pair in self.edges:
+            for i, j in (pair, pair[::-1]):
+                name = f"{layout.keypoints[i]}-{layout.keypoints[j]}"
+                if name in lengths:
+                    spans[name] = float(np.linalg.norm(shape[i] - shape[j]))
+        a, b = layout.reference or ("", "")
+        bones = [name for name in (f"{a}-{b}", f"{b}-{a}") if name in spans]
+        bones = bones or [*spans]
+        return sum(spans[name] for name in bones) / (sum(lengths[name] for name in bones) or 1.0)
 
     def lift(
         self,

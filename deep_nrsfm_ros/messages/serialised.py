@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros import kernel
 from deep_nrsfm_ros.lifting.observation import (
@@ -26,6 +27,7 @@ from deep_nrsfm_ros.messages.decoding import (
     POINT_CLOUD,
     InputType,
     count_keypoints,
+    read_confidence,
     read_observation,
 )
 from deep_nrsfm_ros.messages.field_mapping import Size
@@ -60,6 +62,11 @@ class Header(NamedTuple):
     def stamp(self) -> int:
         """The stamp in ns."""
         return self.sec * 1_000_000_000 + self.nanosec
+
+    def later(self, nanoseconds: int) -> Header:
+        """Return the header with its stamp so much later."""
+        sec, nanosec = divmod(self.stamp + nanoseconds, 1_000_000_000)
+        return self._replace(sec=sec, nanosec=nanosec)
 
     def write_stamp(self, raw: bytearray) -> None:
         """Write the stamp into a serialised message that begins with a header."""
@@ -184,6 +191,21 @@ class MessageReader:
             MessageError: as `count_keypoints`; and what `decode` raises.
         """
         return count_keypoints(self._decode(raw), self.input_type)
+
+    def confidence(
+        self, raw: bytes, keypoints: int, size: Size | None = None
+    ) -> NDArray[np.floating[Any]]:
+        """Return the confidence (n, q) of a message as the detector gives it, not limited to 1.
+
+        Args:
+            raw: the serialised message.
+            keypoints: as in `read_observation`.
+            size: as in `read_observation`.
+
+        Raises:
+            Exception: as `read_confidence`; and what `decode` raises.
+        """
+        return read_confidence(self._decode(raw), self.input_type, keypoints, size)
 
     def find_format(self, raw: bytes, keypoints: int) -> SerialisedFormat | None:
         """Return the kept format of a message; None: it has none or another number of keypoints."""

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from deep_nrsfm_ros.lifting.sanity import Finding
 
 MAX_LATE = 1.0
 """Seconds by which a stamp may be before an earlier message's; more: the stamps begin anew."""
@@ -21,6 +23,7 @@ MAX_LATE = 1.0
 _SECOND = 1_000_000_000  # ns
 _ZERO_FITS = _SECOND // 50  # a stamp of 0 this near to the clock is the start of the clock
 _OTHER_CLOCK = 1_000_000 * _SECOND  # two clocks that differ by more are not the same, 11 days
+_SHORTEST, _LONGEST = 100_000, 3600 * _SECOND  # ns between messages: 10 kHz to one an hour
 _ADOPTED = 10  # messages of another clock in sequence after which it is the topic's clock
 _INTERVALS = 15  # of which the median is the period
 _MAX_PERIOD = 10.0  # s
@@ -190,3 +193,52 @@ def _unrolled(
             shift, stamp, loops = shift + follows - stamp, follows, loops + 1
         result[i], last = stamp, max(last, stamp)
     return result, loops
+
+
+def check_stamps(stamps: NDArray[np.int64], topic: str) -> Iterator[Finding]:
+    """Yield what is wrong with the stamps of the last messages of a topic.
+
+    Args:
+        stamps: (n,) of the headers in ns, in the order of receipt.
+        topic: their name, for the text.
+    """
+    if len(stamps) < 2:
+        return
+    steps = np.diff(stamps)
+    if not steps.any():
+        yield Finding(
+            "stamps",
+            f"the last {len(stamps)} messages on {topic} all have the stamp {_seconds(stamps[0])}: "
+            "let the detector copy the stamp of the image into header.stamp",
+        )
+        return
+    if (np.abs(steps) > _OTHER_CLOCK).sum() > 1:
+        yield Finding(
+            "stamps",
+            f"the stamps on {topic} are of two clocks, {_seconds(stamps.min())} and "
+            f"{_seconds(stamps.max())}: identities and smoothing take the time of receipt instead; "
+            "do two nodes publish on it, one of them with use_sim_time? Set it alike in all nodes",
+        )
+        return
+    rising = steps[steps > 0]
+    middle = float(np.median(rising)) if len(rising) else 0.0
+    if 0 < middle < _SHORTEST or middle > _LONGEST:
+        yield Finding(
+            "stamps",
+            f"the stamps on {topic} are {middle / _SECOND:.2g} s apart: header.stamp.sec must be "
+            "whole seconds, and nanosec the rest",
+        )
+        return
+    back = int((steps <= 0).sum())
+    is_loop = back == 1 and steps.min() < -int(_SECOND * MAX_LATE)
+    if back and not is_loop:
+        yield Finding(
+            "stamps",
+            f"{back} of {len(steps)} stamps on {topic} are not above the one before: do several "
+            "detectors publish on it? Give each a topic of its own (parameter topics)",
+        )
+
+
+def _seconds(stamp: np.int64) -> str:
+    """Return a stamp in ns as seconds for texts."""
+    return f"{stamp / _SECOND:.3f} s"

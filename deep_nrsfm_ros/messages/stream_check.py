@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from typing import NamedTuple
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from deep_nrsfm_ros.lifting.sanity import (
     Finding,
     Size,
     check,
+    confidence_scale,
     is_person,
     orientation,
     to_pixels,
@@ -39,6 +41,7 @@ from deep_nrsfm_ros.lifting.sanity import (
 from deep_nrsfm_ros.messages.decoding import implied_layout, is_normalised, type_name
 from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import MessageReader
+from deep_nrsfm_ros.messages.stamps import check_stamps
 from deep_nrsfm_ros.model_files.model_file import Model
 
 _MESSAGES = 16  # kept; enough objects to tell layouts apart, few enough to read again in 1 ms
@@ -64,6 +67,7 @@ class _Sample(NamedTuple):
     Attributes:
         points: (n, q, 2).
         confidence: (n, q).
+        given: the confidences as the detector gives them, not limited to 1.
         stamps: (f,) in ns.
         left_out: sentences about objects and keypoints that are left out.
         has_scores: objects have scores.
@@ -72,6 +76,7 @@ class _Sample(NamedTuple):
 
     points: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    given: NDArray[np.floating[Any]]
     stamps: NDArray[np.int64]
     left_out: list[str]
     has_scores: bool
@@ -188,10 +193,11 @@ class StreamCheck:
             sample.confidence,
             intrinsics,
             size or pipeline.image_size,
-            sample.stamps,
-            self._lifted,
+            lifted=self._lifted,
             is_normalised=sample.is_normalised,
         )
+        findings = confidence_scale(sample.given) + findings
+        findings += check_stamps(sample.stamps, topic)
         findings += [Finding("left-out", text) for text in sample.left_out]
         if pipeline.min_score and not sample.has_scores:
             findings.append(
@@ -239,6 +245,7 @@ class StreamCheck:
         """Return the objects of a topic, read with q keypoints; None if none can be."""
         observations: list[Observation] = []
         stamps: list[int] = []
+        given: list[NDArray[np.floating[Any]]] = [np.zeros(0)]
         size = size or pipeline.image_size
         for _, reader, raw in (kept for kept in self._recent if kept[0] == topic):
             try:
@@ -246,6 +253,9 @@ class StreamCheck:
             except Exception:  # damaged bytes fail in many ways; the hot path has reported it
                 continue
             observations.append(observation.above(pipeline.min_score))
+            if (observation.confidence == 1).any():  # else none was limited to 1
+                with suppress(Exception):  # as above
+                    given.append(reader.confidence(raw, q, size).ravel())
             if header:
                 stamps.append(header.stamp)
         if not observations:
@@ -257,7 +267,13 @@ class StreamCheck:
         left_out = left_out_sentences(r for each in observations for r in each.left_out)
         has_scores = any(each.scores for each in observations)
         return _Sample(
-            pixels, confidence, np.array(stamps, np.int64), left_out, has_scores, was_normalised
+            pixels,
+            confidence,
+            np.concatenate(given),
+            np.array(stamps, np.int64),
+            left_out,
+            has_scores,
+            was_normalised,
         )
 
 

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState, MultiDOFJointState
 from std_msgs.msg import String
 
 from deep_nrsfm_ros.body.kinematic_tree import KinematicTree, Pose
-from deep_nrsfm_ros.body.motion import Motion, MotionTracker
+from deep_nrsfm_ros.body.motion import INTERVALS, LOST_TIME, Motion, MotionTracker
 from deep_nrsfm_ros.body.urdf import rep155_name, urdf
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -36,6 +36,7 @@ IDS_LIST = "hri_msgs/IdsList"
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _MAX_BODIES = 100  # objects with topics of their own
 _LENGTHS_TIME = 5.0  # s, time constant of the mean lengths of an object's bones
+_FIRST_SILENCE = 5.0  # s without a second message after which a topic is silent
 _URDF_PERIOD = 5.0  # s between two URDFs of an object at least
 _URDF_CHANGE = 0.05  # of the length of a bone, from which on the URDF is published again
 
@@ -208,6 +209,7 @@ class BodyPublishers:
         self._described: KeypointLayout | None = None
         self._tree: KinematicTree | None = None
         self._motions: dict[str, MotionTracker] = {}
+        self._last: dict[str, tuple[int, Header, Moment]] = {}  # node's ns, of the last message
         self._bodies: dict[str, list[_Body]] = {}
         self._lengths: dict[str, _Lengths] = {}
         self.wanted = self._always = options.frames or options.per_object or options.humans
@@ -247,6 +249,7 @@ class BodyPublishers:
         self._tree = KinematicTree(layout) if layout.joints else None
         self._lengths.clear()
         self._motions.clear()
+        self._last.clear()
         self._skeleton.publish(body_messages.skeleton(layout))
 
     def has_subscriber(self) -> bool:
@@ -268,6 +271,35 @@ class BodyPublishers:
         finally:
             self._outbox.send()
         self._forget(lost)
+
+    def tell_lost(self) -> None:
+        """Tell that identities are lost on topics without a message; call it twice a second.
+
+        A detector may send nothing where it sees nobody.
+        """
+        if not self.wanted:
+            return
+        now = self._node.get_clock().now().nanoseconds
+        for topic, (received, header, moment) in [*self._last.items()]:
+            silence = 1e-9 * (now - received)
+            if silence < _silent_time(moment.period):
+                continue
+            nobody = np.zeros((0, 1, 3))
+            tracker = self._motions[topic]
+            motion = tracker((), nobody, moment.seconds + silence, moment.period)
+            if not motion.lost:
+                if not len(tracker):
+                    del self._last[topic]
+                continue
+            self._forget(motion.lost)
+            header = header.later(now - received)
+            if self._tracks.get_subscription_count():
+                self._outbox.add(
+                    self._tracks, body_messages.tracks(header, (), motion, np.zeros(0))
+                )
+            if self._options.humans:
+                self._make_ids(header)
+            self._outbox.send()
 
     def _make(self, topic: str, scene: Scene, *, positioned: bool) -> Motion:
         """Make the messages of `publish`; return the motion of the objects."""
@@ -311,6 +343,7 @@ class BodyPublishers:
         if tracker is None:
             tracker = self._motions[topic] = MotionTracker(self._options.velocity_time)
         moment = scene.moment
+        self._last[topic] = self._node.get_clock().now().nanoseconds, scene.header, moment
         bridged = len(names) - scene.detected
         return tracker(names, places, moment.seconds, moment.period, bridged)
 
@@ -371,6 +404,7 @@ class BodyPublishers:
     def forget(self) -> None:
         """Forget all objects and destroy their topics."""
         self._motions.clear()
+        self._last.clear()
         self._forget([*self._bodies])
 
     def _forget(self, lost: Sequence[str]) -> None:
@@ -379,6 +413,15 @@ class BodyPublishers:
             self._lengths.pop(name, None)
             for body in self._bodies.pop(name, ()):
                 body.close()
+
+
+def _silent_time(period: float) -> float:
+    """Return the seconds without a message after which a topic is silent.
+
+    Args:
+        period: typical interval between its messages in seconds; 0: unknown.
+    """
+    return max(LOST_TIME, INTERVALS * period) if period else _FIRST_SILENCE
 
 
 def topic_name(identity: str) -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 
 from deep_nrsfm_ros.configuration import option
@@ -19,10 +20,12 @@ from deep_nrsfm_ros.lifting.options import FieldOfViewOptions
 from deep_nrsfm_ros.messages.camera_info import read_camera_info
 from deep_nrsfm_ros.messages.field_mapping import Size
 
-# Drivers publish CameraInfo with every image; a simulator or a bag may publish it once, latched.
+# Drivers publish CameraInfo with every image: best effort fits all of them. A simulator or a bag
+# may publish it once, latched, and only a latched subscription receives what was sent before it.
 _STREAM = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _TYPE = "sensor_msgs/msg/CameraInfo"
 _LOOK_PERIOD = 2.0  # seconds between two looks at the topics
+_SEARCH_PERIOD = 0.2  # seconds between two looks for a latched publisher, while messages wait
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _UNKNOWN_VIEW = FieldOfViewOptions()
 
@@ -125,22 +128,46 @@ class Camera:
         self.frame = ""
         self.size: Size | None = None
         self._rectified = options.rectified
-        self._topic = ""
+        self._topic, self._name = "", options.camera_info
+        self._latched: Subscription | None = None
+        self._searched = -math.inf
         self._problem = ""
         self._node, self._silence, self._looked = node, "", -math.inf
         self.set_image_size(image_size)
         if not options.camera_info:
             return
-        for qos in (_STREAM, _LATCHED):
-            subscription = node.create_subscription(
+        stream = node.create_subscription(CameraInfo, options.camera_info, self._receive, _STREAM)
+        self._topic = stream.topic_name
+        self.update()
+
+    def update(self) -> None:
+        """Subscribe latched while there is a latched publisher; call it once a second.
+
+        A latched subscription beside other publishers would make each of them warn of an
+        incompatible quality of service.
+        """
+        if not self._topic:
+            return
+        self._searched = time.monotonic()
+        publishers = self._node.get_publishers_info_by_topic(self._topic)
+        offers = [publisher.qos_profile for publisher in publishers]
+        latched = any(
+            offer.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            and offer.reliability == ReliabilityPolicy.RELIABLE
+            for offer in offers
+        )
+        if latched and self._latched is None:
+            self._latched = self._node.create_subscription(
                 CameraInfo,
-                options.camera_info,
+                self._name,
                 self._receive,
-                qos,
-                # Most publishers are not latched: an incompatible QoS is no problem here.
+                _LATCHED,
+                # Another publisher may not be latched: an incompatible QoS is no problem here.
                 event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             )
-            self._topic = subscription.topic_name
+        elif not latched and self._latched is not None:
+            self._node.destroy_subscription(self._latched)
+            self._latched = None
 
     def set_image_size(self, size: Size | None) -> None:
         """Set width and height in pixels, which the intrinsics of a field of view depend on.
@@ -158,6 +185,8 @@ class Camera:
             MessageError: no usable CameraInfo has been received.
         """
         if self.enabled and self.intrinsics is None:
+            if time.monotonic() - self._searched > _SEARCH_PERIOD:
+                self.update()
             raise MessageError(self._missing())
         return self.intrinsics
 

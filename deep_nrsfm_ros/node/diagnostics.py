@@ -16,6 +16,8 @@ OK, WARN, ERROR = range(3)
 """Levels of diagnostic_msgs/DiagnosticStatus."""
 
 _MAX_SILENCE = 3.0  # seconds without a message
+_PROBLEM_TIME = 60.0  # seconds for which a problem is shown
+_PROBLEM_OVER = 2.0  # seconds after which its age is shown too
 _MAX_RESIDUAL = 0.3  # median reprojection error
 _MIN_CONFIDENCE = 0.3  # median confidence of objects
 
@@ -49,7 +51,8 @@ class LifterDiagnostics:
         total_empty: messages without objects since the start.
         total_rejected: messages since the start that could not be lifted.
         total_dropped: messages since the start that were sent and not received.
-        last_problem: reason of the last rejected message or publisher that cannot be received.
+        last_problem: reason of the last rejected message or publisher that cannot be received; ""
+            when it is a minute old.
         frame_problem: what is wrong with the frame of points in this period; "" if nothing is.
     """
 
@@ -70,8 +73,13 @@ class LifterDiagnostics:
         self.total_empty = 0
         self.total_rejected = 0
         self.total_dropped = 0
-        self.last_problem = ""
+        self._problem, self._problem_time = "", 0.0
         self.frame_problem = ""
+
+    @property
+    def last_problem(self) -> str:
+        """The reason of the last problem; "" if there was none within a minute."""
+        return self._problem if self._clock() - self._problem_time <= _PROBLEM_TIME else ""
 
     @property
     def idle(self) -> bool:
@@ -112,7 +120,7 @@ class LifterDiagnostics:
         self._last_input = self._clock()
         self._rejected += 1
         self.total_rejected += 1
-        self.last_problem = reason
+        self._note(reason)
 
     def dropped(self, count: int) -> None:
         """Count messages that were sent and not received."""
@@ -121,7 +129,12 @@ class LifterDiagnostics:
 
     def publisher_problem(self, reason: str) -> None:
         """Record why the messages of a publisher cannot be received."""
-        self._publisher_problem = self.last_problem = reason
+        self._publisher_problem = reason
+        self._note(reason)
+
+    def _note(self, reason: str) -> None:
+        """Keep the reason of a problem, and when it was."""
+        self._problem, self._problem_time = reason, self._clock()
 
     def report(self) -> Report:
         """Return the report of the period since the last one, and start the next period."""
@@ -140,7 +153,7 @@ class LifterDiagnostics:
             "messages without objects": str(self.total_empty),
             "messages rejected": str(self.total_rejected),
             "messages dropped": str(self.total_dropped),
-            "last problem": self.last_problem or "none",
+            "last problem": self._last_problem_status(now),
         }
         self._last_report, self._rejected, self._empty, self._dropped = now, 0, 0, 0
         self.frame_problem = ""
@@ -148,6 +161,13 @@ class LifterDiagnostics:
         self._residuals.clear()
         self._confidences.clear()
         return Report(level, message, values)
+
+    def _last_problem_status(self, now: float) -> str:
+        """Return the last problem as text, with its age as soon as it is over."""
+        if not self.last_problem:
+            return "none"
+        age = now - self._problem_time
+        return self.last_problem + (f" ({age:.0f} s ago)" if age >= _PROBLEM_OVER else "")
 
     def _medians(self) -> tuple[float, float]:
         """Return median reprojection error and confidence of the lifted objects, NaN if none."""

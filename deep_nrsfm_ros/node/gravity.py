@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,40 @@ class GravitySources:
     )
 
 
+class Gravity(NamedTuple):
+    """The direction against gravity, and who says so.
+
+    Attributes:
+        up: (3,) unit vector against gravity in the axes of the keypoints' frame; None: unknown.
+        source: of the direction, or what is waited for.
+        mend: what to check where the direction is wrong.
+    """
+
+    up: NDArray[np.float64] | None
+    source: str = ""
+    mend: str = ""
+
+    @property
+    def status(self) -> str:
+        """The state as text, for diagnostics."""
+        if self.up is None:
+            return f"waiting for {self.source}" if self.source else "unknown"
+        x, y, z = np.round(self.up, 2) + 0.0  # without -0.00
+        return f"up is {x:.2f} {y:.2f} {z:.2f} in the camera's axes, by {self.source}"
+
+
+_BY_PARAMETER = (
+    "gravity.up",
+    "check its sign and its axes (x right, y down, z forward): it points up, so that of a level "
+    "camera is [0.0, -1.0, 0.0]",
+)
+FRAME_MEND = (
+    "check that the frame_id of the keypoints is the camera's optical frame (z forward) and not "
+    "that of its body (x forward), and its rotation on /tf"
+)
+"""What to check where a transform of /tf gives a wrong direction."""
+
+
 class GravityDirection:
     """Keeps the direction against gravity; a frame comes before an IMU, and both before `up`."""
 
@@ -98,25 +132,41 @@ class GravityDirection:
             frame: optical frame of the keypoints.
             stamp: of the keypoints in ns, for the transforms of /tf; 0: the newest.
         """
+        return self.find(up, frame, stamp).up
+
+    def find(self, up: NDArray[np.float64] | None, frame: str, stamp: int = 0) -> Gravity:
+        """Return the direction and its source; the arguments are those of a call."""
         sources = self._sources
         if sources.frame and frame:
             R = self._tree.rotation(frame, sources.frame, stamp)
             if R is not None:
-                return np.ascontiguousarray(R[:, 2])
+                by = f"gravity.frame {sources.frame}"
+                return Gravity(np.ascontiguousarray(R[:, 2]), by, FRAME_MEND)
         if self._mean is not None and self._now() - self._measured <= _MAX_AGE:
-            R = self._tree.rotation(frame, self._imu_frame)
-            turned = self._mean if R is None else R @ self._mean
-            return np.asarray(turned / np.linalg.norm(turned), np.float64)
-        return up
+            return self._by_imu(self._mean, frame)
+        if up is not None:
+            return Gravity(up, *_BY_PARAMETER)
+        waits = [f"frame {sources.frame} on /tf"] if sources.frame else []
+        waits += [f"IMU on {sources.imu}"] if sources.imu else []
+        return Gravity(None, " or ".join(waits))
 
     def status(self, up: NDArray[np.float64] | None, frame: str) -> str:
         """Return the state as text, for diagnostics."""
-        direction = self(up, frame)
-        if direction is not None:
-            return "up is {:.2f} {:.2f} {:.2f} in the camera's axes".format(*direction)
-        waits = [f"frame {self._sources.frame} on /tf"] if self._sources.frame else []
-        waits += [f"IMU on {self._sources.imu}"] if self._sources.imu else []
-        return f"waiting for {' or '.join(waits)}" if waits else "unknown"
+        return self.find(up, frame).status
+
+    def _by_imu(self, mean: NDArray[Any], frame: str) -> Gravity:
+        """Return the direction of the mean acceleration of the IMU."""
+        R, own = self._tree.rotation(frame, self._imu_frame), self._imu_frame or "its frame"
+        turned = mean if R is None else R @ mean
+        by, is_camera = f"the IMU on {self._sources.imu}", self._imu_frame in ("", frame)
+        mend = f"check the rotation from {own} to {frame or 'the camera'} on /tf"
+        if R is None or is_camera:
+            by += "" if is_camera else f", whose {own} is taken as the camera's optical frame"
+            mend = (
+                f"check that the axes of {own} are those of the camera's optical frame (x right, y "
+                "down, z forward), or publish its frame on /tf; gravity.up says the direction too"
+            )
+        return Gravity(np.asarray(turned / np.linalg.norm(turned), np.float64), by, mend)
 
     def _listen_to_frames(self, *, required: bool) -> None:
         """Subscribe to /tf and /tf_static."""

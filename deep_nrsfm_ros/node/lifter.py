@@ -49,11 +49,12 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import MultiDOFJointState, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from deep_nrsfm_ros.body.floor import FloorScale
+from deep_nrsfm_ros.body.depth import believed_scales
+from deep_nrsfm_ros.body.floor import FloorScale, floor_factor
 from deep_nrsfm_ros.configuration import option
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap, TooFewSharedError
-from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import (
@@ -69,6 +70,7 @@ from deep_nrsfm_ros.messages.field_mapping import YOLO
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
+from deep_nrsfm_ros.messages.scene_check import FloorCheck, GravityCheck
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
@@ -88,7 +90,7 @@ from deep_nrsfm_ros.node.depth import DepthOptions, DepthSubscription
 from deep_nrsfm_ros.node.detections_3d import DetectionsPublisher
 from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, LifterDiagnostics, status
 from deep_nrsfm_ros.node.entities import Entities
-from deep_nrsfm_ros.node.gravity import GravityDirection, GravitySources
+from deep_nrsfm_ros.node.gravity import Gravity, GravityDirection, GravitySources
 from deep_nrsfm_ros.node.shutdown import shut_down
 from deep_nrsfm_ros.node.subscriptions import LOG_PERIOD, KeypointSubscriptions, KeypointTopic
 from deep_nrsfm_ros.node.surroundings import NameCheck, launch_has_ended
@@ -116,9 +118,11 @@ _DEPTH = "depth."
 _BODY = "body."
 _TRAIN = "train."
 _REPORT_PERIOD = 1.0  # seconds
+_LOST_PERIOD = 0.5  # seconds between two looks for topics that have fallen silent
 _FRAME_LOG_PERIOD = 60.0  # seconds
 _EARLY_CHECKS = 5  # reports at the start in each of which the input is looked at
 _CHECK_EVERY = 10  # reports between two looks at an input in which nothing looked wrong
+_PRESENT = 3.0  # seconds for which the objects of a topic's last message count as present
 _FINDING_PERIOD = 30.0  # seconds between two log entries of the same finding
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _TRAINING_GRACE = 1.0  # seconds in which a training may save its model when the node ends
@@ -242,6 +246,10 @@ class LifterNode(Node):
         self._frame_id, self._last_frame = camera.frame_id, ""
         self._camera = Camera(self, camera, self._view, self._pipeline.image_size)
         self._gravity = GravityDirection(self, self._gravity_sources)
+        self._gravity_check, self._gravity_source = GravityCheck(), ""
+        self._floor_check = FloorCheck()
+        self._scenes: dict[str, tuple[float, Scene]] = {}  # the last of each topic, and when
+        self._floor_sizes: tuple[Sequence[str], NDArray[np.float32]] = ((), np.ones(0, np.float32))
         depth = self._depth_options
         self._depth = DepthSubscription(self, depth, self._camera) if depth.topic else None
         self._floor = FloorScale(camera.camera_height) if camera.camera_height else None
@@ -254,6 +262,9 @@ class LifterNode(Node):
         self._detections: DetectionsPublisher | None = None
         self._bodies = BodyPublishers(self, self._body_options, camera.tf_prefix)
         self._bodies.describe(self._pipeline.model.layout)
+        self.create_timer(
+            _LOST_PERIOD, self._tell_lost, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         self._training = TrainingService(
             self,
             self._training_request,
@@ -302,11 +313,18 @@ class LifterNode(Node):
         self._keypoint_topics.close()
         self._pipeline.forget()
         self._bodies.forget()
+        self._forget_scene()
         if self._floor:
             self._floor.forget()
         if self._depth is not None:
             self._depth.forget()
         self._stage = Stage.INACTIVE
+
+    def _forget_scene(self) -> None:
+        """Forget the last objects, by which gravity and the camera's height are checked too."""
+        self._scenes.clear()
+        self._gravity_check.forget()
+        self._floor_check.forget()
 
     def clean_up(self) -> None:
         """Release the model, the topics and the services, and end a running training."""
@@ -360,6 +378,7 @@ class LifterNode(Node):
             if self.context.ok():  # else a signal came meanwhile, and the message is not at fault
                 self._reject(source, problem)
             return
+        self._scenes[source.topic] = time.monotonic(), scene
         if not scene.identities:
             self._lifter_diagnostics.empty()
             self._publish_bodies(source, scene)
@@ -390,17 +409,24 @@ class LifterNode(Node):
         moment = self._moment(source, header.stamp if header else 0)
         identities = self._identities(source, observation, moment, with_objects=with_objects)
         header = self._in_frame(source, header or self._now())
-        up = self._gravity(self._up, header.frame_id, header.stamp)
-        if up is None and self._target.name:
-            up = self._target.up(header)
+        up = self._against_gravity(header).up
         detected = len(identities)
         lifted, identities = self._pipeline.lift(
             observation, intrinsics, identities, source.topic, moment, up
         )
+        if up is not None and is_person(self._pipeline.model.layout):
+            self._gravity_check.add(time.monotonic(), lifted.rotations, up)
         scene = Scene(header, lifted, identities, detected, moment)
         if identities:
             self._stream.lifted(lifted)  # in the camera's axes, before `target_frame`
         return self._placed(source, scene, up) if identities else scene, observation.places
+
+    def _against_gravity(self, header: Header) -> Gravity:
+        """Return the direction against gravity in the camera's axes, and its source."""
+        found = self._gravity.find(self._up, header.frame_id, header.stamp)
+        if found.up is None and self._target.name:
+            return self._target.gravity(header)
+        return found
 
     def _identities(
         self, source: KeypointTopic, observation: Observation, moment: Moment, *, with_objects: bool
@@ -465,9 +491,18 @@ class LifterNode(Node):
     ) -> Lifted:
         """Return objects at the size with which they stand on the floor; `placed` ones stay."""
         assert self._floor
-        scales = self._floor(names, lifted.shapes, up, moment.seconds).astype(np.float32)
+        layout = self._pipeline.model.layout
+        believed = believed_scales(layout, self._pipeline.reference_length)
+        if self._floor_check.is_due(now := time.monotonic()):
+            height = self._camera_options.camera_height
+            factors = floor_factor(lifted.shapes.astype(np.float64), up, height)
+            if placed is not None:
+                factors[placed] = np.nan
+            self._floor_check.add(now, factors, believed)
+        scales = self._floor(names, lifted.shapes, up, moment.seconds, believed).astype(np.float32)
         if placed is not None:
             scales[placed] = 1
+        self._floor_sizes = names, scales
         return lifted._replace(
             shapes=scales[:, None, None] * lifted.shapes, scale=lifted.scale / scales
         )
@@ -497,6 +532,16 @@ class LifterNode(Node):
         except Exception as problem:
             self.get_logger().warning(
                 f"joints of {source.topic} not published: {_error_text(problem)}",
+                throttle_duration_sec=LOG_PERIOD,
+            )
+
+    def _tell_lost(self) -> None:
+        """Publish who is lost on silent topics; a failure must not end the node."""
+        try:
+            self._bodies.tell_lost()
+        except Exception as problem:
+            self.get_logger().warning(
+                f"lost objects not published: {_error_text(problem)}",
                 throttle_duration_sec=LOG_PERIOD,
             )
 
@@ -577,6 +622,8 @@ class LifterNode(Node):
         if warning := self._name_check():
             self.get_logger().warning(warning)
         is_active = self._stage is Stage.ACTIVE
+        if self._stage is not Stage.UNCONFIGURED:
+            self._camera.update()
         statuses = [self._lifting_status() if is_active else self._waiting_status()]
         if self._stage is not Stage.UNCONFIGURED:
             statuses.append(self._training.status)
@@ -614,12 +661,42 @@ class LifterNode(Node):
             values |= self._depth.report()
             if level == OK and self._depth.problem:
                 level, message = WARN, self._depth.problem
-        values["gravity"] = self._gravity.status(self._up, frame)
-        for identity, bones in self._pipeline.learned_bones().items():
+        gravity = self._against_gravity(Header(frame_id=frame))
+        values["gravity"] = gravity.status
+        if gravity.up is not None and gravity.source != self._gravity_source:
+            self._gravity_source = gravity.source
+            self.get_logger().info(f"gravity: {gravity.status}")
+        if self._floor:
+            values["floor"] = self._floor_status(known=gravity.up is not None)
+        for identity, bones in self._pipeline.learned_bones(shown=self._present()).items():
             values[f"bones of {identity}"] = bones
         values |= {"subscribed": self._keypoint_topics.description, "camera": self._camera.status}
         node = self.get_fully_qualified_name()
         return status(f"{node}: lifting", level, message, values, node)
+
+    def _floor_status(self, *, known: bool) -> str:
+        """Return what the floor says of the last objects, for diagnostics.
+
+        Args:
+            known: whether the direction of gravity is.
+        """
+        text = f"{self._camera_options.camera_height:g} m below the camera"
+        if not known:
+            return f"{text}; not used: the direction of gravity is not known"
+        names, scales = self._floor_sizes
+        sizes = (f"{name.split(' ', 1)[-1]} {s:.2f}" for name, s in zip(names, scales, strict=True))
+        return f"{text}; times the assumed size: {', '.join(sizes) or 'nobody yet'}"
+
+    def _present(self) -> dict[str, NDArray[np.float32]]:
+        """Return the shape as published of each identity in the last message of its topic."""
+        since = time.monotonic() - _PRESENT
+        self._scenes = {topic: last for topic, last in self._scenes.items() if last[0] > since}
+        return {
+            name: shape
+            for _, scene in self._scenes.values()
+            for name, shape in zip(scene.identities, scene.lifted.shapes, strict=True)
+            if name and np.isfinite(shape).all()
+        }
 
     def _layout_status(self) -> str:
         """Return the layout of the keypoints as text, for diagnostics."""
@@ -631,7 +708,8 @@ class LifterNode(Node):
     def _check_input(self, level: int, residual: float, *, idle: bool) -> None:
         """Look at the last messages; log what looks wrong, at a limited rate.
 
-        It looks in the first reports, while something looks wrong, and then once in 10 s.
+        It looks in the first reports, while something looks wrong, and then once in 10 s; at
+        gravity and the floor always.
 
         Args:
             level: of the diagnostics.
@@ -642,8 +720,9 @@ class LifterNode(Node):
             self._findings, self._checks = [], 0
             return
         self._checks += 1
-        early = self._checks <= _EARLY_CHECKS
-        if not (early or self._findings or level != OK or self._checks % _CHECK_EVERY == 0):
+        early, scene = self._checks <= _EARLY_CHECKS, self._scene_findings()
+        found = bool(self._findings or scene)
+        if not (early or found or level != OK or self._checks % _CHECK_EVERY == 0):
             return
         size = self._camera.size
         try:
@@ -654,6 +733,7 @@ class LifterNode(Node):
             self._findings = self._stream.look(
                 self._pipeline, size, self._camera.intrinsics, residual
             )
+            self._findings += scene
             inputs = parameter_bridge.read(self, InputOptions)
             if bool(inputs.image_width) != bool(inputs.image_height):
                 text = (
@@ -671,6 +751,17 @@ class LifterNode(Node):
             if now - self._logged.get(finding.code, -math.inf) >= _FINDING_PERIOD:
                 self._logged[finding.code] = now
                 self.get_logger().warning(str(finding))
+
+    def _scene_findings(self) -> list[Finding]:
+        """Return whether the people of the last seconds contradict gravity or the floor."""
+        gravity = self._against_gravity(Header(frame_id=self._last_frame))
+        layout, trunk = self._pipeline.model.layout, self._pipeline.reference_length
+        return [
+            *self._gravity_check.find(gravity.source, gravity.mend),
+            *self._floor_check.find(
+                self._camera_options.camera_height, trunk if layout.reference == TRUNK else None
+            ),
+        ]
 
     def _build_pipeline(self, changes: Sequence[Parameter]) -> Pipeline:
         """Return the pipeline for the parameters after `changes`; raise ValueError if invalid."""
@@ -759,6 +850,7 @@ class LifterNode(Node):
         self._pipeline = self._proposed
         self._camera.set_image_size(self._pipeline.image_size)
         self._up = parameter_bridge.read(self, GravityOptions, _GRAVITY).direction
+        self._forget_scene()
         for warning in self._unused_options(changes):
             self.get_logger().warning(warning)
 
@@ -901,7 +993,8 @@ def main() -> None:
     except ExternalShutdownException:
         pass
     except Exception:
-        if not signals:
+        # The executor fails on a context that is shut down before Python has called our handler.
+        if not signals and rclpy.ok():
             raise
     finally:
         shut_down()

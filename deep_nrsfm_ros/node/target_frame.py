@@ -15,11 +15,16 @@ from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.frame_tree import FrameTree, Transform
 from deep_nrsfm_ros.messages.serialised import Header
-from deep_nrsfm_ros.node.gravity import subscribe_to_frames
+from deep_nrsfm_ros.node.gravity import FRAME_MEND, Gravity, subscribe_to_frames
 from deep_nrsfm_ros.node.message_types import message_class
 
 _NUMBERS = 7
 _MAX_GAP = 0.05  # s between keypoints and the nearest transform, above which there is a warning
+
+_POSE_MEND = (
+    "check the quaternion of camera_pose: it turns the optical frame's axes (x right, y down, z "
+    "forward), so that of a level camera that looks along x is -0.5 0.5 -0.5 0.5"
+)
 
 
 @dataclass(frozen=True)
@@ -103,8 +108,20 @@ class TargetFrame:
 
     def up(self, header: Header) -> NDArray[np.float64] | None:
         """Return the direction (3,) of the target's z axis in a camera's axes; None: unknown."""
-        found = self.transform(header) if self.name else None
-        return None if found is None else np.ascontiguousarray(found.rotation[2])
+        return self.gravity(header).up
+
+    def gravity(self, header: Header) -> Gravity:
+        """Return the direction of the target's z axis in a camera's axes, and its source."""
+        if not self.name:
+            return Gravity(None)
+        found = self.transform(header)
+        if found is None:
+            return Gravity(None, f"target_frame {self.name} on /tf")
+        by = f"target_frame {self.name}"
+        up = np.ascontiguousarray(found.rotation[2])
+        if self._pose is None:
+            return Gravity(up, by, FRAME_MEND)
+        return Gravity(up, f"camera_pose in {by}", _POSE_MEND)
 
     def __call__(self, header: Header, lifted: Lifted) -> tuple[Header, Lifted]:
         """Return objects in the target frame, and their header.

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deep_nrsfm_ros.body.floor import CLEARANCE, FloorScale, floor_scale
+from deep_nrsfm_ros.body.floor import CLEARANCE, FloorScale, floor_factor, floor_scale
 
 UP = np.array([0, -1.0, 0])
 HEIGHT = 1.4
@@ -48,3 +48,13 @@ def test_nan_changes_nothing() -> None:
     floor(("anna",), person(0.8), UP, 0.0)
     (scale,) = floor(("anna",), np.full((1, 4, 3), np.nan), UP, 0.1)
     assert scale == pytest.approx(1.25)
+
+
+def test_a_size_that_does_not_exist_is_not_believed() -> None:
+    giants, believed = person(0.5), (0.4, 1.3)
+    assert FloorScale(HEIGHT)(("a",), giants, UP, 0.0) == pytest.approx(2)
+    assert FloorScale(HEIGHT)(("a",), giants, UP, 0.0, believed) == 1
+    assert floor_factor(giants, UP, HEIGHT) == pytest.approx(2)
+    assert floor_factor(person(0.1), UP, HEIGHT) == pytest.approx(10)
+    assert floor_factor(person() - [0, 3.0, 0], UP, HEIGHT) == np.inf
+    assert np.isnan(floor_factor(np.full((1, 4, 3), np.nan), UP, HEIGHT))

@@ -69,3 +69,19 @@ def test_a_gap_and_a_clock_that_begins_anew_give_no_jump() -> None:
     assert tracker(("anna",), far, 5.0).states == (NEW,)
     assert (tracker(("anna",), far, 5.1).velocities == 0).all()
     assert (tracker(("anna",), far + 1, 5.1).velocities == 0).all()  # the stamp is that of the last
+
+
+def test_who_is_lost_is_told_for_a_second_unless_back() -> None:
+    tracker, point, nobody = MotionTracker(0.1), np.zeros((1, 1, 3)), np.zeros((0, 1, 3))
+    for i in range(10):
+        tracker(("anna",), point, i / RATE)
+        tracker(("bert",), point, i / RATE)
+    assert len(tracker) == 2 and not tracker((), nobody, 1.0).lost
+    told = [tracker((), nobody, 1.4 + i / RATE).lost for i in range(60)]
+    assert [set(lost) for lost in told] == [{"anna", "bert"}] * 31 + [set()] * 29
+    assert not len(tracker)
+    tracker(("anna",), point, 5.0)
+    assert tracker((), nobody, 6.5).lost == ("anna",)
+    assert tracker(("anna",), point, 6.6).lost == () == tracker(("anna",), point, 6.7).lost
+    tracker((), nobody, 8.0)
+    assert tracker((), nobody, 0.0).lost == ()  # the clock begins anew

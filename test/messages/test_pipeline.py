@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from benchmarks.data.walking_person import in_layout
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
+from deep_nrsfm_ros.layouts.layout import TRUNK
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
@@ -129,3 +131,40 @@ def test_learned_bones_are_shown_in_units_of_the_reference_length() -> None:
     (text,) = pipeline.learned_bones().values()
     assert "s of sight: " in text and "neck-mid_hip 0.500" in text and "right_knee" not in text
     assert "left_knee-left_ankle" in text and "big_toe" not in text  # coco17 has no toes
+
+
+def bones_of(text: str) -> dict[str, float]:
+    """Return the lengths of a text of learned bones by name."""
+    pairs = (bone.rsplit(" ", 1) for bone in text.split(": ")[1].split(", "))
+    return {name: float(length) for name, length in pairs}
+
+
+def test_learned_bones_have_the_unit_of_the_points_and_are_of_those_present() -> None:
+    layout = LAYOUTS["coco17"]
+    pipeline = Pipeline(HUMAN, layout, InputOptions(), LiftingOptions(), SmoothingOptions())
+    mapped = KeypointMap(layout, HUMAN.layout)(*in_layout(layout, 30))
+    for i in range(30):
+        names = ("a", "b") if i < 10 else ("a",)
+        seen = Observation(mapped[0][[i] * len(names)], mapped[1][[i] * len(names)])
+        lifted, _ = pipeline.lift(seen, CAMERA, names, "topic", Moment(i / 30))
+    assert pipeline.learned_bones(shown={}) == {}
+    (text,) = pipeline.learned_bones(shown={"a": 2.12 * lifted.shapes[0]}).values()
+    own = bones_of(pipeline.learned_bones()["a"])
+    assert bones_of(text) == pytest.approx({n: 2.12 * v for n, v in own.items()}, rel=0.02)
+    span = np.linalg.norm(np.subtract(*lifted.shapes[0][[*map(HUMAN.layout.index, TRUNK)]]))
+    assert bones_of(text)["neck-mid_hip"] == pytest.approx(2.12 * span, abs=1e-3)
+
+
+def test_learned_bones_have_the_unit_of_the_points_where_no_bone_joins_the_reference() -> None:
+    other = replace(HUMAN, layout=replace(HUMAN.layout, reference=("nose", "left_knee")))
+    pipeline = Pipeline(other, None, InputOptions(), LiftingOptions(), SmoothingOptions())
+    mapped = KeypointMap(LAYOUTS["coco17"], HUMAN.layout)(*in_layout(LAYOUTS["coco17"], 30))
+    for i in range(30):
+        seen = Observation(mapped[0][[i]], mapped[1][[i]])
+        lifted, _ = pipeline.lift(seen, CAMERA, ("a",), "topic", Moment(i / 30))
+    shape = lifted.shapes[0]
+    (text,) = pipeline.learned_bones(shown={"a": shape}).values()
+    index = other.layout.index
+    for name, length in bones_of(text).items():
+        a, b = (index(end) for end in name.split("-"))
+        assert length == pytest.approx(np.linalg.norm(shape[a] - shape[b]), rel=0.25, abs=0.02)

@@ -222,3 +222,9 @@ def test_another_type_is_read_by_its_decoder() -> None:
 
 def test_a_header_tells_its_time_in_nanoseconds() -> None:
     assert Header(3, 4).stamp == 3_000_000_004
+
+
+def test_a_later_header() -> None:
+    assert Header(4, 900_000_000, "optical").later(1_200_000_000) == Header(
+        6, 100_000_000, "optical"
+    )

@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.messages.stamps import Moment, RateLimit, TopicClock, one_clock
+from deep_nrsfm_ros.messages.stamps import (
+    Moment,
+    RateLimit,
+    TopicClock,
+    check_stamps,
+    one_clock,
+)
 
 SECOND = 1_000_000_000
 WALL = 1_700_000_000 * SECOND
@@ -146,3 +152,34 @@ def test_after_a_jump_of_time_a_message_is_due_and_the_next_is_not(second: float
     limit = RateLimit(10)
     assert [limit.is_due(Moment(t)) for t in (50.0, 50.04)] == [True, False]
     assert [limit.is_due(Moment(second + t)) for t in (0.0, 0.04, 0.1)] == [True, False, True]
+
+
+def times(*seconds: float) -> np.ndarray:
+    """Return times as an array in ns."""
+    return np.array(at(*seconds), np.int64)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "said"),
+    [
+        (times(*np.arange(1800, 1801, 1 / 30)), ""),
+        (times(), ""),
+        (times(*[0] * 16), "the last 16 messages on /k all have the stamp 0.000 s: let the"),
+        (times(*[100] * 4), "the last 4 messages on /k all have the stamp 100.000 s: let the"),
+        (
+            times(100, 1.7e9, 100.1, 1.7e9 + 0.1, 100.2),
+            "the stamps on /k are of two clocks, 100.000 s and 1700000000.100 s: ",
+        ),
+        (times(0.1, 0.2, 1.7e9, 1.7e9 + 0.1), ""),  # the clock has begun
+        (np.arange(16) * 33, "the stamps on /k are 3.3e-08 s apart: header.stamp.sec must be"),
+        (times(*range(0, 99000, 33000)), "the stamps on /k are 3.3e+04 s apart: header.stamp"),
+        (times(*np.tile(np.arange(8), 2)), ""),  # a bag in a loop
+        (
+            times(*np.repeat(np.arange(8), 2)),
+            "8 of 15 stamps on /k are not above the one before: do several detectors",
+        ),
+    ],
+)
+def test_the_stamps_of_live_messages_are_named_with_the_mend(stamps: np.ndarray, said: str) -> None:
+    found = [str(finding) for finding in check_stamps(stamps.astype(np.int64), "/k")]
+    assert [text[: len(said)] for text in found] == [said] * bool(said)

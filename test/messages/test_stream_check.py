@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What looks wrong in the last messages of a stream: keypoints outside the image."""
+"""What looks wrong in the last messages of a stream: keypoints outside the image, confidence."""
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Point32, Polygon, PolygonStamped
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2, PointField
 
 from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN17
@@ -17,7 +21,15 @@ from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.smoothing import SmoothingOptions
-from deep_nrsfm_ros.messages.decoding import POINT_CLOUD, POLYGON, InputType, is_normalised
+from deep_nrsfm_ros.messages.decoding import (
+    POINT_CLOUD,
+    POINT_FIELDS,
+    POINT_STEP,
+    POLYGON,
+    InputType,
+    is_normalised,
+    pack_points,
+)
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
@@ -43,6 +55,47 @@ class Reader:
 
 def test_fractions_are_told_from_pixels() -> None:
     assert is_normalised(FRACTIONS) and not is_normalised(PIXELS) and not is_normalised(POLYGON)
+
+
+def cloud(points: np.ndarray, confidence: np.ndarray) -> bytes:
+    """Return a serialised PointCloud2 of keypoints."""
+    n, q = confidence.shape
+    fields = [PointField(name=name, offset=o, datatype=7, count=1) for name, o in POINT_FIELDS]
+    data = array("B", pack_points(points, confidence))
+    step = {"point_step": POINT_STEP, "row_step": q * POINT_STEP}
+    raw: bytes = serialize_message(PointCloud2(height=n, width=q, fields=fields, data=data, **step))
+    return raw
+
+
+def polygon(points: np.ndarray, confidence: np.ndarray) -> bytes:
+    """Return a serialised PolygonStamped of the first object."""
+    rows = np.c_[points[0], confidence[0]].tolist()
+    corners = [Point32(x=x, y=y, z=z) for x, y, z in rows]
+    raw: bytes = serialize_message(PolygonStamped(polygon=Polygon(points=corners)))
+    return raw
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "write"),
+    [(POINT_CLOUD, PointCloud2, cloud), (POLYGON, PolygonStamped, polygon)],
+)
+@pytest.mark.parametrize(("largest", "expected"), [(1.0, []), (95.0, ["confidence-scale"])])
+def test_confidence_in_percent_is_found_in_messages(
+    kind: str, message: Any, write: Any, largest: float, expected: list[str]
+) -> None:
+    points, confidence = in_layout(HUMAN17)
+    lifted = Pipeline(
+        load_model("human17"), None, InputOptions(), LiftingOptions(), SmoothingOptions()
+    )
+    stream = StreamCheck(search=False)
+    reader = MessageReader(kind, lambda raw: deserialize_message(raw, message))
+    for i in range(8):
+        raw = write(points[[i]], largest * np.linspace(0.15, 1, 17)[None])
+        stream.received("keypoints", reader, raw)
+        lifted.read(raw, reader)  # the format is known from here on
+    found = stream.look(lifted, None, None, 0.05)
+    assert [f.code for f in found if f.code != "stamps"] == expected
+    assert not expected or str(found[0]).startswith("confidence up to 95: it must be 0 to 1")
 
 
 @pytest.mark.parametrize(("mapping", "expected"), [(PIXELS, ["outside"]), (FRACTIONS, [])])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -231,6 +232,26 @@ def test_the_lifter_says_names_frames_angles_and_states(client: Client) -> None:
     assert track.name == "object1"
     x, y, z = (getattr(joints.transforms[0].translation, k) for k in "xyz")
     assert z > 0.5 and abs(x) < z and abs(y) < z
+
+
+def test_who_is_gone_is_lost_where_the_detector_falls_silent(client: Client) -> None:
+    heard = hear(client, {"/lifter/tracks": (DiagnosticArray, 10)})["/lifter/tracks"]
+    assert [s.message for s in heard[-1].status][0] in ("new", "tracked")
+    before = heard[-1].header.stamp
+
+    def lost() -> dict[int, Any]:
+        """Return the messages with the lost object by stamp: other tests subscribe as well."""
+        said = [("object1", LOST)]
+        found = (m for m in heard if [(s.name, s.message) for s in m.status] == said)
+        return {m.header.stamp.sec * 10**9 + m.header.stamp.nanosec: m for m in found}
+
+    client.wait(lambda: len(lost()) > 1, "two messages of the lost object")
+    first = lost()[min(lost())]
+    assert first.header.frame_id == "optical" and 1 <= first.header.stamp.sec - before.sec <= 3
+    assert first.status[0].level == DiagnosticStatus.STALE
+    told = time.monotonic()
+    client.wait(lambda: time.monotonic() > told + 3, "the end of the second")
+    assert len(lost()) <= 4  # told for a second
 
 
 def test_each_object_has_its_topics(client: Client) -> None:

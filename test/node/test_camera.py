@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
 from std_msgs.msg import Header
@@ -93,6 +94,47 @@ def test_objects_are_at_their_place_once_camera_info_is_heard(
     x, y, z = place(answer)
     assert z > 0.5 and (x / z, y / z) == pytest.approx(ray, abs=0.05)
     assert client.exchange(publisher, keypoints("other")[0]).header.frame_id == "other"
+
+
+@pytest.mark.parametrize("reliability", [*ReliabilityPolicy][1:3])
+@pytest.mark.parametrize("first", ["lifter", "driver"])
+def test_a_driver_has_no_reason_to_warn(
+    start_lifter: Callable[..., Any],
+    connect: Callable[..., Any],
+    reliability: ReliabilityPolicy,
+    first: str,
+) -> None:
+    if first == "lifter":
+        start_lifter(camera_info="camera_info")
+    client = connect()
+    events: list[Any] = []
+    camera = client.node.create_publisher(
+        CameraInfo,
+        "camera_info",
+        QoSProfile(depth=5, reliability=reliability),
+        event_callbacks=PublisherEventCallbacks(incompatible_qos=events.append),
+    )
+    client.node.create_timer(0.1, lambda: camera.publish(info()))
+    if first == "driver":
+        start_lifter(camera_info="camera_info", listens=False)
+    client.wait_for_health(lambda _, v: v["camera"] == "plumb_bob, focal length 600.0 pixels")
+    client.wait_for_health(lambda *_: True)
+    assert camera.get_subscription_count() == 1 and not events
+
+
+def test_a_latched_publisher_that_comes_and_goes_leaves_no_subscription(
+    start_lifter: Callable[..., Any], connect: Callable[..., Any]
+) -> None:
+    start_lifter(camera_info="camera_info")
+    client = connect()
+    for focal in (600.0, 700.0):
+        camera = client.node.create_publisher(CameraInfo, "camera_info", LATCHED)
+        camera.publish(info(focal))
+        shown = f"plumb_bob, focal length {focal:.1f} pixels"
+        client.wait_for_health(lambda _, v, shown=shown: v["camera"] == shown)
+        assert camera.get_subscription_count() == 2
+        client.node.destroy_publisher(camera)
+        client.wait(lambda: client.node.count_subscribers("/camera_info") == 1, "one subscription")
 
 
 def test_a_field_of_view_gives_objects_their_place_without_camera_info(

@@ -154,3 +154,20 @@ def test_more_dropped_than_lifted_is_a_warning_with_the_mend(health: LifterDiagn
     )
     assert values["messages dropped"] == "3"
     assert health.report().level == OK
+
+
+def test_the_last_problem_has_its_age_and_is_gone_after_a_minute(
+    health: LifterDiagnostics, clock: Clock
+) -> None:
+    assert health.report().values["last problem"] == "none"
+    health.rejected("no CameraInfo")
+    assert health.report().values["last problem"] == "no CameraInfo"
+    clock.now += 12
+    health.lifted(0.001, GOOD, SURE)
+    assert health.report().values["last problem"] == "no CameraInfo (12 s ago)"
+    clock.now += 50
+    health.lifted(0.001, GOOD, SURE)
+    assert health.report().values["last problem"] == "none"
+    assert health.report().values["messages rejected"] == "1"
+    health.publisher_problem("another type")
+    assert health.report().values["last problem"] == "another type"

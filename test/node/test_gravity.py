@@ -104,3 +104,23 @@ def test_a_frame_on_tf_comes_first(node: Node, monkeypatch: pytest.MonkeyPatch) 
     assert "waiting for frame map" in gravity.status(None, "optical")
     gravity._tree.add("map", "optical", (-0.5, 0.5, -0.5, 0.5))
     assert_near(gravity(None, "optical"), LEVEL)
+
+
+def test_the_status_names_the_source_and_an_imu_without_a_transform(node: Node) -> None:
+    gravity = GravityDirection(node, GravitySources(imu="imu"))
+    assert gravity.status(None, "optical") == "waiting for IMU on imu"
+    assert gravity.status(LEVEL, "optical").endswith("in the camera's axes, by gravity.up")
+    message = Imu()
+    message.header.frame_id = "imu_link"
+    message.linear_acceleration.z = 9.81
+    gravity._receive_imu(message)
+    found = gravity.find(None, "optical")
+    assert found.status == (
+        "up is 0.00 0.00 1.00 in the camera's axes, by the IMU on imu, whose imu_link is taken as "
+        "the camera's optical frame"
+    )
+    assert "the axes of imu_link are those of the camera's optical frame" in found.mend
+    gravity._tree.add("imu_link", "optical", (-0.5, 0.5, -0.5, 0.5))
+    found = gravity.find(None, "optical")
+    assert found.status.endswith("by the IMU on imu") and "imu_link to optical" in found.mend
+    assert GravityDirection(node, GravitySources()).status(None, "") == "unknown"

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from sensor_msgs.msg import PointCloud2
 from benchmarks.data.walking_person import IMAGE, in_layout
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
 from deep_nrsfm_ros.node.lifter_client import running_layout
-from test.node.conftest import Client, Connect, StartLifter
+from test.node.conftest import Client, Connect, StartLifter, values
 from test.node.test_lifter import cloud, unpack
 
 AUTO = {"model": "human", "input_type": "auto", "keypoint_layout": "auto"}
@@ -124,3 +125,88 @@ def test_qos_overrides_act_on_a_remapped_topic(start_lifter: StartLifter, connec
         lambda: client.node.get_subscriptions_info_by_topic("/detector/out"), "the subscription"
     )
     assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+CAMERA = {
+    "model": "human",
+    "keypoint_layout": "coco17",
+    "field_of_view": 65.2,
+    "image_width": IMAGE[0],
+    "image_height": IMAGE[1],
+}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "source", "mend"),
+    [
+        ({"gravity.up": [0.0, 1.0, 0.0]}, "gravity.up", "check its sign and its axes"),
+        (
+            {"target_frame": "base_link", "camera_pose": [0.0, 0.0, 1.4, 0.0, 0.0, 0.0, 1.0]},
+            "camera_pose in target_frame base_link",
+            "check the quaternion of camera_pose",
+        ),
+    ],
+)
+def test_a_wrong_direction_of_gravity_is_said(
+    start_lifter: StartLifter,
+    connect: Connect,
+    parameters: dict[str, Any],
+    source: str,
+    mend: str,
+) -> None:
+    lifter = start_lifter(**CAMERA, **parameters)
+    client = connect()
+    with stream(client, *in_layout(COCO17)):
+        status = client.wait_for_health(lambda s, v: "against gravity" in v["findings"])
+        assert status.level == b"\x01" and f"that {source} gives: {mend}" in status.message
+        assert values(status)["gravity"].endswith(f"in the camera's axes, by {source}")
+        lifter.wait_for_log(mend)
+        if source == "gravity.up":
+            assert not client.set_parameters(gravity__up=[0.0, -1.0, 0.0])
+            client.wait_for_health(lambda s, v: v["findings"] == "none" and s.level == b"\x00")
+
+
+def test_the_direction_of_a_target_frame_is_shown(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
+    pose = {"target_frame": "base_link", "camera_pose": [0.0, 0.0, 1.4, -0.5, 0.5, -0.5, 0.5]}
+    lifter = start_lifter(**CAMERA, **pose)
+    client = connect()
+    shown = "up is 0.00 -1.00 0.00 in the camera's axes, by camera_pose in target_frame base_link"
+    client.wait_for_health(lambda _, v: v["gravity"] == shown)
+    lifter.wait_for_log("gravity: up is")
+
+
+def test_a_height_of_the_camera_that_makes_giants_is_said(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
+    level = {"gravity.up": [0.0, -1.0, 0.0]}
+    lifter = start_lifter(**CAMERA, **level, camera_height=2.2)
+    client = connect()
+    client.wait_for_health(lambda _, v: v["floor"].endswith("assumed size: nobody yet"))
+    with stream(client, *in_layout(COCO17)):
+        status = client.wait_for_health(lambda s, v: "camera_height is 2.2" in v["findings"])
+        assert status.level == b"\x01" and "people on that floor would have a trunk of" in (
+            status.message
+        )
+        assert values(status)["floor"] == (
+            "2.2 m below the camera; times the assumed size: object1 1.00"
+        )
+        lifter.wait_for_log("camera_height is 2.2 and is not used")
+
+
+def test_a_right_height_of_the_camera_is_shown(start_lifter: StartLifter, connect: Connect) -> None:
+    level = {"gravity.up": [0.0, -1.0, 0.0]}
+    start_lifter(**CAMERA, **level, camera_height=0.95)
+    client = connect()
+    with stream(client, *in_layout(COCO17)):
+        shown = "times the assumed size: object1 1."
+        status = client.wait_for_health(
+            lambda _, v: shown in v["floor"] and int(v["messages lifted"]) > 400
+        )
+        assert values(status)["findings"] == "none"
+        bones = values(status)["bones of object1"].split(": ")[1].split(", ")
+        trunk = dict(bone.rsplit(" ", 1) for bone in bones)["neck-mid_hip"]
+        scale = values(status)["floor"].split("object1 ")[1]
+        assert float(trunk) == pytest.approx(0.5 * float(scale), rel=0.05)
+    client.wait_for_health(lambda _, v: "bones of object1" not in v)  # nobody is there
