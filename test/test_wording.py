@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sentences of a training name no option of the command line in Python."""
+"""Sentences of a training name no option of the command line in Python, nor in the node."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.sanity import check
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
+from deep_nrsfm_ros.training.few_frames import _beginning
 from deep_nrsfm_ros.training.judge import _advice, _guessed, _mirrored_as_a_whole
-from deep_nrsfm_ros.wording import in_python, wording
+from deep_nrsfm_ros.training.mirror import warning
+from deep_nrsfm_ros.wording import in_node, in_python, wording
 from test.test_rooms import PACKAGE, imports
 
 OPTION = re.compile(r"--[a-z]+(?:-[a-z]+)*|\btrain\.[a-z_*]+|\bFILE\b|image_width")
@@ -32,12 +34,7 @@ NOT_SAID = {
     ("lifting/observation.py", "--keypoint-layout"): "of a message",
     ("lifting/options.py", "image_width"): "of the node",
     ("messages/field_mapping.py", "image_width"): "of a message",
-    ("training/few_frames.py", "--minutes"): "Python's `train` has no limit",
-    ("training/few_frames.py", "train.minutes"): "Python's `train` has no limit",
-    ("training/judge.py", "--minutes"): "Python's `train` has no limit",
-    ("training/judge.py", "train.minutes"): "Python's `train` has no limit",
-    ("training/mirror.py", "--seed"): "the program alone warns",
-    ("training/mirror.py", "--seeds"): "the program alone warns",
+    ("model_files/matching_model.py", "--model"): "of what is lifted",
 }
 """Options that files of Python's `train` name by the words of the programs alone, and why."""
 
@@ -81,7 +78,9 @@ def named_outside_wording(path: Path) -> set[str]:
     nodes = list(ast.walk(ast.parse(path.read_text())))
     calls = [node for node in nodes if isinstance(node, ast.Call)]
     said = [call for call in calls if ast.unparse(call.func) in ("option", "wording")]
-    left_out = {id(inner) for call in said for part in call.args for inner in ast.walk(part)}
+    words = [part for call in said for part in call.args]
+    words += [each.value for call in said for each in call.keywords if each.arg == "node"]
+    left_out = {id(inner) for part in words for inner in ast.walk(part)}
     left_out |= {id(node.value) for node in nodes if isinstance(node, ast.Expr)}  # docstrings
     texts = [node for node in nodes if isinstance(node, ast.Constant) and id(node) not in left_out]
     return {option for text in texts for option in OPTION.findall(str(text.value))}
@@ -124,6 +123,22 @@ def test_sentences_in_python_name_no_option() -> None:
     assert sum(bool(OPTION.search(text)) for text in sentences(human)) >= 13
     with in_python():
         assert not [text for text in sentences(human) if OPTION.search(text)]
+
+
+def test_sentences_in_the_node_name_parameters_alone() -> None:
+    human = load_model("human")
+
+    def said() -> list[str]:
+        hurried = dataclasses.replace(human, provenance={"factorisation_needs_minutes": 2.5})
+        more = [_advice(hurried, ""), _beginning(60, 75.0, 1.0), warning(0.3)]
+        return [*sentences(human), *more, curate(people()).summary]
+
+    options = re.compile(r"(?<!-)--[a-z]")
+    files_alone = "--missing-value"  # of files, for which the node has no parameter
+    with in_node():
+        assert not [s for s in said() if options.search(s) and files_alone not in s]
+        assert sum("train." in s for s in said()) >= 10
+    assert sum(bool(options.search(s)) for s in said()) >= 13
 
 
 def test_after_python_words_are_those_of_the_programs_again() -> None:

@@ -15,9 +15,10 @@ from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.training.same_name import CUT_OFF
+from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL
 
 COLUMNS = ("model", "object", "keypoints", "judged", "date")
-BETTER, AS_GOOD, ALONE, DOUBTFUL, NOT_JUDGED = "better", "as_good", "alone", "doubtful", "-"
+NOT_JUDGED = "-"
 EXPLANATION = (
     "judged: whether the model was better than the one at hand at its training (as_good: alike), "
     "without labels; alone = no other model had its keypoints; - = not judged. Models of one "

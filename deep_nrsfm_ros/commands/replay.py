@@ -148,7 +148,8 @@ def read_recording(
         warn(f"showing the lifted points without keypoints: {error}")
         recorded, source = None, layout or model.layout
     recording = join_lifted_messages(lifted, recorded, source, model.layout)
-    return recording, f"as recorded; drawn as model {model.name}"
+    frame = recording.fixed_frame and f" in {recording.fixed_frame}, z up"
+    return recording, f"as recorded{frame}; drawn as model {model.name}"
 
 
 def serve(page: str, port: int | None, work: Callable[[Broadcast, threading.Event], None]) -> None:

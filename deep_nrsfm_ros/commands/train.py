@@ -15,6 +15,7 @@ import stat
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,19 +28,24 @@ from deep_nrsfm_ros.data.pose2sim import JOINTS
 from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.varied_images import ImageVariation
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.lifting.sanity import EXIT_DOUBTFUL
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
+from deep_nrsfm_ros.model_files.matching_model import knows
 from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Recipe
 from deep_nrsfm_ros.reporting.page import Training, write_report
+from deep_nrsfm_ros.training.activation import switch_commands
 from deep_nrsfm_ros.training.config import TrainingConfig
 from deep_nrsfm_ros.training.distributed import own_share, rank
 from deep_nrsfm_ros.training.handedness_check import handedness_warning
+from deep_nrsfm_ros.training.job import FOR_NODE
 from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments
 from deep_nrsfm_ros.training.run import TrainingResult, run
+from deep_nrsfm_ros.wording import in_node
 
 if TYPE_CHECKING:  # it imports torch
     from deep_nrsfm_ros.training.judge import Judgement
@@ -228,12 +234,13 @@ def report_end(result: TrainingResult, reporter: Reporter) -> None:
         values["warning"] = "; ".join(warnings)
     lines = [result.message]
     if judgement := result.judgement:
-        values["judgement"] = "doubtful" if judgement.doubtful else "better"
+        values["judgement"] = judgement.record()["verdict"]
         # The lifter shows the last line where warnings may be out of sight.
         said = str(judgement) if reporter.as_json else judgement.brief
         lines = [said, f"model {result.message}"]
         if judgement.doubtful:
             reporter.warnings.append(judgement.brief)  # for the page; the last line says it as well
+    reporter.judging("the report, beside your other models of this object")
     page = write_page(result, reporter)
     lines += [f"report {page}"] if page else []
     if not reporter.as_json and result.state == "finished":  # else the lifter says it
@@ -253,9 +260,9 @@ def _next_steps(layout: KeypointLayout, path: Path, judgement: Judgement | None)
         use = "not in use, but you can look at what it lifts"
     elif judgement and judgement.is_first_look:
         use = "too few steps for use, but you can look at what it lifts"
-    lines = [
-        f"{use}: lift FILE --model {name}, or in a lifter: ros2 param set /lifter model {path.stem}"
-    ]
+    other = not knows(layout, HUMAN25)
+    switch = ", and then ".join(switch_commands("/lifter", path.stem, other_object=other))
+    lines = [f"{use}: lift FILE --model {name}, or in a lifter: {switch}"]
     if set(JOINTS) <= set(layout.keypoints):
         lines.append(f"see how many mm it is off on the demo's person: demo --model {name}")
     return lines
@@ -303,8 +310,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     reporter = (SilentReporter if rank() else Reporter)(arguments.json_progress, should_stop)
     code = 0
     try:
-        if result := run(parse(arguments, reporter.say), reporter, should_stop):
-            report_end(result, reporter)
+        with in_node() if os.environ.get(FOR_NODE) else nullcontext():
+            result = run(parse(arguments, reporter.say), reporter, should_stop)
+            if result:
+                report_end(result, reporter)
+        if result:
             if result.state == "cancelled":
                 code = CANCELLED
             elif result.judgement and result.judgement.faults and not arguments.force:

@@ -122,7 +122,7 @@ class Curated:
         """Return one sentence with every count; "" if nothing was dropped or hidden."""
         dropped = {
             "with too few visible keypoints": self.few_visible,
-            "near-duplicates": self.near_duplicates,
+            f"near-duplicates{_keep_duplicates()}": self.near_duplicates,
             "that contradict the rest": self.inconsistent,
         }
         parts = [f"{count} {reason}" for reason, count in dropped.items() if count]
@@ -155,6 +155,7 @@ class Curated:
                 "poses and not mistakes of the detector, "
                 + wording(
                     "--outlier-threshold 0 keeps them",
+                    node="train.outlier_threshold 0 keeps them",
                     python="the program `train` can keep them",
                 )
             )
@@ -166,9 +167,18 @@ class Curated:
         return tuple(warnings)
 
 
+def _keep_duplicates() -> str:
+    """Return how near-duplicates are kept."""
+    return wording(
+        " (--min-change 0, train.min_change 0: keep them)",
+        node=" (train.min_change 0 keeps them)",
+        python="",
+    )
+
+
 def _look_at_the_detector() -> str:
     """Return what to do about frames with few keypoints."""
-    confidence = wording("--min-confidence", python="the confidence")
+    confidence = wording("--min-confidence", node="min_confidence", python="the confidence")
     return f"look at the detector, {confidence} and the keypoint layout"
 
 
@@ -182,8 +192,8 @@ def curate(
     Args:
         dataset: is not changed.
         options: what to drop; None = defaults.
-        on_progress: called after each few thousand frames of both passes; an exception ends the
-            curation.
+        on_progress: called after each few thousand frames of both passes, of which the second
+            counts as many as the first; an exception ends the curation.
 
     Raises:
         ValueError: an option is out of range, or no frame has enough visible keypoints.
@@ -197,7 +207,7 @@ def curate(
             + _look_at_the_detector()
         )
     frames = np.flatnonzero(enough)
-    candidates = dataset if enough.all() else dataset[frames]
+    candidates, count = dataset if enough.all() else dataset[frames], len(frames)
     if options.min_change:
         changed = changed_frames(
             candidates.points,
@@ -217,7 +227,7 @@ def curate(
             candidates.points,
             visible,
             options.outlier_threshold,
-            lambda done, total: on_progress(total + done, 2 * total),
+            lambda done, total: on_progress(count + round(count * done / total), 2 * count),
         )
     number = outliers.sum(1)
     keep = (number <= _MAX_OUTLIER_SHARE * visible.sum(1)) & (

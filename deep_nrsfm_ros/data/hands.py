@@ -109,7 +109,7 @@ def as_right_hands(hands: Dataset, side: str) -> Dataset:
         raise ValueError(
             f"hands are {side!r}, but the object {layout.name!r} has no {', '.join(lacking)}: "
             "leave this out, or name the object hand21 "
-            f"({wording('--object, train.object', python='object')})"
+            f"({wording('--object, train.object', node='train.object', python='object')})"
         )
     if side == "palms":
         left = _look_left(hands.points, layout)
@@ -145,11 +145,11 @@ def mixed_sides(hands: Dataset, least: float = _SOME) -> str:
     share = np.nan if hands.is_one_side else other_side_share(hands)
     if not share >= least:
         return ""
+    option = wording("--hands, train.hands", node="train.hands", python="hands")
     return (
         f"{100 * share:.0f} % of the hands look like those of the other side: if left and right "
         "hands are mixed, the model learns a mirrored depth, and no figure shows it. Say what they "
-        f"are ({wording('--hands, train.hands', python='hands')}): palms (each shows its palm: "
-        "left ones are mirrored), right or left"
+        f"are ({option}): palms (each shows its palm: left ones are mirrored), right or left"
     )
 
 

@@ -35,15 +35,17 @@ class LiftedMessage(NamedTuple):
 
     Attributes:
         stamp: time of the frame in ns.
-        shapes: (n, p, 3) in the camera's axes, in output units; NaN where not lifted.
+        shapes: (n, p, 3) in the axes of `frame_id`, in output units; NaN where not lifted.
         confidence: (n, p) in [0, 1].
-        rotation: (3, 3) from object to camera, of the first object; None if not recorded.
+        rotation: (3, 3) from the first object to `frame_id`; None if not recorded.
+        frame_id: frame of the points: the camera's, or the lifter's target_frame, with z up.
     """
 
     stamp: int
     shapes: NDArray[np.float32]
     confidence: NDArray[np.float32]
     rotation: NDArray[np.float32] | None
+    frame_id: str = ""
 
 
 def has_lifted_messages(path: Path) -> bool:
@@ -81,7 +83,8 @@ def read_lifted_messages(
         for time, stamp, message in _messages(bag, points, warn):
             values = read_points(message)
             shapes, confidence = values[..., :3], values[..., 3]
-            lifted.append(LiftedMessage(stamp, shapes, confidence, rotations.get(stamp)))
+            rotated, frame_id = rotations.get(stamp), str(message.header.frame_id)
+            lifted.append(LiftedMessage(stamp, shapes, confidence, rotated, frame_id))
             times.append(time)
             on_progress(len(lifted), max(len(lifted), points.total))
     stamps, warnings = one_clock([each.stamp for each in lifted], times)

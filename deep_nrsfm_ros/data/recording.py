@@ -23,10 +23,14 @@ from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.track_matching import keypoint_tolerances
-from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, weak_perspective
+from deep_nrsfm_ros.model_files.matching_model import map_to_model
+from deep_nrsfm_ros.nrsfm.geometry import Floats, centre, reprojection_error, weak_perspective
 
 _CAUSAL = OverTime()
 
+# From a fixed frame (x front, y left, z up) to the axes of a level camera that looks along its x.
+_LEVEL_CAMERA = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], np.float32)
+_MAX_MISFIT = 0.5  # reprojection error; below 0.3 in the right axes, about 0.9 in others
 _MAX_DELAY = 50_000_000  # ns between the stamps of keypoints and points of one frame
 
 
@@ -39,12 +43,15 @@ class Recording:
         target: layout of the lifted shapes.
         detections: the 2D keypoints.
         lifted: the 3D shapes; NaN with confidence 0 for objects that were not lifted.
+        fixed_frame: frame with z up in which a lifter with target_frame gave the shapes, which are
+            here in the axes of a level camera that looks along its x. "" = in the camera's axes.
     """
 
     source: KeypointLayout
     target: KeypointLayout
     detections: Detections
     lifted: Lifted
+    fixed_frame: str = ""
 
     @property
     def is_lifted(self) -> NDArray[np.bool_]:
@@ -81,7 +88,7 @@ def lift_recording(
         ValueError: too few keypoints of the layout are keypoints of the model.
     """
     target = lifter.model.layout
-    to_model = KeypointMap(source, target)
+    to_model = map_to_model(source, target)
     if lifter.layout != source:
         history = lifter.constants.history
         lifter = Lifter(lifter.model, lifter.options, layout=source, history=history)
@@ -113,6 +120,7 @@ def join_lifted_messages(
     detections: Detections | None,
     source: KeypointLayout,
     target: KeypointLayout,
+    fixed_frame: str = "",
 ) -> Recording:
     """Return recorded messages of a lifter, joined with the keypoints that they belong to.
 
@@ -125,6 +133,7 @@ def join_lifted_messages(
         detections: the recorded keypoints; None = they were not recorded.
         source: layout of the detections.
         target: layout of the model that lifted them.
+        fixed_frame: known target_frame of the lifter; "" = the keypoints tell whether it has one.
 
     Raises:
         ValueError: the messages are of a model with another number of keypoints.
@@ -151,8 +160,34 @@ def join_lifted_messages(
     scale = np.where((visible > 0).any(1), scale, np.nan).astype(np.float32)
     unknown = np.full(m, np.nan, np.float32)
     rotations = rotations.astype(np.float32)
+    fixed_frame = fixed_frame or _fixed_frame(messages, detections.frame_id)
+    if not (fixed_frame or detections.frame_id) and _has_z_up(points, visible > 0, shapes):
+        fixed_frame = next((each.frame_id for each in messages if each.frame_id), "target_frame")
+    if fixed_frame:
+        shapes[...], rotations = shapes @ _LEVEL_CAMERA.T, _LEVEL_CAMERA @ rotations
+        scale, translation = unknown, np.full((m, 2), np.nan, np.float32)
     lifted = Lifted(shapes, rotations, scale, translation, unknown, confidence)
-    return Recording(source, target, detections, lifted)
+    return Recording(source, target, detections, lifted, fixed_frame)
+
+
+def _fixed_frame(messages: Sequence[LiftedMessage], camera: str) -> str:
+    """Return the one frame of all messages if it is not that of the camera; "" = it is, or unknown.
+
+    A lifter without target_frame that lifts for several cameras gives points in several frames.
+    """
+    frames = {message.frame_id for message in messages}
+    return frames.pop() if camera and len(frames) == 1 and camera not in frames else ""
+
+
+def _has_z_up(points: Floats, visible: NDArray[np.bool_], shapes: Floats) -> bool:
+    """Return whether shapes (m, p, 3) project to their keypoints (m, p, 2) with z up only."""
+    known = np.isfinite(shapes).all((1, 2)) & (visible.sum(1) > 1)
+    if not known.any():
+        return False
+    image, seen, S = points[known], visible[known], centre(shapes[known])
+    axes = S, S @ _LEVEL_CAMERA.T
+    as_is, turned = (np.median(reprojection_error(image, P[..., :2], seen)) for P in axes)
+    return bool(turned < _MAX_MISFIT < as_is)
 
 
 def _rows(detections: Detections, message: LiftedMessage) -> NDArray[np.int64]:

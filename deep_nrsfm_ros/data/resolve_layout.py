@@ -23,7 +23,9 @@ from deep_nrsfm_ros.lifting.layout_fit import (
     fit_layouts,
 )
 from deep_nrsfm_ros.lifting.sanity import POOR_RESIDUAL, Finding, is_person
+from deep_nrsfm_ros.model_files.matching_model import model_of_count
 from deep_nrsfm_ros.model_files.model_file import Model
+from deep_nrsfm_ros.wording import wording
 
 _SHOWN = 4  # names in a text
 _TIE = 0.02  # difference of residuals that chance makes
@@ -77,10 +79,19 @@ def resolve_layout(
         return ResolvedLayout(layout, f"{q} keypoints; no object has enough of them to try it")
     if q == len(preferred):
         return ResolvedLayout(preferred, f"the order of {preferred.name}, {q} keypoints")
+    other = model_of_count(q)
+    options = f"--model {other}; to train --object {other}"
+    hint = f", but model {other!r} lifts objects of {q} keypoints ({options})" if other else ""
     raise ValueError(
         f"the objects have {q} keypoints; no layout of {q} keypoints is known that model "
-        f"{model.name!r} ({len(model.layout)} keypoints) can lift: name one with --keypoint-layout"
+        f"{model.name!r} ({len(model.layout)} keypoints) can lift{hint}: name one with "
+        f"{layout_option()}"
     )
+
+
+def layout_option() -> str:
+    """Return the option that names the layout of the detector's keypoints."""
+    return wording("--keypoint-layout", node="train.keypoint_layout", python="layout")
 
 
 class NameCheck(NamedTuple):
@@ -118,7 +129,7 @@ def check_names(layout: KeypointLayout, target: KeypointLayout, owner: str) -> N
         raise ValueError(
             f"its keypoints are named {_shown(names)}, and those of {owner} "
             f"{_shown(wanted)}: rename them{f', such as {guesses}' if guesses else ''}, or name "
-            "the layout in whose order they are with --keypoint-layout"
+            f"the layout in whose order they are with {layout_option()}"
         ) from None
     findings, warnings = list[Finding](), list[str]()
     if close and are_mostly_known(names, wanted):

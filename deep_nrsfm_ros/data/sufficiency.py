@@ -68,12 +68,15 @@ class Sufficiency:
         )
 
 
-def assess_sufficiency(dataset: Dataset, *, has_start: bool = False) -> Sufficiency:
+def assess_sufficiency(
+    dataset: Dataset, *, has_start: bool = False, near_duplicates: int = 0
+) -> Sufficiency:
     """Return whether a model can be learned from a dataset; deterministic, within a second.
 
     Args:
         dataset: the frames.
         has_start: whether the training starts from a model, which has learned depth elsewhere.
+        near_duplicates: number of frames that the curation left out as such.
     """
     counts = dataset.visible.sum(0) >= max(1, _MIN_VISIBLE_SHARE * len(dataset))
     frames, keypoints = len(dataset), int(counts.sum())
@@ -86,7 +89,9 @@ def assess_sufficiency(dataset: Dataset, *, has_start: bool = False) -> Sufficie
             keypoints,
             f"only {keypoints} keypoints are visible ({', '.join(names) or 'none'}); NRSfM needs "
             "at least 4, better 8; check the layout and "
-            + wording("lower --min-confidence", python="the confidence"),
+            + wording(
+                "lower --min-confidence", node="lower min_confidence", python="the confidence"
+            ),
         )
     lines = np.zeros(len(dataset), bool)
     for part in slices(len(dataset)):
@@ -118,7 +123,7 @@ def assess_sufficiency(dataset: Dataset, *, has_start: bool = False) -> Sufficie
     deformation = float(np.sqrt(max(0.0, 1 - (values[:3] ** 2).sum())))
     figures = (frames, keypoints, tuple(values.tolist()), span, deformation)
     refusal = _flatness(values)
-    warnings = () if refusal else _warnings(frames, span, deformation, has_start)
+    warnings = () if refusal else _warnings(frames, span, deformation, has_start, near_duplicates)
     if sides := mixed_sides(dataset):
         warnings = (*warnings, sides)
     return Sufficiency(*figures, refusal, warnings)
@@ -180,18 +185,23 @@ def _flatness(values: Floats) -> str:
     return ""
 
 
-def _warnings(frames: int, span: float, deformation: float, has_start: bool) -> tuple[str, ...]:
+def _warnings(
+    frames: int, span: float, deformation: float, has_start: bool, near_duplicates: int
+) -> tuple[str, ...]:
     """Return a sentence for each figure that may make the model poor."""
     warnings = []
     if frames < _FEW_FRAMES:
+        others, differ = "", ""
+        if near_duplicates > frames:
+            others, differ = f", as {near_duplicates} more are near-duplicates", " that differ"
         warnings.append(
-            f"{frames} frames are few; expect a model of those frames alone, and record "
-            "thousands for a model of other frames too"
+            f"{frames} frames are few{others}; expect a model of those frames alone, and record "
+            f"thousands{differ} for a model of other frames too"
         )
     if span < _NARROW:
         views = f"the views span only {span:.0f} degrees around their mean"
         if span < 1:  # deformation hides a rotation that small, or looks like one
-            views = "the keypoints show no view from another side"
+            views = "the frames look as if all were seen from one side"
         warnings.append(
             f"{views}, so that depth rests on the model that the training starts from; record the "
             "object from more sides to learn its depth"
@@ -213,6 +223,8 @@ def how_to_learn_depth() -> str:
     start = wording(
         f"start from {a_model} (--from, train.from), or let the layout help (--bone-length-weight, "
         "--handedness-weight, or train.*)",
+        node=f"start from {a_model} (train.from), or let the layout help "
+        "(train.bone_length_weight, train.handedness_weight)",
         python=f"or start from {a_model} (start)",
     )
     return f"record the object from more sides, {start}"

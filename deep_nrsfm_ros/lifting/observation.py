@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from deep_nrsfm_ros.batched import slices
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.model_files.matching_model import model_of_count
 
 MAX_COORDINATE = 1e9
 """Pixels; a keypoint with a larger coordinate is missing.
@@ -239,5 +240,12 @@ def check_keypoints(count: int, keypoints: int, field: str) -> None:
     if count != keypoints:
         raise MessageError(
             f"message has {count} keypoints ({field}); the keypoint layout has {keypoints}: "
+            + _other_model(count)
             + NAME_THE_LAYOUT
         )
+
+
+def _other_model(count: int) -> str:
+    """Return a hint at the package's model of an object with so many keypoints, or ""."""
+    name = model_of_count(count)
+    return f"{count} keypoints are those of model {name!r}: -p model:={name}; else " if name else ""

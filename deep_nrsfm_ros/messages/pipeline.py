@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.history import Memory
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
@@ -30,6 +29,7 @@ from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.serialised import Header, MessageReader
 from deep_nrsfm_ros.messages.stamps import Moment
+from deep_nrsfm_ros.model_files.matching_model import map_to_model
 from deep_nrsfm_ros.model_files.model_file import Model
 
 Floats = NDArray[Any]
@@ -80,7 +80,7 @@ class Pipeline:
         self.source = detector or model.layout
         self.edges = model.layout.edge_indices()
         self.tolerances = keypoint_tolerances(model.layout)
-        self._map = KeypointMap(self.source, model.layout)
+        self._map = map_to_model(self.source, model.layout)
         self._lifter = Lifter(model, lifting, layout=self.source, history=history)
         self.remembers = history.enabled and lifting.correction != "none"
         self._memories: dict[str, Memory] = {}

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap, TooFewSharedError
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import HUMAN25, LAYOUTS
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
 from deep_nrsfm_ros.model_files.folders import shipped_models
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, ModelFileError, load_once
@@ -55,3 +57,37 @@ def matching_model(
         if found:
             return found[0]
     return None
+
+
+def model_of_count(keypoints: int) -> str:
+    """Return the name of the package's one model of another object than people with so many.
+
+    "" if there is none, or if several layouts have that number of keypoints.
+    """
+    layouts = [layout for layout in LAYOUTS.values() if len(layout) == keypoints]
+    if len(layouts) != 1 or knows(layouts[0], HUMAN25):
+        return ""
+    file = matching_model(layouts[0])
+    return file.stem if file else ""
+
+
+def map_to_model(source: KeypointLayout, target: KeypointLayout) -> KeypointMap:
+    """Return the map from a detector's layout to that of a model.
+
+    Raises:
+        TooFewSharedError: they share too few keypoints; the text names a model that would do.
+    """
+    try:
+        return KeypointMap(source, target)
+    except TooFewSharedError as error:
+        file = matching_model(source)
+        raise TooFewSharedError(f"{error}{_that_lifts(file, source)}") from None
+
+
+def _that_lifts(file: Path | None, layout: KeypointLayout) -> str:
+    """Return a sentence on the model that lifts a layout; "" if there is none."""
+    if file is None:
+        return ""
+    return (
+        f"; model {file.stem!r} lifts {layout.name!r} (-p model:={file.stem}, --model {file.stem})"
+    )

@@ -270,6 +270,7 @@ class LifterNode(Node):
             self._training_request,
             self._switch_model,
             lambda: self._pipeline.model,
+            lambda: self._pipeline.source,
             self._sandbox.models_dir,
         )
 
@@ -948,8 +949,9 @@ def _one_at_a_time(changes: Sequence[Parameter]) -> str:
     if {"model", "keypoint_layout"} <= {change.name for change in changes}:
         return ""
     return (
-        ". To exchange model and keypoint_layout, set keypoint_layout to 'auto' first, then model, "
-        "then keypoint_layout; or set both in one call (set_parameters_atomically)"
+        ". To exchange model and keypoint_layout, set keypoint_layout to 'model' first, then "
+        "model, then keypoint_layout if the detector has another order; or set both in one call "
+        "(set_parameters_atomically)"
     )
 
 

@@ -118,9 +118,10 @@ class LifterClient(Node):
         """
         super().__init__("lifter_client", context=context)
         self._topics, self._on_frame = topics, on_frame
-        # By stamp; 0 for messages without a header.
-        self._observations: OrderedDict[int, Observation] = OrderedDict()
+        # With its frame_id, by stamp; 0 for messages without a header.
+        self._observations: OrderedDict[int, tuple[Observation, str]] = OrderedDict()
         self._waiting: LiftedMessage | None = None
+        self._fixed_frame = ""
         self._keypoints = topics.keypoints and self.resolve_topic_name(topics.keypoints)
         lifter = topics.lifter.rstrip("/")
         self._lifter = self.resolve_topic_name(lifter)  # a node's full name follows the same rules
@@ -165,7 +166,8 @@ class LifterClient(Node):
             except ValueError as problem:
                 self._warn(str(problem))
                 return
-            self._observations[stamp_of(message)] = observation
+            frame_id = getattr(getattr(message, "header", None), "frame_id", "")
+            self._observations[stamp_of(message)] = observation, frame_id
             while len(self._observations) > _MAX_WAITING:
                 self._observations.popitem(last=False)
 
@@ -179,7 +181,8 @@ class LifterClient(Node):
         except ValueError as problem:
             self._warn(str(problem))
             return
-        self._waiting = LiftedMessage(stamp_of(message), values[..., :3], values[..., 3], None)
+        stamp, frame_id = stamp_of(message), message.header.frame_id
+        self._waiting = LiftedMessage(stamp, values[..., :3], values[..., 3], None, frame_id)
 
     def _receive_rotation(self, message: QuaternionStamped) -> None:
         """Add the rotation to its points and pass them on."""
@@ -194,13 +197,19 @@ class LifterClient(Node):
         lifted, self._waiting = self._waiting, None
         if lifted is None:
             return
-        observation = self._observations.get(lifted.stamp) or self._observations.get(0)
-        source, target = self._topics.source, self._topics.target
-        detections = observation and gather([observation], [lifted.stamp], len(source))
+        found = self._observations.get(lifted.stamp) or self._observations.get(0)
+        source, target, fixed = self._topics.source, self._topics.target, ""
+        detections = found and gather([found[0]], [lifted.stamp], len(source), found[1])
+        if not detections and lifted.frame_id == self._fixed_frame:
+            fixed = self._fixed_frame
         try:
-            self._on_frame(join_lifted_messages([lifted], detections, source, target))
+            recording = join_lifted_messages([lifted], detections, source, target, fixed)
         except ValueError as problem:
             self._warn(str(problem))
+            return
+        if detections:
+            self._fixed_frame = recording.fixed_frame
+        self._on_frame(recording)
 
     def _warn(self, problem: str) -> None:
         """Log a problem, throttled."""

@@ -20,16 +20,20 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
 from deep_nrsfm_ros.lifting.observation import MessageError
+from deep_nrsfm_ros.messages.options import AUTO
 from deep_nrsfm_ros.messages.serialised import MessageReader
-from deep_nrsfm_ros.model_files.model_file import Model, load_model
+from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_model
 from deep_nrsfm_ros.node import publishing
-from deep_nrsfm_ros.node.diagnostics import ERROR, OK, status
-from deep_nrsfm_ros.training.activation import reason_to_stay
+from deep_nrsfm_ros.node.diagnostics import ERROR, OK, WARN, status
+from deep_nrsfm_ros.training.activation import reason_to_stay, switch_commands
 from deep_nrsfm_ros.training.config import PARAMETERS, DataConfig, TrainingConfig
 from deep_nrsfm_ros.training.job import JobStatus, TrainingJob
 from deep_nrsfm_ros.training.record import find_records, read_record
 from deep_nrsfm_ros.training.request import TrainingRequest, data_in_words
+from deep_nrsfm_ros.training.same_name import BEFORE
 from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
+from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL
+from deep_nrsfm_ros.wording import in_node
 
 _SAMPLE = 16
 """Messages of a bag that are read before a training is accepted."""
@@ -114,6 +118,7 @@ class TrainingService:
         request: Callable[[], TrainingRequest],
         activate: Callable[[str], None],
         present: Callable[[], Model],
+        source: Callable[[], KeypointLayout],
         folder: Path,
     ) -> None:
         """Offer the services on `node`.
@@ -123,15 +128,17 @@ class TrainingService:
             request: returns the training that the present parameters ask for; raises ValueError.
             activate: switches to the model in a file; raises ValueError if it cannot.
             present: returns the model that the lifter has.
+            source: returns the layout in which it receives keypoints.
             folder: folder of models and of the records of trainings.
         """
         self._node, self._request, self._activate = node, request, activate
-        self._present = present
+        self._present, self._source = present, source
         self._folder = folder
         self._job: TrainingJob | None = None
         self._closed = False
         self._name, self._activate_when = "", "if_better"
         self._state, self._last_failure = "idle", "none"
+        self._switched = "", ""  # name of the model that the last training put in use; what said so
         self._progress: SimpleQueue[JobStatus] = SimpleQueue()
         self._wake = node.create_guard_condition(self._report)
         self._publisher = node.create_publisher(
@@ -161,6 +168,7 @@ class TrainingService:
         names = {"unfinished": ", ".join(record.name for record in records)} if records else {}
         self._publish(JobStatus("idle", message, {**names}))
 
+    @in_node()
     def _train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start a training and answer at once."""
         try:
@@ -227,25 +235,57 @@ class TrainingService:
             return progress
         return progress._replace(message=f"{progress.message}\n{record}: {record.advice}")
 
+    @property
+    def status(self) -> DiagnosticStatus:
+        """The state of the last training; a model that it put in use may be so no longer."""
+        name, said = self._switched
+        now = self._present().name
+        message = self._status.message
+        if said and now != name:
+            message = message.replace(said, f"was in use; the lifter has model {now!r} now")
+        status = self._status
+        return DiagnosticStatus(
+            level=status.level,
+            name=status.name,
+            message=message,
+            hardware_id=status.hardware_id,
+            values=status.values,
+        )
+
     def _switch(self, progress: JobStatus) -> JobStatus:
         """Activate the model of a finished training, if it should be, and say so."""
         if self._activate_when == "never":
             return progress
         model = str(progress.values.get("model", ""))
         if self._activate_when == "if_better":
-            if progress.values.get("judgement") != "better":
+            if progress.values.get("judgement") not in (BETTER, AS_GOOD, ALONE):
                 return progress._replace(message=f"{progress.message}; not in use (train.activate)")
             if reason := self._reason_to_stay(model):
-                node = self._node.get_fully_qualified_name()
-                how = f"to switch: ros2 param set {node} model {Path(model).stem}"
+                how = f"to switch: {self._how_to_switch(model)}"
                 return progress._replace(
                     message=f"{progress.message}; not in use (train.activate): {reason}; {how}"
                 )
+        before, name = str(self._node.get_parameter("model").value), Path(model).stem
         try:
             self._activate(model)
         except ValueError as problem:
             return progress._replace(message=f"{progress.message}; not in use: {problem}")
-        return progress._replace(message=f"{progress.message}; in use from now on")
+        if before == name:  # the file that it replaced
+            before = f"{name}{BEFORE}"
+        said = f"in use from now on; a lifter that is started anew needs -p model:={name}"
+        if before != name + BEFORE or (self._folder / f"{before}{MODEL_SUFFIX}").exists():
+            node = self._node.get_fully_qualified_name()
+            said += f"; to go back to model {before!r}: ros2 param set {node} model {before}"
+        self._switched = self._present().name, said
+        return progress._replace(message=f"{progress.message}; {said}")
+
+    def _how_to_switch(self, file: str) -> str:
+        """Return the commands that have the lifter take the model in a file."""
+        node = self._node.get_fully_qualified_name()
+        # A lifter whose keypoint_layout is auto looks for the layout of its input anew.
+        is_named = self._node.get_parameter("keypoint_layout").value != AUTO
+        other = is_named and not _maps(self._source(), load_model(Path(file)).layout)
+        return ", and then ".join(switch_commands(node, Path(file).stem, other_object=other))
 
     def _reason_to_stay(self, file: str) -> str:
         """Return why the lifter should not switch to the model in a file by itself, or ""."""
@@ -257,11 +297,14 @@ class TrainingService:
     def _publish(self, progress: JobStatus) -> None:
         """Publish progress, and log it where the state changes or there is a message."""
         failed = progress.state == "failed"
+        warns = not progress.values and progress.message.startswith("warning: ")
+        warns |= bool(progress.values.get("warning"))
+        warns |= progress.values.get("judgement") == DOUBTFUL
         news = f"training of {self._name!r}: {progress.message}"
         if failed:
             self._node.get_logger().error(news)
             self._last_failure = news
-        elif not progress.values and progress.message.startswith("warning: "):
+        elif warns:
             self._node.get_logger().warning(news)
         elif progress.state != "idle" and (progress.state != self._state or not progress.values):
             self._node.get_logger().info(news)  # a new state, or no step but something to say
@@ -270,6 +313,6 @@ class TrainingService:
         self._state = progress.state
         node = self._node.get_fully_qualified_name()
         values = {"state": progress.state, **progress.values, "last failure": self._last_failure}
-        level = ERROR if failed else OK
-        self.status = status(f"{node}: training", level, progress.message, values, node)
-        self._publisher.publish(self.status)
+        level = ERROR if failed else WARN if warns else OK
+        self._status = status(f"{node}: training", level, progress.message, values, node)
+        self._publisher.publish(self._status)

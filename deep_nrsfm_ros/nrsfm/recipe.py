@@ -58,8 +58,9 @@ class Recipe:
     )
     spectral: float = option(
         0.01,
-        "weight of the camera's spectral norm in the loss; used with the free camera only; "
-        "0 = off, 0.01 typical",
+        "weight of a loss that keeps the network's camera from growing; without effect unless the "
+        "network has a free camera (`train --camera free`), which no model of the package has; 0 = "
+        "off, 0.01 typical",
         low=0,
         high=100,
     )
@@ -79,30 +80,32 @@ class Recipe:
     )
     reference: str = option(
         "repair",
-        "repair of mirrored frames by shapes made of similar frames, which the cycle loss takes in "
-        "place of the network's own: repair = while the test finds mirrored frames, always = also "
-        "from a fifth of the steps on, off = never; without effect where cycle is 0, where "
-        "factorisations teach the network (few_frames), or where frames show one side only",
+        "when frames whose depth is mirrored are repaired while training: repair = while a test "
+        "finds such frames, always = in any case, from a fifth of the steps on, off = never. They "
+        "are repaired by shapes made of similar frames, which the cycle loss takes in place of the "
+        "network's own. Without effect where cycle is 0, where factorisations teach the network "
+        "(few_frames), or where frames show one side only",
         choices=("repair", "always", "off"),
     )
     error_scale: float = option(
         1.0,
-        "variance of the network's errors that the model is given, relative to that on the "
-        "training frames; 4 lifts motions that the training lacks a tenth better from clean and "
-        "complete keypoints, those with gaps worse, and makes the confidence too low; 1 = as on "
-        "the training frames; without effect where the training starts from a model, or where its "
-        "last step learns the errors from other data, such as virtual people",
+        "how much more the network is taken to be wrong, in variance, than it is on the frames of "
+        "its training, so that lifting corrects it more; 1 = as much as there. 4 lifts motions "
+        "that the training lacks a tenth better from clean and complete keypoints, those with gaps "
+        "worse, and makes the confidence too low. Without effect where the training starts from a "
+        "model, or with virtual people (`train --virtual-people`)",
         low=0.01,
         high=100.0,
     )
     limb_exchange: float = option(
         float(AUTOMATIC),
-        "share of the shapes that the network must find again from another view (cycle loss) that "
-        "get limbs of other frames, turned at the joints, at the first step; it falls to 0 by the "
-        "last step; lifts people and motions that the frames do not show better, and those of the "
-        "frames a little worse; a limb is what one edge of the layout joins to the rest; without "
-        "effect where cycle is 0; 0 = off; 1 = all, for motions that the data lack; -1 = 1 where "
-        "the training starts from a model of a layout with limbs, 0 from random weights",
+        "whether the training also shows poses that the recording lacks, by limbs exchanged "
+        "between frames: 0 = no, 1 = yes, -1 = yes where it starts from a model of a layout with "
+        "limbs, no from random weights. People and motions that the frames do not show are then "
+        "lifted better, those of the frames a little worse. The number is the share of the cycle "
+        "loss's shapes that get limbs of other frames at the first step; it falls to 0 by the "
+        "last. A limb is what one edge of the layout joins to the rest. Without effect where cycle "
+        "is 0",
         low=float(AUTOMATIC),
         high=1.0,
     )
@@ -125,8 +128,8 @@ class Recipe:
     )
     paper_initialisation: bool = option(
         False,
-        "initialise the weights as the paper's code does: random biases, and the scale of weights "
-        "by the fans of its convolutions",
+        "draw the random weights of a training as the paper's code does; without effect where the "
+        "training starts from a model",
     )
     seeds: int = option(
         3,

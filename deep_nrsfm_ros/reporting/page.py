@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shlex
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.held_out import Split
 from deep_nrsfm_ros.data.lifted_sample import LiftedFrames, lift_sample
 from deep_nrsfm_ros.data.sufficiency import Sufficiency
+from deep_nrsfm_ros.layouts.presets import HUMAN25
 from deep_nrsfm_ros.model_files.matching_model import knows
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
@@ -33,6 +35,7 @@ REPORT_SUFFIX = ".html"
 
 _OTHERS = 12  # other models in the comparison
 _FRAMES = 6  # best frames, and worst frames
+_SAME_ERROR = 1e-4  # rounding, of the error of the same weights
 _MIN_GAP = 0.005  # between two of these frames, as a share of the data
 _CURVES = {
     "loss": "reprojection error",
@@ -45,7 +48,10 @@ _QUALITY = {
     "coherence": "coherence",
     "mirrored_share": "mirrored",
 }
-_FIGURES = ("residual", "bone_variation", "mirrored_share", "front_disagreement", "opposed")
+_FIGURES = (
+    *("residual", "bone_variation", "misfit"),
+    *("mirrored_share", "front_disagreement", "opposed"),
+)
 _CAMERA_TO_SCREEN = np.array([1, -1, -1])  # x right, y down, z forward to x right, y up, z back
 
 
@@ -121,6 +127,8 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         ["orbit.js", "viewer.js"],
         model=model,
         name=training.path.stem,
+        start_share=_start_share(training),
+        other_object=not knows(model.layout, HUMAN25),
         path=shlex.quote(str(training.path.resolve())),
         input_parameters=[
             (name, shlex.quote(value))
@@ -153,6 +161,16 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         provenance=_rows(model.provenance),
         scenes=embedded(scenes),
     )
+
+
+def _start_share(training: Training) -> float:
+    """Return the share of its start in a model's weights; 0 where it is not their mean."""
+    said, combined = training.model.provenance, training.model.quality.get("combined")
+    if "from" not in said or combined is None or not training.progress:
+        return 0.0
+    last = training.progress[-1]
+    is_mean = abs(math.hypot(last.loss, last.cycle_error) - combined) > _SAME_ERROR
+    return float(said["recipe"]["start_share"]) if is_mean else 0.0
 
 
 def _curve(progress: Sequence[Progress], field: str, label: str) -> Markup:
@@ -196,10 +214,9 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
 
 
 def _verdict(standing: Standing, model: Model) -> str:
-    """Return the verdict on a model; that on the one of the page counts its data, too."""
-    judgement = model.provenance.get("judgement", {})
-    is_faulty = standing.model is model and bool(judgement.get("faults"))
-    return "doubtful" if is_faulty else standing.verdict
+    """Return the verdict on a model; that on the one of the page is what its training said."""
+    said = model.provenance.get("judgement", {}) if standing.model is model else {}
+    return str(said.get("verdict", standing.verdict))
 
 
 def _shapes(

@@ -1,5 +1,6 @@
 // Plays a recording: 2D keypoints left, lifted skeletons right. Frames are in the page, or are
-// received from the server. Lifted points are in camera axes: x right, y down, z forward.
+// received from the server. Lifted points are in camera axes: x right, y down, z forward; in a fixed
+// frame, in those of a level camera that looks along its x.
 "use strict";
 const recording = JSON.parse(document.getElementById("recording").textContent);
 const live = recording.frames === null;
@@ -127,7 +128,7 @@ const orbit = new Orbit($("lifted"), 0, 0, () => {
     lines.push([project(from), project(to), stroke, opacity, width]);
   if (atRest && recording.upright) floor(view, frame).forEach(line => lines.push(line));
   if (!atRest && recording.upright) level(view).forEach(line => lines.push(line));
-  if (!atRest || view.chosen.rotation) {
+  if (!frame.fixed && (!atRest || view.chosen.rotation)) {
     const far = frame.camera ? Math.hypot(...frame.camera) : 1.35 * view.reach;
     const tip = frame.camera ? add(frame.camera, atRest ? scaled(view.chosen.position, -1) : [0, 0, 0]) : [0, 0, -far];
     frustum(tip, 0.22 * view.reach).forEach(([a, b]) => put(a, b, "#444444", 1, 2));
@@ -169,7 +170,8 @@ function floor(view, frame) {
   return lines;
 }
 
-// A grid below the objects, level with the camera: the direction of gravity is not known.
+// A grid below the objects, level with the camera: the direction of gravity is not known. In a fixed
+// frame it is level.
 function level(view) {
   const low = 0.95 * extent("reach"), far = 1.2 * extent("reach"), lines = [];
   const project = v => orbit.project(view.up(v));
@@ -189,8 +191,11 @@ function show(next) {
   if (frame) {
     const seconds = frame.t - frames[0].t;
     $("time").value = `${seconds.toFixed(2)} s · ${index + 1} / ${frames.length}`;
+    if (recording.upright) $("grid").textContent = frame.fixed ? `level in ${frame.fixed}, z up` : "level with the camera";
     $("objects").textContent = frame.objects.map(describe).join(" · ") || "no object in this frame";
   }
+  const fixed = frame && frame.fixed ? `${frame.fixed} fixed` : "camera fixed";
+  $("view").textContent = `view: ${atRest ? "object fixed, camera moves" : fixed}`;
   drawSeen();
   orbit.draw();
 }
@@ -230,7 +235,6 @@ function tick(now) {
 function reset() {
   [orbit.yaw, orbit.pitch] = atRest ? [-0.6, 0.3] : [0.75, 0.3];
   wheel = 1;
-  $("view").textContent = atRest ? "view: object fixed, camera moves" : "view: camera fixed";
   show(index);
 }
 

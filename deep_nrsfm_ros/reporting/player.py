@@ -29,7 +29,8 @@ class SceneTransform:
     """The transform from lifted objects to a common scene, the same for all frames of a recording.
 
     Objects lifted without intrinsics are centred at the origin. The scene arranges them as in the
-    image. Objects lifted with intrinsics keep their position in front of the camera.
+    image. Objects lifted with intrinsics keep their position in front of the camera, or in a fixed
+    frame, in which the camera's position is not known.
 
     Without values, the first object in a scene determines them.
 
@@ -37,10 +38,12 @@ class SceneTransform:
         origin: (2,) point of the image in pixels, or (3,) position in front of the camera, at the
             origin of the scene.
         scale: pixels per unit of the scene; 0 for objects at their position.
+        fixed_frame: of the recording; "" = its objects are in the camera's axes.
     """
 
     origin: NDArray[np.floating] | None = None
     scale: float = 0.0
+    fixed_frame: str = ""
 
     def scene(
         self,
@@ -58,7 +61,8 @@ class SceneTransform:
             identities: of the n objects; None = their indices.
 
         Returns:
-            `t` in s; `camera`, its position (3), or None if unknown; `objects`, each with
+            `t` in s; `camera`, its position (3), or None if unknown; `fixed`, the name of the fixed
+            frame, or "" for the camera's axes; `objects`, each with
             `identity` and `keypoints` (3 q: x, y, confidence). Lifted objects also have `shape`
             (3 p, camera axes, centred), `confidence` (p), `position` (3) and `size` of the shape,
             `rotation` (9 or None) and `residual` (or None).
@@ -76,9 +80,10 @@ class SceneTransform:
             objects.append(scene_object)
         at_position = self.origin is not None and not self.scale
         camera = None
-        if at_position and self.origin is not None:
+        if at_position and self.origin is not None and not self.fixed_frame:
             camera = _flat(_rounded(-self.origin, 4))
-        return {"t": round(stamp / 1e9, 4), "camera": camera, "objects": objects}
+        seconds, fixed = round(stamp / 1e9, 4), self.fixed_frame
+        return {"t": seconds, "camera": camera, "fixed": fixed, "objects": objects}
 
     def _lifted(self, lifted: Lifted) -> Scene:
         """Return the part of a scene about one lifted object."""
@@ -125,11 +130,11 @@ def scene_transform(recording: Recording) -> SceneTransform:
     shapes = recording.lifted.shapes[is_lifted]
     centres = shapes.mean(1)
     if len(shapes) and has_position(np.median(np.abs(centres), 0), shapes[len(shapes) // 2]):
-        return SceneTransform(np.median(centres, 0))
+        return SceneTransform(np.median(centres, 0), fixed_frame=recording.fixed_frame)
     scale, translation = (part[is_lifted] for part in recording.lifted[2:4])
     known = np.isfinite(scale) & (scale > 0)
     if not known.any():
-        return SceneTransform()
+        return SceneTransform(fixed_frame=recording.fixed_frame)
     return SceneTransform(np.median(translation[known], 0), float(np.median(scale[known])))
 
 
@@ -145,6 +150,9 @@ def scenes(
     """
     detections, lifted = recording.detections, recording.lifted
     transform = transform or scene_transform(recording)
+    if transform.fixed_frame != recording.fixed_frame:  # the keypoints that tell it came later
+        transform.origin, transform.scale = None, 0.0
+        transform.fixed_frame = recording.fixed_frame
     ends = np.searchsorted(detections.frame, np.arange(len(detections.stamps) + 1))
     for frame in range(0, len(detections.stamps), every):
         rows = slice(ends[frame], ends[frame + 1])

@@ -3,8 +3,22 @@
 
 from __future__ import annotations
 
+from deep_nrsfm_ros.messages.options import MODEL_ORDER
 from deep_nrsfm_ros.model_files.matching_model import knows
 from deep_nrsfm_ros.model_files.model_file import Model
+
+
+def switch_commands(lifter: str, name: str, *, other_object: bool) -> list[str]:
+    """Return the commands that have a running lifter take a model, in order.
+
+    Args:
+        lifter: name of the node.
+        name: of the model.
+        other_object: whether the lifter may have the keypoints of another object, named by its
+            keypoint_layout, with which it refuses the model.
+    """
+    values = ([("keypoint_layout", MODEL_ORDER)] if other_object else []) + [("model", name)]
+    return [f"ros2 param set {lifter} {parameter} {value}" for parameter, value in values]
 
 
 def reason_to_stay(new: Model, present: Model) -> str:

@@ -30,6 +30,7 @@ from deep_nrsfm_ros.nrsfm.network import Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.nrsfm.recipe import PRESETS, LayoutLossWeights, Preset, Recipe
 from deep_nrsfm_ros.training.limits import WHOLE, Limits
+from deep_nrsfm_ros.wording import is_in_node
 
 
 @dataclass(frozen=True)
@@ -313,6 +314,11 @@ PARAMETERS = OptionNames(
         "data": "train.bags and train.inputs",
     },
 )
+
+
+def option_names() -> OptionNames:
+    """Return the names by which the reader of a training's sentences sets options."""
+    return PARAMETERS if is_in_node() else COMMAND_LINE
 
 
 def differences(old: TrainingConfig, new: TrainingConfig, names: OptionNames) -> list[str]:

@@ -22,6 +22,7 @@ from deep_nrsfm_ros.nrsfm.network import complete, whitening_network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.trainer import KnownShapes, second_moment
+from deep_nrsfm_ros.wording import wording
 
 MIN_STEPS = 2000
 """Steps from which the factorisations are worth their seconds."""
@@ -141,13 +142,20 @@ def _rounded(seconds: float) -> int:
     return max(1, round(seconds) if seconds < 20 else round(seconds / 5) * 5)
 
 
+def minutes_option(minutes: float) -> str:
+    """Return a time limit as its option; Python's `train` has none."""
+    return wording(
+        f"--minutes {minutes:g} (train.minutes)", node=f"train.minutes {minutes:g}", python=""
+    )
+
+
 def _beginning(frames: int, needed: float, most: float) -> str:
     """Return a sentence on factorisations that begin: the seconds they need, and at most have."""
     limit = ""
     if needed > most:
         limit = (
-            f"; the time limit leaves them {most:.0f} s, --minutes {_minutes_for(needed):g} "
-            "(train.minutes) would be enough"
+            f"; the time limit leaves them {most:.0f} s, {minutes_option(_minutes_for(needed))} "
+            "would be enough"
         )
     return (
         f"classic factorisations of all {frames} frames come first and take up to about "
@@ -165,7 +173,7 @@ def _cut_short(spent: float, needed: float, minutes: float, *, anything: bool) -
     known = f"they need up to about {_rounded(needed)} s here: " if needed > spent else ""
     return (
         f"the factorisations are cut short after {spent:.0f} s, to leave time for the network; "
-        f"{learns}; {known}give --minutes {minutes:g} (train.minutes), or leave it out"
+        f"{learns}; {known}give {minutes_option(minutes)}, or leave it out"
     )
 
 

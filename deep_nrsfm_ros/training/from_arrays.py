@@ -147,7 +147,11 @@ def train(
         data = as_right_hands(data, hands)
     curated = curate(data)
     origin = _origin(start, layout)
-    sufficiency = assess_sufficiency(curated.dataset, has_start=origin is not None)
+    sufficiency = assess_sufficiency(
+        curated.dataset,
+        has_start=origin is not None,
+        near_duplicates=curated.near_duplicates,
+    )
     if sufficiency.refusal:
         raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
     # A start passes its handedness on to a layout without one.

@@ -20,8 +20,10 @@ from deep_nrsfm_ros.training.config import TrainingConfig
 
 Value = str | int | float | None
 
-ACTIVE = ("starting", "reading", "curating", "training")
+ACTIVE = ("starting", "reading", "curating", "training", "judging")
 ENDED = ("finished", "failed", "cancelled")
+FOR_NODE = "DEEP_NRSFM_FOR_NODE"
+"""Variable of the environment with which a training names parameters, and no options."""
 TRAIN_COMMAND = (sys.executable, "-m", "deep_nrsfm_ros.commands.train")
 
 _OUTPUT_TAIL = 10  # lines
@@ -84,7 +86,7 @@ class TrainingJob:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                env=os.environ | dict.fromkeys(_THREAD_VARIABLES, threads),
+                env=os.environ | dict.fromkeys(_THREAD_VARIABLES, threads) | {FOR_NODE: "1"},
                 pass_fds=[file.fileno()],
             )
         _yield_to_others(self._process.pid)

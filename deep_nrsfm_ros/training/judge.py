@@ -36,6 +36,7 @@ from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
 from deep_nrsfm_ros.training.steps import FROM_RANDOM
+from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL
 from deep_nrsfm_ros.wording import wording
 
 Floats = NDArray[Any]
@@ -106,10 +107,9 @@ _BESIDE = ("opposed", "turned")  # figures that need a model beside it
 _SHOWN = {
     "residual": "image error of the network before the correction {} of the size of the object",
     "bone_variation": "bone lengths vary by {}",
+    "misfit": "both together, the root of their summed squares, {}",
     "wrong_sides": "frames that look mirrored {}",
 }
-BETTER, AS_GOOD, ALONE, DOUBTFUL = "better", "as_good", "alone", "doubtful"
-"""Verdicts; alone: no other model has these keypoints."""
 MIN_SEEN_SHARE = 0.25
 """Share of an object's keypoints that a frame must show to tell its side: of 4 of 25 keypoints the
 mirror image is as good, and the network's prior alone decides."""
@@ -324,8 +324,10 @@ def _has_few_steps(model: Model) -> bool:
 
 
 _IN_SENTENCES = {
-    BETTER: "is better than model {!r}: it fits {}, and mirrors {} frames",
-    AS_GOOD: "is as good as model {!r}: both fit alike, and it mirrors no more frames",
+    BETTER: "is better than model {!r}: image error and bones together are {}, and it mirrors {} "
+    "frames",
+    AS_GOOD: "is as good as model {!r}: image error and bones together are alike, within "
+    f"{round(100 * SAME_MISFIT - 100)} %, and it mirrors no more frames",
     ALONE: "has no other to compare with",
     DOUBTFUL: "is doubtful",
 }
@@ -335,10 +337,12 @@ def _mirrored_as_a_whole(name: str) -> str:
     """Return a sentence on a model whose depth nothing decides."""
     look = wording(
         f"it from the side (replay FILE --model {name} --html look.html)",
+        node="the shapes in the report",
         python="its shapes from the side",
     )
     undo = wording(
         "mirrored (lift --mirrored, the lifter's parameter mirrored)",
+        node="the parameter mirrored",
         python="LiftingOptions(mirrored=True)",
     )
     return (
@@ -361,7 +365,7 @@ def _gains(new: Figures, old: Figures | None) -> tuple[str, str]:
     looser = new.misfit > SAME_MISFIT * old.misfit  # allowed beside a model that mirrors frames
     is_opposed = _or_zero(new.opposed) > MOST_OPPOSED
     fewer = is_opposed or old.wrong_sides > new.wrong_sides + MORE_WRONG_SIDES
-    fit = "more closely" if closer else "less closely" if looser else "alike"
+    fit = "smaller" if closer else "larger" if looser else "alike"
     return fit, "fewer" if fewer else "no more"
 
 
@@ -390,7 +394,7 @@ def _on(frames: Split) -> str:
     """Return on which frames models are compared."""
     count = len(frames.held_out)
     if frames.held_out is frames.training:
-        return f"on the {count} frames of its training, which is weak evidence"
+        return f"on the {count} frames of its training, as none were held out"
     return f"on {count} held-out frames, later ones that it was not trained on"
 
 
@@ -401,6 +405,8 @@ def _shown(new: Figures, old: Figures | None, name: str) -> str:
     ]
     texts = []
     for each, value, other in values:
+        if each == "misfit" and math.isnan(new.bone_variation):
+            continue  # it is the image error alone
         if each == "wrong_sides" and not _is_side_known(new):
             texts.append("neither other views nor a front tell which frames are mirrored")
         elif not math.isnan(value):
@@ -417,10 +423,14 @@ def _guessed(model: Model) -> str:
     more = f" and {len(rare) - _MOST_NAMES} more" if len(rare) > _MOST_NAMES else ""
     said = "only guessed"
     if "from" in model.provenance:
-        said = "their guesses rest on the start"
+        said = "guessed mostly as the start does"
         if model.provenance["recipe"]["start_share"] < (share := _SHARE_OF_SPEAKERS):
-            option = wording(f"--start-share {share}", python=f"Recipe(start_share={share})")
-            said += f"; {option} keeps more of them"
+            option = wording(
+                f"--start-share {share}",
+                node=f"train.start_share {share}",
+                python=f"Recipe(start_share={share})",
+            )
+            said += f"; {option} keeps more of that"
     return f". Rarely shown: {', '.join(rare[:_MOST_NAMES])}{more} ({said})"
 
 
@@ -528,21 +538,33 @@ def _advice(model: Model, rival: str) -> str:
     """Return what would help a doubtful model."""
     advice = ["more views", "more frames"]
     if minutes := model.provenance.get("factorisation_needs_minutes"):
-        advice.insert(0, f"more time (--minutes {minutes:g}, train.minutes, or no limit)")
+        limit = wording(
+            f"--minutes {minutes:g}, train.minutes", node=f"train.minutes {minutes:g}", python=""
+        )
+        advice.insert(0, f"more time ({limit}, or no limit)")
     elif _has_few_steps(model):
         steps = FROM_RANDOM
-        option = wording(f"--steps {steps}, train.steps", python=f"Recipe.steps, {steps} are usual")
+        option = wording(
+            f"--steps {steps}, train.steps",
+            node=f"train.steps {steps}",
+            python=f"Recipe.steps, {steps} are usual",
+        )
         advice.insert(0, f"more steps ({option})")
     if "from" in model.provenance:
         advice.append("fewer steps")
-        option = wording("--start-share, train.start_share", python="Recipe.start_share")
+        option = wording(
+            "--start-share, train.start_share",
+            node="train.start_share",
+            python="Recipe.start_share",
+        )
         advice.append(f"a larger share of the start ({option})")
     else:
-        option = wording("--from, train.from", python="start")
+        option = wording("--from, train.from", node="train.from", python="start")
         advice.append(f"a start from {rival or 'a model of such an object'} ({option})")
     if model.layout.edges and model.layout.handedness:
         options = wording(
             " (--bone-length-weight, --handedness-weight, --depth-penalty, or train.*)",
+            node=" (train.bone_length_weight, train.handedness_weight, train.depth_penalty)",
             python=", which the program `train` offers,",
         )
         advice.append(f"the layout's losses{options}")
@@ -555,7 +577,7 @@ class Standing(NamedTuple):
     Attributes:
         model: the model.
         figures: beside the model at hand.
-        verdict: "at hand", "better" or "doubtful".
+        verdict: "at hand", or BETTER, AS_GOOD or DOUBTFUL beside it; "" where there is none.
         rank: orders the models.
     """
 
@@ -583,7 +605,7 @@ def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> li
         with suppress(ValueError):
             new = old if model is at_hand and old else comparison.figures(model, at_hand)
             place = rank(new, old)
-            verdict = "doubtful" if place.doubtful else "better" if old else ""
+            verdict = DOUBTFUL if place.doubtful else _verdict(new, old) if old else ""
             result.append(Standing(model, new, "at hand" if model is at_hand else verdict, place))
     return sorted(result, key=lambda each: each.rank)
 

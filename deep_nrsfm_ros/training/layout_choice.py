@@ -22,9 +22,10 @@ from deep_nrsfm_ros.lifting.layout_fit import (
 from deep_nrsfm_ros.lifting.sanity import check, is_person
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
 from deep_nrsfm_ros.model_files.model_file import Model, load_model, load_once
-from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
+from deep_nrsfm_ros.training.config import TrainingConfig, option_names
 from deep_nrsfm_ros.training.reporter import Reporter
 from deep_nrsfm_ros.training.validation import find_layouts
+from deep_nrsfm_ros.wording import wording
 
 PEOPLE = "human"
 """The model of people that comes with the package."""
@@ -55,7 +56,8 @@ class Source:
 
     def fail(self, reason: ValueError) -> None:
         """Have no layout."""
-        self.failure = ValueError(f"{self.path}: {reason}, or the object with --object")
+        option = wording("--object", node="train.object", python="")
+        self.failure = ValueError(f"{self.path}: {reason}, or the object with {option}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +149,7 @@ class LayoutChoice:
 
     def report(self, reporter: Reporter) -> None:
         """Report each layout that was chosen, with the reason, and each that is ambiguous."""
-        option = COMMAND_LINE("keypoint_layout")
+        option = option_names()("keypoint_layout")
         chosen = [(each.path.name, each.resolved) for each in self._sources if each.resolved]
         for names, (layout, reason, _) in _by_layout(chosen):
             reporter.say(
@@ -221,7 +223,7 @@ def layout_choice(config: TrainingConfig) -> LayoutChoice | None:
     """
     if config.data.keypoint_layout or config.data.cmu or config.object == NUMBERED:
         return None
-    _, target = find_layouts(config, COMMAND_LINE)
+    _, target = find_layouts(config, option_names())
     if is_person(target):
         return LayoutChoice(load_model(PEOPLE), target)
     return LayoutChoice(load_once(Path(config.start)), target) if config.start else None
@@ -238,7 +240,7 @@ def detector_layout(config: TrainingConfig, layouts: list[KeypointLayout]) -> st
         The name of a preset, or the path of a layout file or model file. "" where it is the layout
         of the model, or where bags and files are of several layouts.
     """
-    named, target = find_layouts(config, COMMAND_LINE)
+    named, target = find_layouts(config, option_names())
     if config.data.keypoint_layout:
         return config.data.keypoint_layout if named.keypoints != target.keypoints else ""
     if len({layout.keypoints for layout in layouts}) != 1:

@@ -30,8 +30,10 @@ class Limits:
     )
     patience: float = option(
         0.0,
-        "fraction of the steps (or of the time limit) without an improvement of the label-free "
-        "quality by 1 %, after which the training ends; 0 = never, 0.2 typical",
+        "share of the steps (or of the time limit) after which a training ends that no longer "
+        "improves: its combined error (reprojection and cycle error, which need no labels; "
+        "`combined` on ~/training_status) has not fallen by 1 % for so long; 0 = never, 0.2 "
+        "typical",
         low=0.0,
         high=1.0,
     )
@@ -51,7 +53,9 @@ class Limits:
         read_only=True,
     )
     keep_best: bool = option(
-        True, "keep the state with the best label-free quality instead of the last state"
+        True,
+        "keep the weights with the least combined error (reprojection and cycle error) instead of "
+        "the last ones",
     )
 
 

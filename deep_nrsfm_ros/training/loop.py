@@ -34,6 +34,7 @@ from deep_nrsfm_ros.training.progress import Clock, Progress
 from deep_nrsfm_ros.training.setup import DEFAULT_SETUP, Setup
 from deep_nrsfm_ros.training.steps import with_steps
 from deep_nrsfm_ros.training.trainer import Trainer
+from deep_nrsfm_ros.wording import wording
 
 _SCREENING_SHARE = 0.1  # of the time, at most
 _FACTORISED = "factorised."  # begins the names of checkpoints' tensors of factorised shapes
@@ -240,12 +241,17 @@ class _Loop:
                 no_improvement=self.best.patience_exceeded,
             )
         self.best.restore_best(trainer)
-        if (start := self.setup.start) is not None and not lacks_whitening(start):
-            trainer.average_with_start(self.preset.recipe.start_share)
-        if trainer.end_reason:
-            trainer.mirrored_share = self.mirror.share(trainer.net)
         if not self.group.rank:
             self.callbacks.on_progress(self.clock.progress(trainer, self.iterations))
+        share, start = self.preset.recipe.start_share, self.setup.start
+        if trainer.step and share and start is not None and not lacks_whitening(start):
+            before = math.hypot(*trainer.measure())
+            trainer.average_with_start(share)
+            after = math.hypot(*trainer.measure())
+            if not self.group.rank:
+                self.callbacks.on_message(_mean_in_words(share, before, after))
+        if trainer.end_reason:
+            trainer.mirrored_share = self.mirror.share(trainer.net)
         return trainer
 
     def _screen(self) -> None:
@@ -348,6 +354,18 @@ class _Loop:
         if self.screening:
             where += f", where seed {self.trainer.seed} is screened"
         self.callbacks.on_message(f"goes on at {where}")
+
+
+def _mean_in_words(share: float, before: float, after: float) -> str:
+    """Return a sentence on the mean with the start, and the combined error before and after it."""
+    option = wording(
+        "--start-share, train.start_share", node="train.start_share", python="Recipe.start_share"
+    )
+    return (
+        f"the model is the mean of its start, with a share of {share:g} ({option}), and of the "
+        f"trained weights: combined is {after:.3f} on the frames of the training, and was "
+        f"{before:.3f} before; the mean keeps what the start can do on other frames"
+    )
 
 
 def _frames_with_extent(points: NDArray[np.float32], visible: NDArray[np.bool_]) -> FrameStore:

@@ -35,6 +35,7 @@ from deep_nrsfm_ros.training.distributed import ALONE, ProcessGroup
 from deep_nrsfm_ros.training.few_frames import FactorisedShapes
 from deep_nrsfm_ros.training.frames import FrameStore
 from deep_nrsfm_ros.training.trainer import KnownShapes, Trainer, second_moment
+from deep_nrsfm_ros.wording import wording
 
 MOST_FRAMES = 15_000
 """Frames of the reference: 11 s on one core, 220 MB."""
@@ -63,8 +64,9 @@ def warning(share: float) -> str:
         return ""
     return (
         f"{100 * share:.1f} % of the frames have a mirrored depth: frames of nearly the same shape "
-        "from other sides are lifted as its mirror image; train with another seed (--seed) or "
-        "more of them (--seeds)"
+        "from other sides are lifted as its mirror image; train with another seed "
+        f"({wording('--seed', node='train.seed', python='Recipe.seed')}) or more of them "
+        f"({wording('--seeds', node='train.seeds', python='Recipe.seeds')})"
     )
 
 

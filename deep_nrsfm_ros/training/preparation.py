@@ -27,7 +27,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.sanity import Finding, to_pixels
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED
-from deep_nrsfm_ros.training.config import COMMAND_LINE, PARAMETERS, DataConfig, TrainingConfig
+from deep_nrsfm_ros.training.config import DataConfig, TrainingConfig, option_names
 from deep_nrsfm_ros.training.data_check import (
     WRONG_LAYOUT,
     SourceFinding,
@@ -45,8 +45,7 @@ from deep_nrsfm_ros.training.layout_choice import (
 )
 from deep_nrsfm_ros.training.reporter import Reporter
 from deep_nrsfm_ros.training.validation import find_layouts, read_field_mapping
-
-_OPTION = f"({COMMAND_LINE('keypoint_layout')}, {PARAMETERS('keypoint_layout')})"
+from deep_nrsfm_ros.wording import wording
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def read_data(config: TrainingConfig, reporter: Reporter) -> ReadData:
     Raises ValueError where there is no such data, or none that can be read or learned from.
     """
     data = config.data
-    source, target = find_layouts(config, COMMAND_LINE)
+    source, target = find_layouts(config, option_names())
     if data.cmu:
         images = read_split(_selection(data, data.cmu), target, reporter.reading)
         return ReadData(varied(images, config.variation), "")
@@ -295,6 +294,11 @@ class _Reader:
                 count = f"{reading.unreadable} of {reading.messages}"
                 reporter.warn(f"{count} messages could not be read: {reading.reason}")
             whole = _in_pixels(reading.dataset, options)
+            if len(whole) > reading.messages:
+                reporter.say(
+                    f"{reading.messages} messages hold {len(whole)} objects; each is a frame of "
+                    "the training"
+                )
             ends = [start for _, start in reading.starts[1:]] + [len(whole)]
             kept = list[tuple[str, Dataset]]()
             for (bag, start), end in zip(reading.starts, ends, strict=True):
@@ -422,7 +426,10 @@ def _check_bag(
 def _wrong_layout(path: Path, findings: list[Finding]) -> ValueError | None:
     """Return the error of a bag or file that is clearly in another layout; None if it is not."""
     wrong = next((finding for finding in findings if finding.code == WRONG_LAYOUT), None)
-    return ValueError(f"{path}: {wrong} {_OPTION}") if wrong else None
+    option = wording(
+        "--keypoint-layout, train.keypoint_layout", node="train.keypoint_layout", python=""
+    )
+    return ValueError(f"{path}: {wrong} ({option})") if wrong else None
 
 
 def _match_names(
@@ -459,7 +466,9 @@ def prepare(
     curated = curate(dataset, curation, reporter.curating)
     if curated.summary:
         reporter.say(curated.summary)
-    sufficiency = assess_sufficiency(curated.dataset, has_start=has_start)
+    sufficiency = assess_sufficiency(
+        curated.dataset, has_start=has_start, near_duplicates=curated.near_duplicates
+    )
     if sufficiency.refusal:
         raise ValueError(f"a model cannot be learned from this: {sufficiency.refusal}")
     for warning in (*curated.warnings, *sufficiency.warnings):

@@ -20,6 +20,7 @@ from typing import IO, NamedTuple
 from deep_nrsfm_ros.training.config import TrainingConfig, option_text
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.same_name import UNFINISHED
+from deep_nrsfm_ros.wording import wording
 
 CHECKPOINT = ".checkpoint"
 RECORD = ".training.json"
@@ -185,10 +186,12 @@ def _set_aside(folder: Path, name: str) -> str:
     with suppress(OSError):
         shutil.copyfile(record_file(folder, name), record_file(folder, aside))
     checkpoint_file(folder, name).replace(checkpoint_file(folder, aside))
+    resume = wording(
+        f"--resume --name {aside}", node=f"train.resume with train.name {aside}", python=""
+    )
     return (
         f"the training of {name!r} begins anew. The unfinished one is kept as {aside!r} until one "
-        f"of {name!r} ends with a model that is not doubtful: --resume --name {aside} goes on with "
-        "it"
+        f"of {name!r} ends with a model that is not doubtful: {resume} goes on with it"
     )
 
 

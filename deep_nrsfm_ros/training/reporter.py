@@ -77,6 +77,12 @@ class Reporter:
         step, steps = values.pop("step"), values.pop("steps")
         self._show("training", step, steps, values)
 
+    def judging(self, message: str) -> None:
+        """Report what is done after the last step."""
+        self._close_bar()
+        self._state = "judging"
+        self.say(f"judging: {message}")
+
     def say(self, message: str) -> None:
         """Report a message."""
         if self.as_json:

@@ -36,11 +36,15 @@ UNKNOWN_SIDE = "unknown"
 class TrainingOptions:
     """Data and result of the service ~/train: the parameters `train.*` that no other part has."""
 
-    bags: tuple[str, ...] = option((), "rosbag2 folders or files to train on")
+    bags: tuple[str, ...] = option(
+        (),
+        "rosbag2 folders or files to train on; they lie in the folder of the parameter bags_dir, "
+        "where relative names begin",
+    )
     inputs: tuple[str, ...] = option(
         (),
         "files of keypoints to train on beside the bags, of any kind that `lift` reads, or folders "
-        "of such recordings",
+        "of such recordings; they lie in bags_dir, too",
     )
     topic: str = option(
         "",

@@ -19,7 +19,7 @@ from deep_nrsfm_ros.data.held_out import Split, split
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
-from deep_nrsfm_ros.training.config import COMMAND_LINE, TrainingConfig
+from deep_nrsfm_ros.training.config import TrainingConfig, option_names
 from deep_nrsfm_ros.training.data_check import SourceFinding, never_seen
 from deep_nrsfm_ros.training.disk import unwritable
 from deep_nrsfm_ros.training.distributed import join, rank
@@ -37,6 +37,7 @@ from deep_nrsfm_ros.training.same_name import (
     old_model,
 )
 from deep_nrsfm_ros.training.validation import validate
+from deep_nrsfm_ros.wording import wording
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.training.judge import Judgement
@@ -89,7 +90,7 @@ def run(
         ValueError: for a configuration, data or a folder that a training cannot work with.
         CancelledError: the training was stopped before anything was learned.
     """
-    validate(config, COMMAND_LINE)
+    validate(config, option_names())
     try:
         dataset, detector_layout, findings = read_data(config, reporter)
         if config.data.hands:
@@ -141,6 +142,10 @@ def _train_and_save(
     from deep_nrsfm_ros.training.finish import finish
 
     dataset = prepared.dataset
+    reporter.judging(
+        "bones and errors of the new model; it takes some seconds, up to a minute where other "
+        "programs have the cores"
+    )
     people = read_people(config, dataset.layout, reporter)
     model = finish(trainer, config.output.name, dataset.layout, dataset.source, people)
     date = time.strftime("%Y-%m-%d", time.gmtime())
@@ -149,6 +154,8 @@ def _train_and_save(
         model = inherit(model, start)
     judgement, rival = None, rivals[0] if rivals else None
     if trainer.end_reason:
+        beside = f" beside model {rival.name!r}" if rival else ""
+        reporter.judging(f"the new model on {len(frames.held_out)} frames{beside}")
         judgement, rival = _judge(frames, model, rivals, findings)
         model.provenance["judgement"] = judgement.record()
     else:
@@ -247,9 +254,10 @@ def _describe(
 ) -> None:
     """Report the size of the dataset, what it cannot teach, and what the training starts from."""
     dataset = prepared.dataset
+    random = wording("--from none, train.from none", node="train.from none", python="")
     if not is_resumed:  # the training loop says where it goes on
         reporter.say(
-            f"starts from model {start.name!r} (--from none, train.from none: from random weights)"
+            f"starts from model {start.name!r} ({random}: from random weights)"
             if start
             else "starts from random weights"
         )
@@ -267,7 +275,7 @@ def _shared_out(total: int, frames: Split) -> str:
     return (
         f"{training} of the {total} frames are trained on; {held_out} later ones are held out to "
         f"judge the model, and {total - training - held_out} between them are left out "
-        "(--held-out, train.held_out)"
+        f"({wording('--held-out, train.held_out', node='train.held_out', python='')})"
     )
 
 
@@ -282,10 +290,11 @@ def _train(
     weights = config.layout_loss
     origin = load_once(Path(config.start)) if config.start else None
     start = start_from(origin, dataset.layout) if origin else None
-    weights.check(dataset.layout, COMMAND_LINE)
+    weights.check(dataset.layout, option_names())
     import torch  # takes seconds; a wrong configuration is refused without it
 
     from deep_nrsfm_ros.nrsfm.layout_loss import LayoutLoss
+    from deep_nrsfm_ros.training.few_frames import minutes_option
     from deep_nrsfm_ros.training.loop import Callbacks, Checkpointing, train
     from deep_nrsfm_ros.training.setup import Setup
 
@@ -314,8 +323,8 @@ def _train(
     group.close()
     if trainer.minutes_needed and trainer.end_reason:
         reporter.warn(
-            "the factorisations of the few frames were cut short: give --minutes "
-            f"{trainer.minutes_needed:g} (train.minutes), or leave it out, for a better model"
+            "the factorisations of the few frames were cut short: give "
+            f"{minutes_option(trainer.minutes_needed)}, or leave it out, for a better model"
         )
     return trainer
 
@@ -326,7 +335,7 @@ def _ending(
     """Return the state and the message with which the training ends; remove a used checkpoint."""
     if not trainer.end_reason:
         message = f"{path} holds what was learned so far"
-        goes_on = f", --resume --name {name} goes on"
+        goes_on = wording(f", --resume --name {name} goes on", node="", python="")
         return "cancelled", message + (goes_on if checkpoint.exists() else "")
     checkpoint.unlink(missing_ok=True)
     message, steps = str(path), trainer.preset.recipe.steps

@@ -493,3 +493,14 @@ def test_gravity_is_three_numbers(
     with pytest.raises(SystemExit) as ended:
         main([*command, "--up", "0", "-1"])
     assert ended.value.code == 2 and "three finite numbers" in capsys.readouterr().err
+
+
+def test_hands_without_a_model_are_told_theirs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / "hands.npy", np.random.default_rng(0).uniform(0, 500, (9, 21, 2)))
+    words = [str(tmp_path / "hands.npy"), "--output", str(tmp_path / "lifted.npz")]
+    for more in ([], ["--keypoint-layout", "hand21"]):
+        with pytest.raises(SystemExit, match="2"):
+            main([*words, *more])
+        assert "--model hand21" in capsys.readouterr().err

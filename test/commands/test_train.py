@@ -22,6 +22,7 @@ from deep_nrsfm_ros.commands import train
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.data.dataset import Dataset
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import read_layout
 from deep_nrsfm_ros.layouts.presets import BODY25B, COCO17, HUMAN25
 from deep_nrsfm_ros.lifting.lifter import Lifter
@@ -133,10 +134,12 @@ def test_from_bag_to_model(
     assert in_process(*words) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     states = [line["state"] for line in lines]
-    order = ["reading", "curating", "training", "finished"]
+    order = ["reading", "curating", "training", "judging", "finished"]
     assert states[-1] == "finished" and [*dict.fromkeys(states)] == [
         s for s in order if s in states
     ]
+    judging = [line["message"] for line in lines if line["state"] == "judging"]
+    assert sum(text.startswith("judging: ") for text in judging) == 3
     progress = [line for line in lines if line["state"] == "training" and "step" in line]
     assert (progress[-1]["step"], progress[-1]["steps"]) == (30, 30)
     for field in ("loss", "cycle_error", "coherence", "seconds_left"):
@@ -187,10 +190,8 @@ def test_keypoints_that_no_frame_shows_stay_guesses_of_the_start(
     assert in_process(*words, *more, "--output", str(models)) == 0
     said = capsys.readouterr()
     assert "right_heel" in said.err and "will only guess them, as 'human' does" in said.err
-    assert (
-        "Rarely shown: " in said.out
-        and "(their guesses rest on the start; --start-share 0.8 keeps" in said.out
-    )
+    assert "Rarely shown: " in said.out
+    assert "(guessed mostly as the start does; --start-share 0.8 keeps more of that)" in said.out
     kept, human = load_model(models / "mine.safetensors"), load_model("human")
     np.testing.assert_array_equal(kept.error_covariance, human.error_covariance)
 
@@ -597,7 +598,7 @@ def test_a_good_model_of_the_name_is_compared_with_and_not_lost(
     rows = re.findall(
         r"<td>(mine[a-z_]*)</td><td>(.*?)</td>", path.with_suffix(".html").read_text()
     )
-    assert ("mine", "better") in rows and ("mine_before", "at hand") in rows
+    assert ("mine", "as_good") in rows and ("mine_before", "at hand") in rows
 
 
 def test_a_good_model_of_another_object_gives_its_name(
@@ -631,6 +632,18 @@ def test_a_first_look_is_not_offered_for_use(tmp_path: Path) -> None:
         assert train._next_steps(HUMAN25, tmp_path / "mine.safetensors", judgement)[0].startswith(
             use
         )
+    (use, *_) = train._next_steps(HUMAN25, tmp_path / "mine.safetensors", alone)
+    assert use.endswith("or in a lifter: ros2 param set /lifter model mine")
+
+
+def test_a_model_of_another_object_needs_two_commands(tmp_path: Path) -> None:
+    dog = KeypointLayout("dog", ("nose", "withers", "tail", "paw"))
+    alone = judge.Judgement("", "it is alone", judge.Figures(*[0.1] * 9))
+    (use,) = train._next_steps(dog, tmp_path / "dog.safetensors", alone)
+    assert use.endswith(
+        "or in a lifter: ros2 param set /lifter keypoint_layout model, and then ros2 param set "
+        "/lifter model dog"
+    )
 
 
 def test_a_new_model_must_be_better_than_the_one_at_hand_and_that_of_its_name(

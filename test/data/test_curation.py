@@ -14,6 +14,7 @@ from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation, changed_frames, cur
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.geometry import centre, random_cameras
+from deep_nrsfm_ros.wording import in_python
 
 P = 12
 LAYOUT = KeypointLayout.numbered(P)
@@ -86,6 +87,10 @@ def test_a_still_camera_on_still_objects_is_thinned(objects: int) -> None:
     left = curate(still, ONLY_THIN)
     assert len(left.dataset) == 4 * objects
     assert left.near_duplicates == len(still) - 4 * objects
+    duplicates = f"{left.near_duplicates} near-duplicates"
+    assert f"{duplicates} (--min-change 0, train.min_change 0: keep them)" in left.summary
+    with in_python():
+        assert duplicates in left.summary and "--min-change" not in left.summary
 
 
 def test_different_frames_are_not_thinned() -> None:
@@ -230,3 +235,10 @@ def test_new_frames_at_once_are_those_that_are_found_one_by_one(missing: float) 
     assert f / 10 < len(kept) < f
     found = changed_frames(points.astype(np.float32), visible, 0.05)
     assert np.flatnonzero(found).tolist() == kept
+
+
+def test_progress_counts_to_one_total() -> None:
+    still = dataset(10)[np.repeat(np.arange(10), 50)]
+    counts: list[tuple[int, int]] = []
+    curate(still, Curation(), lambda done, total: counts.append((done, total)))
+    assert len(still) == 500 and counts == [(500, 1000), (1000, 1000)]

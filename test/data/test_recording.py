@@ -20,6 +20,7 @@ from deep_nrsfm_ros.data.keypoint_files import read_keypoints
 from deep_nrsfm_ros.data.lifted_bags import (
     KEYPOINTS,
     POINTS,
+    LiftedMessage,
     has_lifted_messages,
     read_lifted_messages,
     write_lifted_bag,
@@ -29,7 +30,7 @@ from deep_nrsfm_ros.data.read_options import ReadOptions
 from deep_nrsfm_ros.data.recording import Recording, join_lifted_messages, lift_recording
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.presets import BODY25, HUMAN17
-from deep_nrsfm_ros.lifting.lifter import Lifter
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
 from deep_nrsfm_ros.lifting.observation import Observation, to_observation
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
 from deep_nrsfm_ros.nrsfm.geometry import quaternion, rotation_from_quaternion
@@ -167,3 +168,53 @@ def test_outputs_that_cannot_be_are_refused_at_once(tmp_path: Path) -> None:
 def test_quaternions_and_rotations_are_the_same(seed: int) -> None:
     R = Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
     np.testing.assert_allclose(rotation_from_quaternion(quaternion(R)), R, atol=1e-12)
+
+
+LEVEL = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float32)  # from the camera to base_link
+
+
+def standing(frame_id: str) -> tuple[Recording, Detections]:
+    """Return two people that stand before a level camera, and their keypoints of a frame."""
+    rng = np.random.default_rng(0)
+    shape = rng.normal(0, (0.2, 0.8, 0.2), (17, 3))  # in the camera's axes, y down
+    shapes = (shape + [[[0, 0, 4]], [[1, 0, 5]]]).astype(np.float32)
+    points = (600 * shapes[..., :2] / shapes[..., 2:] + 400).astype(np.float32)
+    sure = np.ones((2, 17), np.float32)
+    seen = gather([Observation(points, sure)], [10**18], 17, frame_id)
+    none = np.full(2, np.nan, np.float32)
+    R = np.tile(np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], np.float32), (2, 1, 1))
+    lifted = Lifted(shapes, R, none, np.full((2, 2), np.nan, np.float32), none, sure)
+    return Recording(HUMAN17, HUMAN17, seen, lifted), seen
+
+
+@pytest.mark.parametrize("camera", ["cam", ""])  # the detector may not name its camera
+def test_points_in_a_fixed_frame_stand(camera: str) -> None:
+    recording, seen = standing(camera)
+    shapes, R, confidence = (
+        getattr(recording.lifted, n) for n in ("shapes", "rotations", "confidence")
+    )
+    as_is = LiftedMessage(10**18, shapes, confidence, R[0], camera)
+    joined = join_lifted_messages([as_is], seen, HUMAN17, HUMAN17)
+    assert joined.fixed_frame == "" and np.isfinite(joined.lifted.scale).all()
+    np.testing.assert_array_equal(joined.lifted.shapes, shapes)
+    fixed = as_is._replace(
+        shapes=shapes @ LEVEL.T + [0, 0, 1.1], rotation=LEVEL @ R[0], frame_id="base_link"
+    )
+    joined = join_lifted_messages([fixed], seen, HUMAN17, HUMAN17)
+    assert joined.fixed_frame == "base_link"
+    np.testing.assert_allclose(joined.lifted.shapes, shapes - [0, 1.1, 0], atol=1e-5)
+    np.testing.assert_allclose(joined.lifted.rotations[0], R[0], atol=1e-6)
+    alone = join_lifted_messages([fixed], None, HUMAN17, HUMAN17, "base_link")
+    np.testing.assert_allclose(alone.lifted.shapes, joined.lifted.shapes)
+
+
+def test_points_of_several_cameras_are_in_no_fixed_frame() -> None:
+    recording, seen = standing("cam")
+    first = LiftedMessage(10**18, recording.lifted.shapes, recording.lifted.confidence, None, "cam")
+    messages = [first, first._replace(stamp=10**18 + 10**10, frame_id="other")]
+    assert join_lifted_messages(messages, seen, HUMAN17, HUMAN17).fixed_frame == ""
+
+
+def test_bags_give_back_the_frame_of_the_points(tmp_path: Path, recording: Recording) -> None:
+    write_lifted_bag(tmp_path / "bag", recording.detections, recording.lifted)
+    assert {each.frame_id for each in read_lifted_messages(tmp_path / "bag")} == {"cam"}

@@ -163,3 +163,12 @@ def test_a_start_is_not_recommended_to_a_training_that_has_one() -> None:
     assert "start from a model" in alone and "may come out mirrored" in alone
     assert "depth rests on the model that the training starts from" in helped
     assert "--from" not in helped
+
+
+def test_few_frames_of_many_alike_say_so() -> None:
+    few = dataset(seen_from(shapes(60, 0.3), 90))
+    (said,) = assess_sufficiency(few, near_duplicates=292).warnings
+    assert said.startswith("60 frames are few, as 292 more are near-duplicates; expect")
+    assert "record thousands that differ" in said
+    (said,) = assess_sufficiency(few, near_duplicates=2).warnings
+    assert said.startswith("60 frames are few; expect") and "that differ" not in said

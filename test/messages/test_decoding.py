@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float32MultiArray, MultiArrayDimension
 
-from deep_nrsfm_ros.lifting.observation import MessageError, to_observation
+from deep_nrsfm_ros.lifting.observation import MessageError, check_keypoints, to_observation
 from deep_nrsfm_ros.messages.decoding import (
     INPUT_TYPES,
     MULTI_ARRAY,
@@ -398,3 +398,10 @@ def test_a_message_of_nobody_has_no_objects() -> None:
     polygon_of = SimpleNamespace(polygon=SimpleNamespace(points=[]))
     assert read_observation(polygon_of, POLYGON, 5).points.shape == (0, 5, 2)
     assert read_observation(nobody, POINT_CLOUD, 5).points.shape == (0, 5, 2)
+
+
+def test_as_many_keypoints_as_a_hand_has_name_its_model() -> None:
+    with pytest.raises(MessageError, match="21 keypoints are those of model 'hand21': -p model:"):
+        check_keypoints(21, 25, "width")
+    with pytest.raises(MessageError, match="has 25: name the layout"):
+        check_keypoints(18, 25, "width")

@@ -8,10 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.layouts.keypoint_map import TooFewSharedError
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN17, LAYOUTS
 from deep_nrsfm_ros.model_files import model_file
-from deep_nrsfm_ros.model_files.matching_model import knows, matching_model
+from deep_nrsfm_ros.model_files.matching_model import (
+    knows,
+    map_to_model,
+    matching_model,
+    model_of_count,
+)
 from deep_nrsfm_ros.model_files.model_file import (
     Model,
     ModelFileError,
@@ -48,6 +54,21 @@ def test_a_file_is_read_once_until_it_changes(
     assert load_once(path).layout.keypoints == HUMAN17.keypoints and len(read) == 2
     with pytest.raises(ModelFileError, match="cannot read"):
         load_once(tmp_path / "none.safetensors")
+
+
+def test_a_number_of_keypoints_that_one_object_has_names_its_model() -> None:
+    assert model_of_count(21) == "hand21"
+    # Of people several layouts have these; of 1000 keypoints there is no layout.
+    assert [model_of_count(count) for count in (17, 25, 1000)] == [""] * 3
+
+
+def test_layouts_of_different_objects_name_the_model_that_would_do() -> None:
+    hand, human = LAYOUTS["hand21"], LAYOUTS["human25"]
+    with pytest.raises(TooFewSharedError, match=r"; model 'hand21' lifts .*-p model:=hand21, --m"):
+        map_to_model(hand, human)
+    with pytest.raises(TooFewSharedError, match=r"\.\.\.$"):  # no model lifts it
+        map_to_model(DOG, hand)
+    assert map_to_model(hand, hand).identical
 
 
 @pytest.mark.parametrize("name", ["coco17", "body25", "body25b", "mediapipe33", "halpe26"])

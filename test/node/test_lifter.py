@@ -384,12 +384,12 @@ def test_a_model_is_changed_and_changed_back_by_one_parameter(client: Client) ->
 
 def test_a_refusal_of_model_or_layout_says_how_to_exchange_both(client: Client) -> None:
     # `ros2 param set` sets one parameter at a time: neither comes first.
-    remedy = "set keypoint_layout to 'auto' first, then model"
+    remedy = "set keypoint_layout to 'model' first, then model"
     assert client.set_parameters(keypoint_layout="coco17") == ""
     assert remedy in client.set_parameters(model="joints")
     assert remedy in client.set_parameters(keypoint_layout="hand21")
     assert remedy not in client.set_parameters(model="joints", keypoint_layout="coco17")
-    assert client.set_parameters(keypoint_layout="auto") == ""
+    assert client.set_parameters(keypoint_layout="model") == ""
     assert client.set_parameters(model="joints") == ""
     assert client.set_parameters(keypoint_layout="cmu31") == ""
     assert client.set_parameters(keypoint_layout="model") == ""

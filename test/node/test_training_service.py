@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import Float32MultiArray
@@ -32,6 +33,17 @@ STAND_IN = (str(Path(__file__).with_name("lifter_with_stand_in_training.py")),)
 
 def values(status: Any) -> dict[str, str]:
     return {pair.key: pair.value for pair in status.values}
+
+
+def training_health(client: Any) -> Any:
+    """Return the status of the training in the next diagnostics."""
+    heard = client.heard["/diagnostics"]
+    heard.clear()
+
+    def found() -> Any:
+        return next((s for m in heard for s in m.status if s.name == "/lifter: training"), None)
+
+    return client.wait(found, "diagnostics of the training")
 
 
 def keypoints(seed: int = 0, p: int = P) -> Float32MultiArray:
@@ -85,6 +97,8 @@ def test_a_training_from_request_to_use(
     client.set_parameters(train__name="doubtful")
     assert client.call("/lifter/train").success
     doubted = client.wait_for_training("finished")
+    levels = {s.message: s.level for s in client.heard["/lifter/training_status"]}
+    assert levels["warning: 60 frames are few"] == doubted.level == DiagnosticStatus.WARN
     assert "not in use" in doubted.message and values(doubted)["judgement"] == "doubtful"
     assert (models / "doubtful.safetensors").exists()
     client.heard["/lifter/training_status"].clear()
@@ -103,16 +117,60 @@ def test_a_training_from_request_to_use(
 
     client.set_parameters(train__activate="always")
     assert client.call("/lifter/train").success
-    assert client.wait_for_training("finished").message.endswith("; in use from now on")
+    switched = client.wait_for_training("finished").message
     client.wait_for_health(lambda _, v: v["model"] == "finish")
+    said = (
+        "in use from now on; a lifter that is started anew needs -p model:=finish; to go back to "
+        "model 'person': ros2 param set /lifter model person"
+    )
+    assert switched.endswith(f"; {said}") and training_health(client).message == switched
+    client.set_parameters(model="person")
+    client.wait_for_health(lambda _, v: v["model"] == "person")
+    assert training_health(client).message.endswith(
+        "; was in use; the lifter has model 'person' now"
+    )
     client.heard["/lifter/training_status"].clear()
 
-    client.set_parameters(model="person", train__bags=[str(models / "person")])
+    client.set_parameters(train__bags=[str(models / "person")])
     client.set_parameters(train__activate="if_better", train__name="other")  # of the same object
     client.heard["/lifter/training_status"].clear()
     assert client.call("/lifter/train").success
-    assert client.wait_for_training("finished").message.endswith("; in use from now on")
+    assert "; in use from now on; " in client.wait_for_training("finished").message
     client.wait_for_health(lambda _, v: v["model"] == "other")
+    client.heard["/lifter/training_status"].clear()
+    (models / "other_before.safetensors").write_bytes((models / "other.safetensors").read_bytes())
+    assert client.call("/lifter/train").success
+    assert client.wait_for_training("finished").message.endswith("model other_before")
+
+
+@pytest.mark.parametrize("judgement", ["as_good", "alone"])
+def test_every_model_that_is_not_doubtful_is_used(
+    lifter: LifterProcess, connect: Connect, models: Path, judgement: str
+) -> None:
+    shutil.copytree(models / "joints", models / "person")  # a bag
+    client = connect()
+    client.set_parameters(train__bags=[str(models / "person")], train__name=judgement)
+    assert client.call("/lifter/train").success
+    finished = client.wait_for_training("finished")
+    assert values(finished)["judgement"] == judgement and "in use from now on" in finished.message
+    assert finished.level == DiagnosticStatus.OK
+
+
+def test_the_way_to_a_model_of_another_object_is_one_that_works(
+    lifter: LifterProcess, connect: Connect, models: Path
+) -> None:
+    client = connect()
+    assert client.set_parameters(keypoint_layout="coco17") == ""
+    client.set_parameters(train__bags=[str(models / "joints")], train__name="finish")
+    assert client.call("/lifter/train").success
+    how = client.wait_for_training("finished").message.split("to switch: ")[1]
+    assert how == (
+        "ros2 param set /lifter keypoint_layout model, and then ros2 param set /lifter model finish"
+    )
+    for command in how.split(", and then "):
+        name, value = command.split()[-2:]
+        assert client.set_parameters(**{name: value}) == ""
+    client.wait_for_health(lambda _, v: v["model"] == "finish")
 
 
 def test_a_training_that_fails_leaves_the_lifter_as_it_was(
@@ -198,7 +256,9 @@ def test_the_real_training_turns_a_bag_into_the_model_in_use(
     assert "starting from model 'person'" in accepted.message
     finished = client.wait_for_training("finished")
     assert "in use from now on" in finished.message
-    assert values(finished)["judgement"] in ("better", "doubtful")
+    said = [s.message for s in client.heard["/lifter/training_status"]]
+    assert any("train.held_out" in text for text in said) and not [s for s in said if "--" in s]
+    assert values(finished)["judgement"] in ("better", "as_good", "doubtful")
     assert load_model(models / "fresh.safetensors").name == "fresh"
     client.wait_for_health(lambda _, v: v["model"] == "fresh")
     assert client.exchange(publisher, keypoints()).data != before

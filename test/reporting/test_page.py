@@ -200,6 +200,32 @@ def test_other_models_are_compared_with(tmp_path: Path) -> None:
     assert sorted(f.name for f in tmp_path.glob("*mine*")) == ["mine.html", "mine.safetensors"]
 
 
+@pytest.mark.parametrize("verdict", ["as_good", "alone"])
+def test_the_verdict_on_the_model_is_that_of_its_training(verdict: str) -> None:
+    whole = training_of()
+    whole.model.provenance["judgement"] = {"verdict": verdict, "doubtful": False}
+    text = page(whole)
+    assert re.findall(r"<td>mine</td><td>(.*?)</td>", text) == [verdict]
+    assert '<th class="figure">together</th>' in text
+
+
+def test_a_report_on_another_object_sets_the_layout_first(text: str) -> None:
+    first = "ros2 param set /lifter keypoint_layout model"
+    dog = KeypointLayout("dog", tuple(f"dog_{i}" for i in range(len(HUMAN17))))
+    other = page(training_of(layout=dog))
+    assert first not in text and other.index(first) < other.index("/lifter model mine")
+
+
+def test_a_model_that_is_the_mean_with_its_start_says_so() -> None:
+    whole, said = training_of(), "the mean of its start"
+    whole.model.provenance.update({"from": {"model": "human"}, "recipe": {"start_share": 0.6}})
+    last = whole.progress[-1]
+    whole.model.quality["combined"] = math.hypot(last.loss, last.cycle_error) + 0.05
+    assert said in page(whole)
+    whole.model.quality["combined"] -= 0.05  # of the same weights as the curves
+    assert said not in page(whole)
+
+
 def test_doubtful_models_stand_below_the_one_at_hand() -> None:
     whole = training_of()
     human = load_model("human")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -18,7 +19,7 @@ from deep_nrsfm_ros.layouts.presets import HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import Observation
 from deep_nrsfm_ros.nrsfm.geometry import centre
-from deep_nrsfm_ros.reporting.player import recording_page, scenes, stride
+from deep_nrsfm_ros.reporting.player import SceneTransform, recording_page, scenes, stride
 
 P = len(HUMAN17)
 EVIL = '</script><img src=x onerror="alert(1)">&'
@@ -163,6 +164,30 @@ def test_people_are_upright_and_the_right_way_round(tab: Any, page: str) -> None
     tab.press("v")  # the person at rest, seen from before again
     at = joints(tab)
     assert at[LEFT, 0] > at[RIGHT, 0] and at[NOSE, 1] < at[ANKLE, 1] - 100
+
+
+def test_a_fixed_frame_has_no_camera_and_is_named(tab: Any, tmp_path: Path) -> None:
+    recording = dataclasses.replace(recording_of(offset=4.0), fixed_frame="base_link")
+    text = recording_page(recording, "a wave")
+    assert head_of(text)["frames"][0]["camera"] is None
+    (tmp_path / "page.html").write_text(text)
+    tab.open((tmp_path / "page.html").as_uri())
+    at = joints(tab)
+    assert at[NOSE, 1] < at[ANKLE, 1] - 100
+    assert tab.evaluate("$('view').textContent") == "view: base_link fixed"
+    assert tab.evaluate("$('grid').textContent") == "level in base_link, z up"
+    fixed = pixels(tab, "lifted")
+    tab.evaluate("frames.forEach(f => { f.fixed = ''; }), show(0)")
+    assert pixels(tab, "lifted") != fixed  # the camera is drawn again
+
+
+def test_a_frame_that_becomes_known_starts_the_scene_anew() -> None:
+    live, before = SceneTransform(), recording_of(offset=4.0)
+    assert next(scenes(before, transform=live))["camera"]
+    later = dataclasses.replace(recording_of(offset=9.0), fixed_frame="base_link")
+    shown = next(scenes(later, transform=live))
+    assert shown["fixed"] == "base_link" and shown["camera"] is None
+    assert shown["objects"][0]["position"] == pytest.approx([0, 0, 0], abs=1e-3)
 
 
 def test_dragging_turns_the_lifted_skeleton_alone(tab: Any, page: str) -> None:

@@ -34,6 +34,9 @@ def main() -> None:
         signal.signal(signal.SIGTERM, lambda *_: stop.set())
         threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
     print("a line that is no progress")
+    if behaviour == "doubtful":
+        say("curating", message="warning: 60 frames are few")
+        time.sleep(0.5)  # the latched topic keeps the newest status alone
     print("[" * 50_000)
     say("training", step=1, steps=2, loss=0.5, niceness=os.nice(0), session=os.getsid(0))
     if behaviour == "crash":
@@ -57,7 +60,7 @@ def main() -> None:
                 f"{config['data']['bags'][0]}.safetensors", folder / f"{behaviour}.safetensors"
             )
         )
-    judgement = "doubtful" if behaviour == "doubtful" else "better"
+    judgement = behaviour if behaviour in ("doubtful", "as_good", "alone") else "better"
     say("finished", message="done", model=model, step=2, steps=2, judgement=judgement)
     if behaviour == "doubtful":
         sys.exit(3)  # its data looked wrong

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from deep_nrsfm_ros.nrsfm.recipe import Preset, Recipe
 from deep_nrsfm_ros.training.fine_tuning import check_fixed_options, inherit, start_from
 from deep_nrsfm_ros.training.finish import finish
 from deep_nrsfm_ros.training.loop import Callbacks, train
+from deep_nrsfm_ros.training.progress import Progress
 from deep_nrsfm_ros.training.setup import Setup
 from deep_nrsfm_ros.training.trainer import Trainer
 
@@ -103,6 +105,26 @@ def test_the_result_is_the_mean_of_start_and_trained_weights(
     np.testing.assert_allclose(mixed, 0.75 * trained + 0.25 * same, atol=1e-6)
     start = tuned(source, figure.layout, stretched, 0)
     np.testing.assert_array_equal(same, start.weights)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_figures_end_with_the_trained_weights_and_a_sentence_gives_those_of_the_mean(
+    source: Model, figure: Any, stretched: np.ndarray, share: float
+) -> None:
+    reports: list[Progress] = []
+    said: list[str] = []
+    recipe = dataclasses.replace(RECIPE, start_share=share, steps=20)
+    visible = np.ones(stretched.shape[:2], bool)
+    setup = Setup(start=start_from(source, figure.layout))
+    callbacks = Callbacks(on_progress=reports.append, on_message=said.append)
+    preset = Preset(source.network.architecture, source.normaliser, recipe)
+    trainer = train(stretched, visible, preset, setup, callbacks)
+    last, model = reports[-1], trainer.measure()
+    assert ((last.loss, last.cycle_error) == model) == (share == 0)
+    before, after = (f"{math.hypot(*each):.3f}" for each in ((last.loss, last.cycle_error), model))
+    means = [text for text in said if "the mean of its start" in text]
+    assert len(means) == (share > 0)
+    assert all(f"combined is {after} " in text and f"was {before} " in text for text in means)
 
 
 def test_a_start_with_other_keypoints_has_no_share_in_the_result(

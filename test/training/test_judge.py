@@ -106,7 +106,7 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
         than = "as good as" if rival is good else "better than"
         assert str(judgement).startswith(f"the new model is {than} model {rival.name!r}")
         assert "on 60 held-out frames, later ones that it was not trained on" in str(judgement)
-        assert f"({rival.name}: " in str(judgement) and len(str(judgement)) < 450
+        assert f"({rival.name}: " in str(judgement) and len(str(judgement)) < 520
         assert not judgement.record()["doubtful"]
 
 
@@ -315,6 +315,8 @@ def test_standings_have_the_best_first_and_doubtful_ones_last(
         ("good", "at hand"),
         ("bad", "doubtful"),
     ]
+    same = dataclasses.replace(good, name="same")
+    assert [each.verdict for each in standings(frames, [same], good)] == ["as_good", "at hand"]
     alone = standings(frames, [bad, good], None)
     assert [each.model.name for each in alone] == ["good", "bad"]
     assert found[0].rank < found[1].rank
@@ -323,13 +325,17 @@ def test_standings_have_the_best_first_and_doubtful_ones_last(
 def test_a_judgement_on_the_frames_of_the_training_says_so(frames: Split, good: Model) -> None:
     few = frames.training[:40]
     judgement = judge(Split(few, few), good, None)
-    assert "on the 40 frames of its training" in str(judgement)
+    assert "on the 40 frames of its training, as none were held out: " in str(judgement)
 
 
 def test_the_figures_are_named_and_short(frames: Split, good: Model, bad: Model) -> None:
     text = str(judge(frames, good, bad))
     assert "image error of the network before the correction " in text
     assert "bone lengths vary by " in text and "frames that look mirrored 0 % (bad: " in text
+    assert "image error and bones together are smaller" in text
+    figures = dict(zip(("new", "old"), map(Judge(frames).figures, (good, bad)), strict=True))
+    new, old = (percent(each.misfit) for each in figures.values())
+    assert f"both together, the root of their summed squares, {new} (bad: {old})" in text
     assert not re.search(r"\d\.\d\d", text)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deep_nrsfm_ros.commands.train import parser
-from deep_nrsfm_ros.data.bags import frames, write_bag
+from deep_nrsfm_ros.data.bags import Frame, frames, write_bag
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.layouts.presets import HUMAN17
@@ -99,6 +99,20 @@ def test_files_are_trained_on_as_bags_are(tmp_path: Path) -> None:
     assert by_identity.sequence_starts.tolist() == [0, 3]
     for named in (("--input", f"{tmp_path}/coco.json"), ("--input", f"{tmp_path}/a.npz")):
         assert read(*named, "--object", "numbered").layout.keypoints[16] == "point_16"
+
+
+def test_several_people_in_a_message_are_said_to_be_frames_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = pixels(12).reshape(6, 2, 17, 2)
+    pairs = [Frame(10**9 + i * 10**8, points[i], np.ones((2, 17))) for i in range(6)]
+    write_bag(tmp_path / "pairs", "/keypoints", pairs)
+    layout = ("--object", "human17", "--keypoint-layout", "human17")
+    assert len(read("--bag", f"{tmp_path}/pairs", *layout).points) == 12
+    assert "6 messages hold 12 objects; each is a frame" in capsys.readouterr().err
+    write_bag(tmp_path / "single", "/keypoints", frames(pixels(6), np.ones((6, 17))))
+    read("--bag", f"{tmp_path}/single", *layout)
+    assert "messages hold" not in capsys.readouterr().err
 
 
 def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.bags import frames, write_bag
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -235,3 +236,15 @@ def test_a_checkpoint_without_a_record_goes_on_with_the_parameters(tmp_path: Pat
     write(tmp_path, "/camera/keypoints")
     asked = request(tmp_path, resume=True, name="mine", bags=("keypoints",))
     assert asked.accept() == (asked.config, "") and asked.config.resume
+
+
+def test_descriptions_of_parameters_stand_alone() -> None:
+    fields = {
+        field.name: opt.description
+        for group in (TrainingOptions, Recipe, LayoutLossWeights, Limits, Curation)
+        for field, _, opt in options(group)
+    }
+    assert all("bags_dir" in fields[name] for name in ("bags", "inputs"))  # where they must lie
+    assert "train --camera free" in fields["spectral"]  # the service has no such parameter
+    for jargon in ("label-free", "fans of", "spectral norm", "used with"):
+        assert not [name for name, text in fields.items() if jargon in text]

@@ -42,6 +42,7 @@ from deep_nrsfm_ros.model_files.model_file import load_model
 from deep_nrsfm_ros.nrsfm.metrics import camera_errors
 from deep_nrsfm_ros.nrsfm.recipe import AUTOMATIC
 from deep_nrsfm_ros.training.job import ENDED
+from deep_nrsfm_ros.training.verdicts import DOUBTFUL
 
 TOPIC = "/keypoints"
 CAMERA_INFO = "/camera_info"
@@ -155,7 +156,7 @@ def train(client: Client, session: Session, present: Path) -> None:
     say(client.training["message"])
     models = {before: present, TRAINED: Path(client.training["model"])}
     print(comparison(session, models), flush=True)
-    if client.training["judgement"] != "better":
+    if client.training["judgement"] == DOUBTFUL:
         say(f"the lifter goes on with model {before!r}")
         return
     client.wait(lambda: client.health["model"] == TRAINED, "the change of models")
