@@ -55,7 +55,9 @@ def test_points_are_printed_by_name_and_identity(
     ][-1:]
     rows = [line.split() for line in lines]
     assert [row[1] for row in rows] == [*HUMAN17.keypoints] * 2
-    assert {row[0] for row in rows} in ({"0", "1"}, {"object1", "object2"})
+    # A second between stamps may begin new identities, and points may come without theirs.
+    shown = {row[0] for row in rows}
+    assert len(shown) == 2 and all(re.fullmatch(r"[01]|object\d+", name) for name in shown)
     printed = np.array([row[2:] for row in rows], float)
     np.testing.assert_allclose(printed, points.reshape(-1, 4), atol=0.0051)
 
