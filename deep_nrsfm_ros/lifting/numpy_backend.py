@@ -200,9 +200,7 @@ class NumpyBackend:
             constants.network, constants.normaliser, points, shown.astype(np.float32)
         )
         S, _, residual = self._average(gain * W, W, visible, unit if perspective else None)
-        P = S[..., :2]
-        if perspective:
-            P = P / np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
+        P = _projected(S, unit if perspective else None)
         radius = np.sqrt((W * W * shown).sum((1, 2)) / np.maximum(visible.sum(1), 1))
         apart = np.linalg.norm((points - origin) / unit - P, axis=2)
         return Fit(residual, apart / np.maximum(radius, np.float32(1e-9))[:, None])
@@ -271,10 +269,7 @@ class NumpyBackend:
             M[half:] *= _MIRROR[:, None] * _MIRROR[1:]
         M = M @ rotations[:, None]
         S = S @ rotation_from_camera(M).swapaxes(-1, -2)
-        P = S[..., :2]
-        if unit is not None:
-            P = P / np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
-        residual = reprojection_error(W, P, visible)
+        residual = reprojection_error(W, _projected(S, unit), visible)
         weight = np.exp((residual.min(0) ** 2 - residual**2) / RESIDUAL_SCALE)
         weight /= weight.sum(0)
         M = (weight[..., None, None] * M).sum(0)
@@ -293,3 +288,16 @@ class NumpyBackend:
             size = np.linalg.norm(S[:, a] - S[:, b], axis=1)
         positive: Float32 = np.maximum(size, np.float32(1e-9))
         return positive[:, None, None]
+
+
+def _projected(S: Float32, unit: Float32 | None) -> Float32:
+    """Return the projection (..., p, 2) of shapes (..., p, 3) in camera axes.
+
+    Args:
+        S: the shapes.
+        unit: of the shapes, in distances of their origin from the camera; None: weak perspective.
+    """
+    if unit is None:
+        return S[..., :2]
+    projected: Float32 = S[..., :2] / np.maximum(1 + unit * S[..., 2:], MIN_RELATIVE_DEPTH)
+    return projected
