@@ -53,12 +53,12 @@ static int find_candidates(const Plan *k, const float *visible, int candidates[M
 void leave_out_wrong(Plan *k, Object *o, int perspective) {
     float *visible = k->shown, *shown = visible + k->p;
     int candidates[MAX_CANDIDATES], fewest = k->min_visible > k->fewest_left ? k->min_visible : k->fewest_left;
+    if (!(o->residual > k->min_residual)) return;
     memcpy(visible, o->visible, k->p * sizeof(float));
+    set_distances(k, o, perspective);
     for (int round = 0; round < k->most_wrong && o->residual > k->min_residual; round++) {
         double limit = k->residual_ratio * o->residual;
-        int wrong = -1;
-        set_distances(k, o, perspective);
-        int n = find_candidates(k, visible, candidates);
+        int wrong = -1, n = find_candidates(k, visible, candidates);
         for (int i = 0; i < n; i++) {
             show_without(k, visible, candidates[i], shown);
             fit_to(k, o, shown, perspective);
