@@ -14,6 +14,7 @@ from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
 from deep_nrsfm_ros.lifting.numpy_backend import Float32
 from deep_nrsfm_ros.lifting.observation import from_arrays
+from deep_nrsfm_ros.lifting.options import unit_vector
 from deep_nrsfm_ros.lifting.perspective import lift_perspective
 from deep_nrsfm_ros.lifting.steady_depth import steady_depths
 from deep_nrsfm_ros.lifting.track_matching import keypoint_tolerances
@@ -134,10 +135,9 @@ def _unit_vector(up: ArrayLike) -> NDArray[np.float64]:
         ValueError: it is no direction.
     """
     direction = np.asarray(up, np.float64)
-    if direction.shape != (3,) or not 0 < np.linalg.norm(direction) < np.inf:
+    if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
         raise ValueError(
             f"up is {up!r}; give x, y and z against gravity in the camera's axes: (0, -1, 0) of a "
             "level camera"
         )
-    unit: NDArray[np.float64] = direction / np.linalg.norm(direction)
-    return unit
+    return unit_vector(direction)

@@ -219,8 +219,10 @@ class GravityOptions:
     @property
     def direction(self) -> NDArray[np.float64] | None:
         """The unit vector (3,) against gravity; None: unknown."""
-        largest = max(map(abs, self.up))
-        if not largest:
-            return None
-        up = np.array(self.up) / largest  # the squares of very long ones are infinite
-        return np.asarray(up / np.linalg.norm(up))
+        return unit_vector(np.array(self.up)) if any(self.up) else None
+
+
+def unit_vector(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a direction (3,), finite and not 0, with length 1."""
+    scaled = direction / np.abs(direction).max()  # the squares of very long ones are infinite
+    return np.asarray(scaled / np.linalg.norm(scaled))
