@@ -554,6 +554,13 @@ def mark_as_good(path: Path) -> bytes:
     return path.read_bytes()
 
 
+def paws(folder: Path, models: Path) -> tuple[str, ...]:
+    """Write a bag of paws; return the words of a quick training on it."""
+    (folder / "paw.yaml").write_text(PAW)
+    data = ("--bag", str(write_paws(folder)), "--object", str(folder / "paw.yaml"))
+    return (*data, *QUICK, "--output", str(models), "--few-frames", "0", "--seeds", "1")
+
+
 def test_a_good_model_of_the_name_is_compared_with_and_not_lost(
     tmp_path: Path,
     models: Path,
@@ -561,9 +568,7 @@ def test_a_good_model_of_the_name_is_compared_with_and_not_lost(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "paw.yaml").write_text(PAW)
-    data = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"))
-    words = (*data, *QUICK, "--output", str(models), "--few-frames", "0", "--seeds", "1")
+    words = paws(tmp_path, models)
     path = models / "mine.safetensors"
     assert in_process(*words, "--steps", "150") == 0
     good = mark_as_good(path)
@@ -609,9 +614,7 @@ def test_a_good_model_of_another_object_gives_its_name(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "paw.yaml").write_text(PAW)
-    data = ("--bag", str(write_paws(tmp_path)), "--object", str(tmp_path / "paw.yaml"))
-    words = (*data, *QUICK, "--output", str(models), "--few-frames", "0", "--seeds", "1")
+    words = paws(tmp_path, models)
     assert in_process(*words, "--steps", "1") == 0
     good = mark_as_good(models / "mine.safetensors")
     doubt = judge.Judgement("worse", "", judge.Figures(*[0.1] * 9))
