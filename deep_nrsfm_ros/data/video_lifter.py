@@ -135,7 +135,7 @@ def _unit_vector(up: ArrayLike) -> NDArray[np.float64]:
         ValueError: it is no direction.
     """
     direction = np.asarray(up, np.float64)
-    if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
+    if direction.shape != (3,) or not 0 < np.linalg.norm(direction) < np.inf:
         raise ValueError(
             f"up is {up!r}; give x, y and z against gravity in the camera's axes: (0, -1, 0) of a "
             "level camera"
