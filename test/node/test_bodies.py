@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, TransformStamped, TwistStamped
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import CameraInfo, JointState, MultiDOFJointState, PointCloud2
 from std_msgs.msg import String
@@ -29,6 +29,7 @@ from deep_nrsfm_ros.node import body_messages
 from deep_nrsfm_ros.node.bodies import BodyPublishers, topic_name
 from deep_nrsfm_ros.node.publishing import Outbox
 from deep_nrsfm_ros.node.serialised_template import (
+    STAMP,
     SerialisedTemplate,
     TextTemplate,
     mark,
@@ -343,3 +344,16 @@ def test_frames_of_joints_need_a_prefix_and_tf2(start_lifter: Make) -> None:
     lifter = start_lifter(listens=False, **{"body.frames": True})
     assert lifter.process.wait(60) == 1
     assert "body.frames is true without tf_prefix" in lifter.log
+
+
+def test_what_padding_holds_is_no_number() -> None:
+    message = JointState(name=["abc"], position=[mark(0), mark(1)])
+    message.header.stamp = STAMP
+
+    def with_old_memory(given: JointState) -> bytes:
+        """Serialise, with a slot of padding that looks like a number between the marks."""
+        return serialize_message(given) + np.float64(1.5 * mark(0)).tobytes()
+
+    SerialisedTemplate(message, 2, with_old_memory)
+    with pytest.raises(ValueError, match="message has 2 marked numbers; expected 3"):
+        SerialisedTemplate(message, 3)
