@@ -198,6 +198,8 @@ def troubleshooting_page() -> str:
                 "enough keypoints; `last problem` says why; not answered |\n"
                 "| messages dropped | sent, and never received: they came while another was "
                 "lifted, or were lost on the way |",
+                "`wrong keypoints` there are those that contradict the others of their object and "
+                "are left out, with their share of the objects of the last 15 seconds.",
             ]
         )
         + "\n"

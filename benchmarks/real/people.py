@@ -271,10 +271,10 @@ def lift_track(lifter: Lifter, track: Track, system: System, *, intrinsics: bool
         return lifted
     smoother = Smoother(system.filter)
     smoothed = [
-        smoother(Lifted(*(part[i : i + 1] for part in lifted)), ("person",), second)[0]
+        smoother(lifted.at([i]), ("person",), second)[0]
         for i, second in enumerate(track.seconds.tolist())
     ]
-    return Lifted(*(np.concatenate(parts) for parts in zip(*smoothed, strict=True)))
+    return Lifted._make(np.concatenate(parts) for parts in zip(*smoothed, strict=True))
 
 
 def lifting_errors(lifter: Lifter, track: Track, system: System, *, intrinsics: bool) -> Errors:

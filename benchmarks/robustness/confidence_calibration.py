@@ -390,7 +390,7 @@ def rate(
     lifted = lift_all(lift, points, confidence)
     seen = trusted(keypoint_weight(confidence))
     valid = ~np.isnan(lifted.residual) & (seen[:, k].sum(1) >= _FEWEST_VISIBLE)
-    lifted, seen = Lifted(*(array[valid] for array in lifted)), seen[valid]
+    lifted, seen = lifted.at(valid), seen[valid]
     terms = recording.terms(lifted, seen)[:, k] if recording else np.zeros(0)
     S, T, visible = lifted.shapes[:, k], T[valid], seen[:, k]
     # The truth may lack points. Twice the RMS radius of all is so many of that of those it has.

@@ -144,10 +144,9 @@ def smoothed(lifted: Lifted, rate: float, options: SmoothingOptions) -> Lifted:
     """Return the frames (n = f) of one object, filtered one by one."""
     smoothed_frames = Smoother(options)
     outputs = [
-        smoothed_frames(Lifted(*(part[i : i + 1] for part in lifted)), ("0",), i / rate)[0]
-        for i in range(len(lifted.residual))
+        smoothed_frames(lifted.at([i]), ("0",), i / rate)[0] for i in range(len(lifted.residual))
     ]
-    return Lifted(*(np.concatenate(parts) for parts in zip(*outputs, strict=True)))
+    return Lifted._make(np.concatenate(parts) for parts in zip(*outputs, strict=True))
 
 
 def figures(lifted: Lifted, smoothed_frames: Lifted, clip: Clip) -> dict[str, float]:

@@ -159,7 +159,8 @@ def _message(view: NDArray[np.floating]) -> PointCloud2:
     """Return keypoints (17, 2) as a PointCloud2."""
     zeros = np.zeros(1, np.float32)
     points = np.concatenate([view, np.zeros((P, 1))], -1)[None].astype(np.float32)
-    pixels = Lifted(points, zeros, zeros, zeros, zeros, confidence=np.ones((1, P), np.float32))
+    sure = np.ones((1, P), np.float32)
+    pixels = Lifted(points, zeros, zeros, zeros, zeros, sure, wrong=sure < 1)
     return deserialize_message(point_cloud(Header(), pixels), PointCloud2)
 
 

@@ -62,7 +62,8 @@ def serialised_keypoints(objects: int, p: int) -> bytes:
     points = np.zeros((objects, p, 3), np.float32)
     points[..., :2] = 100 * (shapes @ random_cameras(objects, rng)) + [320, 240]
     zeros = np.zeros(objects, np.float32)
-    message = Lifted(points, zeros, zeros, zeros, zeros, np.ones((objects, p), np.float32))
+    sure = np.ones((objects, p), np.float32)
+    message = Lifted(points, zeros, zeros, zeros, zeros, sure, wrong=sure < 1)
     return point_cloud(Header(frame_id="camera"), message)
 
 

@@ -370,6 +370,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"{args.output}: {summary.figures_text}")
     if summary.left_out_text:
         print(f"left out: {summary.left_out_text}")
+    if summary.wrong_keypoints:
+        reason = "they contradict the others and count as missing"
+        print(f"wrong keypoints: {summary.wrong_keypoints} of the objects ({reason})")
     if not summary.findings and (hint := camera_hint(args, model, detections)):
         note(hint)
     for finding in summary.findings:

@@ -21,6 +21,8 @@ from deep_nrsfm_ros.lifting.sanity import (
     check,
     is_person,
     pose,
+    wrong_keypoints,
+    wrong_keypoints_text,
 )
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import Model
@@ -39,6 +41,8 @@ class Summary:
         left_out: number of objects that were not lifted, by reason.
         residual: median reprojection error of the lifted objects; NaN if there is none.
         confidence: median confidence of the lifted objects; NaN if there is none.
+        wrong_keypoints: which keypoints were left out as wrong, and of how many objects; "" if it
+            is less than 1 %.
         findings: what looks wrong. Without any, the answer can be believed.
     """
 
@@ -48,6 +52,7 @@ class Summary:
     left_out: dict[str, int]
     residual: float
     confidence: float
+    wrong_keypoints: str
     findings: tuple[Finding, ...]
 
     @property
@@ -105,6 +110,8 @@ def summarise(
         used = image_size if intrinsics or detections.is_normalised else None
         seen = detections.confidence
         findings += pose(recording.lifted.rotations, seen, recording.source, image_size=used)
+    wrong, names = recording.lifted.wrong[is_lifted], recording.target.keypoints
+    findings += wrong_keypoints(wrong, names)
     total = int((~detections.is_padding).sum())
     if is_lifted.any() and is_lifted.sum() < _FEW_LIFTED * total:
         few = f"only {is_lifted.sum()} of {total} objects are lifted"
@@ -116,6 +123,7 @@ def summarise(
         _left_out(recording, min_visible, with_camera=intrinsics is not None),
         residual,
         float(np.median(certainty[is_lifted])) if is_lifted.any() else np.nan,
+        wrong_keypoints_text(wrong, names),
         tuple(findings),
     )
 

@@ -133,6 +133,8 @@ def _document(recording: Recording, model: str) -> Iterator[str]:
 
 
 def _plain(values: NDArray[Any]) -> Any:
-    """Return rounded numbers as nested lists, None for NaN."""
+    """Return rounded numbers, or truth values, as nested lists; None for NaN."""
+    if values.dtype == bool:
+        return values.tolist()
     rounded = np.round(np.asarray(values, np.float64), _DIGITS)
     return np.where(np.isfinite(rounded), rounded, np.array(None, object)).tolist()

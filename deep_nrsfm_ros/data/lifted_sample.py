@@ -39,4 +39,4 @@ def lift_sample(model: Model, dataset: Dataset, most: int = _SAMPLE) -> LiftedFr
     sound = np.isfinite(lifted.shapes).all((1, 2)) & np.isfinite(lifted.residual)
     if not sound.any():
         raise ValueError(f"model {model.name!r} lifts none of the {len(frames)} frames looked at")
-    return LiftedFrames(frames[sound], Lifted(*(array[sound] for array in lifted)))
+    return LiftedFrames(frames[sound], lifted.at(sound))

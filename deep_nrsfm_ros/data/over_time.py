@@ -199,7 +199,7 @@ def lift_stream(
             context = memory(names, time, over_time.up)
             part = steady_depths(lift(points, confidence, context), memory, context)
             if whole is None:
-                whole = Lifted(*(empty((m, *each.shape[1:]), each.dtype) for each in part))
+                whole = Lifted._make(empty((m, *each.shape[1:]), each.dtype) for each in part)
             # Each frame goes to its place, so that memory holds the objects but once.
             for each, values in zip(whole, part, strict=True):
                 each[rows] = values
@@ -213,10 +213,11 @@ def lift_stream(
 
 def _mean(a: Lifted, b: Lifted) -> Lifted:
     """Return the mean of two lifts of the same objects."""
-    means = Lifted(*(empty(each.shape, each.dtype) for each in a))
+    means = Lifted._make(empty(each.shape, each.dtype) for each in a)
     for rows in slices(len(a.shapes), _BLOCK):
-        for mean, x, y in zip(means, a, b, strict=True):
+        for mean, x, y in zip(means[:-1], a[:-1], b[:-1], strict=True):
             mean[rows] = (x[rows] + y[rows]) / np.float32(2)
+        means.wrong[rows] = a.wrong[rows] | b.wrong[rows]
         rotations = means.rotations[rows]
         lifted = np.isfinite(rotations).all((1, 2))
         U, _, Vt = np.linalg.svd(rotations[lifted].astype(np.float64))

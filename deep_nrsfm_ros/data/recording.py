@@ -166,7 +166,8 @@ def join_lifted_messages(
     if fixed_frame:
         shapes[...], rotations = shapes @ _LEVEL_CAMERA.T, _LEVEL_CAMERA @ rotations
         scale, translation = unknown, np.full((m, 2), np.nan, np.float32)
-    lifted = Lifted(shapes, rotations, scale, translation, unknown, confidence)
+    nothing = np.zeros((m, p), np.bool_)  # a recording does not say what the lifter left out
+    lifted = Lifted(shapes, rotations, scale, translation, unknown, confidence, nothing)
     return Recording(source, target, detections, lifted, fixed_frame)
 
 

@@ -31,7 +31,8 @@ def lift(
         confidence: (n, p) float32, 0 = missing.
         perspective: whether points are where rays meet the plane z = 1.
         context: None, or `lifting.history.Context`, whose states are updated.
-        outputs: the six arrays of `lifting.Lifted`, float32, and (n,) bool: not lifted.
+        outputs: the seven arrays of `lifting.Lifted`, float32 but for `wrong` of bool, and (n,)
+            bool: not lifted.
 
     Raises:
         TypeError: An argument is no C-contiguous array of its item type.

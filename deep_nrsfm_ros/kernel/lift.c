@@ -260,13 +260,15 @@ static void set_weights(const Plan *k, Object *o) {
 }
 
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
-          const Context *context, float *const outputs[6], char *not_lifted) {
+          const Context *context, float *const outputs[6], char *wrong, char *not_lifted) {
     int p = k->p;
+    memset(wrong, 0, (size_t)n * p);
     for (ptrdiff_t start = 0; start < n; start += k->block) {
         int block = n - start < k->block ? (int)(n - start) : k->block, incomplete = 0;
         for (int i = 0; i < block; i++) {
             Object *o = k->incomplete[i] = k->objects + i;
             o->image_points = points + 2 * p * (start + i), o->confidence = confidence + p * (start + i);
+            o->wrong = wrong + p * (start + i);
             memcpy(o->input, o->image_points, 2 * p * sizeof(float));
             set_weights(k, o);
             recall(k, o, context, start + i, context && is_lifted(k, o, k->min_visible));

@@ -112,44 +112,45 @@ static int get_context(const Plan *k, Py_ssize_t n, PyObject *tuple, Context *co
 }
 
 /* lift(plan, points, confidence, perspective, context, shapes, rotations, scale, translation, residual, confidence,
-   not_lifted): fill the last seven: the arrays of `lifting.Lifted`, float32, and not_lifted (n,) of bool. context:
-   None, or a Context of lifting/history.py, whose states are updated.
+   wrong, not_lifted): fill the last eight: the arrays of `lifting.Lifted`, float32 but for wrong (n, p) of bool,
+   and not_lifted (n,) of bool. context: None, or a Context of lifting/history.py, whose states are updated.
 
    The GIL is held: a lift takes less than waiting for the GIL does, and the scratch memory of a plan serves one
    lift at a time. The busy flag also rejects a nested lift with the same plan, which the buffer method of an
    argument could start. */
 static PyObject *lift_entry(PyObject *Py_UNUSED(module), PyObject *args) {
-    static const ArrayArgument expected[9] = {
+    static const ArrayArgument expected[10] = {
         {"points", FLOAT32, 0},    {"confidence", FLOAT32, 0}, {"shapes", FLOAT32, 1},
         {"rotations", FLOAT32, 1}, {"scale", FLOAT32, 1},      {"translation", FLOAT32, 1},
-        {"residual", FLOAT32, 1},  {"confidence", FLOAT32, 1}, {"not_lifted", BOOL, 1}};
-    PyObject *capsule, *tuple, *o[9];
-    Py_buffer arrays[9], views[4];
+        {"residual", FLOAT32, 1},  {"confidence", FLOAT32, 1}, {"wrong", BOOL, 1},
+        {"not_lifted", BOOL, 1}};
+    PyObject *capsule, *tuple, *o[10];
+    Py_buffer arrays[10], views[4];
     Context context;
     int perspective, lifted = 0;
-    if (!parse_arguments(args, "OOOpOOOOOOOO:lift", &capsule, &o[0], &o[1], &perspective, &tuple, &o[2], &o[3], &o[4],
-                         &o[5], &o[6], &o[7], &o[8]))
+    if (!parse_arguments(args, "OOOpOOOOOOOOO:lift", &capsule, &o[0], &o[1], &perspective, &tuple, &o[2], &o[3], &o[4],
+                         &o[5], &o[6], &o[7], &o[8], &o[9]))
         return NULL;
     Plan *k = PyCapsule_GetPointer(capsule, PLAN);
     if (!k) return NULL;
     if (__atomic_exchange_n(&k->busy, 1, __ATOMIC_ACQUIRE))
         return PyErr_Format(PyExc_RuntimeError, "the plan is in use by another lift");
-    if (get_arrays(9, expected, o, arrays)) {
-        Py_ssize_t n = count_items(arrays + 8), p = k->p;
-        const Py_ssize_t sizes[9] = {2 * p, p, 3 * p, 9, 1, 2, 1, p, 1};
+    if (get_arrays(10, expected, o, arrays)) {
+        Py_ssize_t n = count_items(arrays + 9), p = k->p;
+        const Py_ssize_t sizes[10] = {2 * p, p, 3 * p, 9, 1, 2, 1, p, p, 1};
         float *outputs[6];
         for (int i = 0; i < 6; i++) outputs[i] = arrays[2 + i].buf;
         int has_context = tuple != Py_None;
-        if (!lengths_match(9, arrays, sizes, n))
+        if (!lengths_match(10, arrays, sizes, n))
             PyErr_SetString(PyExc_ValueError, "the arrays do not fit the plan and each other");
         else if (!has_context || get_context(k, n, tuple, &context, views)) {
             lift(k, n, arrays[0].buf, arrays[1].buf, perspective, has_context ? &context : NULL, outputs,
-                 arrays[8].buf);
+                 arrays[8].buf, arrays[9].buf);
             lifted = 1;
             for (int i = 0; has_context && i < 4; i++)
                 if (views[i].obj) PyBuffer_Release(views + i);
         }
-        release_arrays(9, arrays);
+        release_arrays(10, arrays);
     }
     __atomic_store_n(&k->busy, 0, __ATOMIC_RELEASE);
     if (!lifted) return NULL;

@@ -23,6 +23,7 @@ typedef struct {
     float *input, *input_mask;              /* (p, 2), (p): what the network reads, refilled round by round */
     float *visible;                         /* (p), 1 or 0: whether the network reads the keypoint */
     double *weight, *certainty;             /* (p) in the correction, and relative confidence; 0 = missing */
+    char *wrong;                            /* (p), an output of `lift`: 1 = contradicts the other keypoints */
     float *W, *S;                           /* (p, 2), (3, stride) in camera axes */
     double gain;                            /* p / number of keypoints in the input */
     double unit, origin[2];                 /* image = unit W + origin */
@@ -169,10 +170,10 @@ void correct(Plan *k, Object *o, double noise);
 /* Lift n objects.
 
    points (n, p, 2), confidence (n, p). Outputs, as in `lifting.Lifted`: shapes (n, p, 3), rotations (n, 3, 3),
-   scale (n), translation (n, 2), residual (n), confidence (n, p); not_lifted (n) is 1 where too few keypoints
-   are detected or all lie on one line. An object's result does not depend on the others. context: NULL if there is
+   scale (n), translation (n, 2), residual (n), confidence (n, p) and, apart, wrong (n, p), a detected keypoint that
+   contradicts the others; not_lifted (n) is 1 where too few keypoints are detected or all lie on one line. An object's result does not depend on the others. context: NULL if there is
    none; its states are updated. */
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
-          const Context *context, float *const outputs[6], char *not_lifted);
+          const Context *context, float *const outputs[6], char *wrong, char *not_lifted);
 
 #endif

@@ -71,7 +71,7 @@ void leave_out_wrong(Plan *k, Object *o, int perspective) {
         }
         show_without(k, visible, wrong, shown);
         for (int i = 0; i < k->p; i++)
-            if (visible[i] > shown[i]) o->weight[i] = o->certainty[i] = 0;
+            if (visible[i] > shown[i]) o->weight[i] = o->certainty[i] = 0, o->wrong[i] = 1;
         memcpy(visible, shown, k->p * sizeof(float));
         fit_to(k, o, visible, perspective);
         o->last = !k->refill_rounds;

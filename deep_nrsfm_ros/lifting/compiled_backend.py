@@ -111,7 +111,7 @@ class CompiledBackend:
         confidence: NDArray[np.float32],
         perspective: bool,
         context: Context | None = None,
-    ) -> tuple[tuple[NDArray[np.float32], ...], NDArray[np.bool_]]:
+    ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.bool_]]:
         """Return the fields of `lifting.Lifted`, and (n,) True for objects that are not lifted.
 
         Args:
@@ -125,7 +125,8 @@ class CompiledBackend:
         """
         n, p = confidence.shape
         shapes = ((n, p, 3), (n, 3, 3), n, (n, 2), n, (n, p))
-        lifted = tuple(np.empty(shape, np.float32) for shape in shapes)
+        numbers = (np.empty(shape, np.float32) for shape in shapes)
+        lifted = (*numbers, np.empty((n, p), np.bool_))
         not_lifted = np.empty(n, np.bool_)
         _kernel.lift(
             self._plan,

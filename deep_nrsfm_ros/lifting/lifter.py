@@ -61,6 +61,8 @@ class Lifted(NamedTuple):
         residual: (n,) reprojection error of the network before the correction, relative to the
             size of the keypoints; 0 = perfect, below 0.1 typical, above 0.3 poor.
         confidence: (n, p) probability in [0, 1] that the point is close to its true position.
+        wrong: (n, p) bool, whether a detected keypoint contradicts the others of its object; it
+            was taken as missing (option `leave_out_wrong`).
     """
 
     shapes: Float32
@@ -69,12 +71,21 @@ class Lifted(NamedTuple):
     translation: Float32
     residual: Float32
     confidence: Float32
+    wrong: NDArray[np.bool_]
 
     @property
     def object_confidence(self) -> Float32:
         """The mean confidence (n,) of each object's points."""
         mean: Float32 = self.confidence.mean(1)
         return mean
+
+    def at(self, chosen: Any) -> Lifted:
+        """Return some objects, or one.
+
+        Args:
+            chosen: index of the arrays' first axis.
+        """
+        return Lifted._make(part[chosen] for part in self)
 
 
 class Lifter:
@@ -368,7 +379,7 @@ def lift_all(
     if not rest:
         return lifted
     # Each slice goes to its place, so that memory holds the objects but once.
-    result = Lifted(*(empty((n, *array.shape[1:]), array.dtype) for array in lifted))
+    result = Lifted._make(empty((n, *array.shape[1:]), array.dtype) for array in lifted)
     for i, part in enumerate((first, *rest)):
         if part is not first:
             lifted = lift(points[part], confidence[part])
@@ -383,6 +394,6 @@ def lift_all(
 def mark_not_lifted(lifted: Lifted, not_lifted: NDArray[np.bool_]) -> Lifted:
     """Set the chosen objects (n,) to NaN and their confidence to 0, in place; return `lifted`."""
     for array in lifted:
-        array[not_lifted] = np.nan
+        array[not_lifted] = 0 if array.dtype == bool else np.nan
     lifted.confidence[not_lifted] = 0
     return lifted

@@ -10,7 +10,7 @@ R (n, 3, 3) rotations from object to camera axes, W (n, p, 2) normalised keypoin
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +129,7 @@ class NumpyBackend:
         confidence: Float32,
         perspective: bool,
         context: Context | None = None,
-    ) -> tuple[tuple[Float32, ...], NDArray[np.bool_]]:
+    ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.bool_]]:
         """Return the fields of `Lifted`, and which of the n objects cannot be lifted.
 
         Args:
@@ -144,12 +144,14 @@ class NumpyBackend:
         not_lifted |= (
             detected_count(visible, self.constants.derivations) < self.constants.min_visible
         )
+        wrong = np.zeros_like(visible)
         history = None
         if context is not None and self.constants.covariance is not None:
             history = HistoryUpdate(self.constants, context, not_lifted)
         if self.constants.leave_out_wrong:
             right = self._without_wrong(points, visible, perspective)
-            weight[visible & ~right] = 0
+            wrong = visible & ~right
+            weight[wrong] = 0
             visible = right
         seen = Keypoints(points, weight, visible, perspective)
         mask = visible[..., None].astype(np.float32)
@@ -176,7 +178,7 @@ class NumpyBackend:
         )
         S *= self.constants.reference_length / self._reference_size(S)
         scale, translation = weak_perspective(points, S[..., :2], visible)
-        return (S, R, scale, translation, residual, probability), not_lifted
+        return (S, R, scale, translation, residual, probability, wrong), not_lifted
 
     def _without_wrong(
         self, points: Float32, visible: NDArray[np.bool_], perspective: bool

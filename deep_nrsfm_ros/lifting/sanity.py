@@ -8,7 +8,7 @@ remedy. It is no error: the values are used as they are.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +62,10 @@ _MARGIN = 0.5  # of the image's size: points further outside are far outside
 _SCALED_TWICE = 20.0  # sizes of the image from its corner to the points
 _MAX_PLACE = 1000.0  # metres from the camera
 _FAR = 0.01  # fraction of objects at an impossible place that is too many
+_MIN_OBJECTS = 20  # that tell how often a keypoint is wrong
+_OFTEN_WRONG = 0.2  # fraction of the objects; of sound data it is up to 0.08
+_SELDOM_WRONG = 0.01  # fraction of the objects below which a wrong keypoint is not named
+_SHOWN = 3  # keypoints named at most
 _SECOND = 1_000_000_000  # ns
 _SHORTEST, _LONGEST = 100_000, 3600 * _SECOND  # ns between frames: 10 kHz to one an hour
 _UNITS = {"microseconds": 1_000, "milliseconds": 1_000_000, "seconds": _SECOND}
@@ -298,6 +302,43 @@ def quality(residual: Floats, confidence: Floats, image_size: Size | None = None
             )
         ]
     return []
+
+
+def wrong_keypoints(wrong: NDArray[np.bool_], keypoints: Sequence[str]) -> list[Finding]:
+    """Return whether a keypoint is left out of many objects because it contradicts the others.
+
+    Args:
+        wrong: (n, p) as in `Lifted`, of lifted objects.
+        keypoints: names of the p keypoints.
+    """
+    if len(wrong) < _MIN_OBJECTS:
+        return []
+    shares = wrong.mean(0)
+    worst = int(shares.argmax())
+    if shares[worst] < _OFTEN_WRONG:
+        return []
+    return [
+        Finding(
+            "wrong-keypoint",
+            f"keypoint {keypoints[worst]!r} contradicts the others in {shares[worst]:.0%} of the "
+            "objects, where it is left out: check its place in the keypoint layout, and what the "
+            "detector reports there",
+        )
+    ]
+
+
+def wrong_keypoints_text(wrong: NDArray[np.bool_], keypoints: Sequence[str]) -> str:
+    """Return which keypoints are left out, and of how many objects; "" if it is less than 1 %.
+
+    Args:
+        wrong: (n, p) as in `Lifted`, of lifted objects.
+        keypoints: names of the p keypoints.
+    """
+    if not len(wrong):
+        return ""
+    shares = wrong.mean(0)
+    order = [i for i in np.argsort(-shares, kind="stable")[:_SHOWN] if shares[i] >= _SELDOM_WRONG]
+    return ", ".join(f"{keypoints[i]} {shares[i]:.0%}" for i in order)
 
 
 def _size_first(image_size: Size | None) -> str:

@@ -133,7 +133,9 @@ class _Track:
 
     def faded(self, factor: float) -> Lifted:
         """Return the last smoothed object with its confidence multiplied by `factor`."""
-        return self.lifted._replace(confidence=self.lifted.confidence * np.float32(factor))
+        confidence = self.lifted.confidence * np.float32(factor)
+        nothing = np.zeros_like(self.lifted.wrong)
+        return self.lifted._replace(confidence=confidence, wrong=nothing)
 
 
 def _decompose(lifted: Lifted) -> tuple[Floats, Floats, Floats]:
@@ -184,8 +186,7 @@ class Smoother:
             identity: track for identity, track in self._tracks.items() if track.time >= oldest
         }
         objects = [
-            self._smooth(Lifted(*(part[i : i + 1] for part in lifted)), identity, time)
-            for i, identity in enumerate(identities)
+            self._smooth(lifted.at([i]), identity, time) for i, identity in enumerate(identities)
         ]
         absent = [
             identity
@@ -197,7 +198,7 @@ class Smoother:
         ]
         if not objects:
             return lifted, identities
-        together = Lifted(*(np.concatenate(parts) for parts in zip(*objects, strict=True)))
+        together = Lifted._make(np.concatenate(parts) for parts in zip(*objects, strict=True))
         return together, (*identities, *absent)
 
     @property

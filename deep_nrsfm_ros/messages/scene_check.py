@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether gravity and the camera's height can be right, by the people of some seconds.
+"""Whether gravity, the camera's height and single keypoints can be right, by some seconds.
 
 A wrong direction of gravity, such as one with another sign or in the axes of the camera's body,
 spoils shapes and lays people on their side in a fixed frame. One message does not show it: people
@@ -8,17 +8,20 @@ are upside down against gravity, or horizontal before a camera that would look a
 Somebody who lies, or whom a camera at the ceiling sees, is neither.
 
 A wrong height of the camera makes giants or dwarfs of those who stand on the floor.
+
+A keypoint that contradicts the others again and again is not where its name says.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.lifting.sanity import Finding
+from deep_nrsfm_ros.lifting.sanity import Finding, wrong_keypoints, wrong_keypoints_text
 
 Floats = NDArray[Any]
 
@@ -55,6 +58,11 @@ class _Window:
             kept.append((seconds, rows))
         while kept and kept[0][0] < seconds - WINDOW:
             kept.popleft()
+
+    @property
+    def all(self) -> Floats | None:
+        """All rows (m, k), however few; None: there are none."""
+        return np.concatenate([rows for _, rows in self._kept]) if self._kept else None
 
     def rows(self) -> Floats | None:
         """Return all rows (m, k); None: they are too few, or of too short a time."""
@@ -172,3 +180,41 @@ class FloorCheck:
                 "gravity, the intrinsics, and that they stand on that floor",
             )
         ]
+
+
+class WrongKeypointCheck:
+    """Counts how often the keypoints of the last seconds contradict the others of their object."""
+
+    def __init__(self) -> None:
+        """Start without objects."""
+        self._window = _Window()  # columns: the keypoints
+        self.forget = self._window.forget
+
+    def add(self, seconds: float, wrong: NDArray[np.bool_], residual: Floats) -> None:
+        """Keep the objects of a message; most messages are left out.
+
+        Args:
+            seconds: of a clock that is never set back.
+            wrong: (n, p) as in `Lifted`.
+            residual: (n,) as in `Lifted`; NaN where not lifted.
+        """
+        if self._window.is_due(seconds):
+            self._window.keep(seconds, wrong[~np.isnan(residual)])
+
+    def find(self, keypoints: Sequence[str]) -> list[Finding]:
+        """Return whether one is wrong in many objects.
+
+        Args:
+            keypoints: their names.
+        """
+        rows = self._window.rows()
+        return [] if rows is None else wrong_keypoints(rows, keypoints)
+
+    def text(self, keypoints: Sequence[str]) -> str:
+        """Return which ones are wrong and how often, for diagnostics.
+
+        Args:
+            keypoints: their names.
+        """
+        rows = self._window.all
+        return (rows is not None and wrong_keypoints_text(rows, keypoints)) or "none"

@@ -70,7 +70,7 @@ from deep_nrsfm_ros.messages.field_mapping import YOLO
 from deep_nrsfm_ros.messages.mapping_file import MAPPING_SUFFIXES
 from deep_nrsfm_ros.messages.options import AUTO, MODEL_ORDER, InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
-from deep_nrsfm_ros.messages.scene_check import FloorCheck, GravityCheck
+from deep_nrsfm_ros.messages.scene_check import FloorCheck, GravityCheck, WrongKeypointCheck
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.messages.stamps import Moment
 from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
@@ -247,7 +247,7 @@ class LifterNode(Node):
         self._camera = Camera(self, camera, self._view, self._pipeline.image_size)
         self._gravity = GravityDirection(self, self._gravity_sources)
         self._gravity_check, self._gravity_source = GravityCheck(), ""
-        self._floor_check = FloorCheck()
+        self._floor_check, self._wrong_check = FloorCheck(), WrongKeypointCheck()
         self._scenes: dict[str, tuple[float, Scene]] = {}  # the last of each topic, and when
         self._floor_sizes: tuple[Sequence[str], NDArray[np.float32]] = ((), np.ones(0, np.float32))
         depth = self._depth_options
@@ -325,6 +325,7 @@ class LifterNode(Node):
         self._scenes.clear()
         self._gravity_check.forget()
         self._floor_check.forget()
+        self._wrong_check.forget()
 
     def clean_up(self) -> None:
         """Release the model, the topics and the services, and end a running training."""
@@ -416,6 +417,7 @@ class LifterNode(Node):
         )
         if up is not None and is_person(self._pipeline.model.layout):
             self._gravity_check.add(time.monotonic(), lifted.rotations, up)
+        self._wrong_check.add(time.monotonic(), lifted.wrong, lifted.residual)
         scene = Scene(header, lifted, identities, detected, moment)
         if identities:
             self._stream.lifted(lifted)  # in the camera's axes, before `target_frame`
@@ -654,6 +656,7 @@ class LifterNode(Node):
         values["findings"] = "; ".join(map(str, self._findings)) or "none"
         values["keypoint layout"] = self._layout_status()
         model = self._pipeline.model
+        values["wrong keypoints"] = self._wrong_check.text(model.layout.keypoints)
         values |= {"model": model.name, "topic": ", ".join(self._keypoint_topics.topics)}
         values["history"] = self._pipeline.history_status
         frame = self._last_frame or self._frame_id or self._camera.frame
@@ -757,6 +760,7 @@ class LifterNode(Node):
         gravity = self._against_gravity(Header(frame_id=self._last_frame))
         layout, trunk = self._pipeline.model.layout, self._pipeline.reference_length
         return [
+            *self._wrong_check.find(layout.keypoints),
             *self._gravity_check.find(gravity.source, gravity.mend),
             *self._floor_check.find(
                 self._camera_options.camera_height, trunk if layout.reference == TRUNK else None

@@ -193,7 +193,7 @@ def markers(
         positioned: whether the shapes are at their positions. If not, the first object is at the
             origin, as in the point cloud, and the others stand beside it as in the image.
     """
-    lifted = Lifted(*(part[~np.isnan(lifted.residual)] for part in lifted))
+    lifted = lifted.at(~np.isnan(lifted.residual))
     n, p, _ = lifted.shapes.shape
     sizes = np.sqrt((centre(lifted.shapes) ** 2).sum(-1).mean(-1))[:, None]
     places = np.zeros((n, 2))

@@ -76,7 +76,7 @@ class SceneTransform:
                 "keypoints": _flat(keypoints),
             }
             if lifted is not None and np.isfinite(lifted.shapes[i]).all():
-                scene_object |= self._lifted(Lifted(*(part[i] for part in lifted)))
+                scene_object |= self._lifted(lifted.at(i))
             objects.append(scene_object)
         at_position = self.origin is not None and not self.scale
         camera = None
@@ -157,7 +157,7 @@ def scenes(
     for frame in range(0, len(detections.stamps), every):
         rows = slice(ends[frame], ends[frame + 1])
         observation = Observation(detections.points[rows], detections.confidence[rows])
-        in_frame = Lifted(*(part[rows] for part in lifted))
+        in_frame = lifted.at(rows)
         stamp, identities = int(detections.stamps[frame]), detections.identities[rows].tolist()
         yield transform.scene(stamp, observation, in_frame, identities)
 

@@ -432,6 +432,31 @@ def test_people_far_away_and_those_left_out(
     assert "56 of 60 objects" in said and "left out: 4 have fewer than 4 detected" in said
 
 
+@pytest.mark.parametrize(("share", "code"), [(0.1, 0), (0.4, 3)])
+def test_a_wrong_keypoint_is_named(
+    share: float, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = POINTS.copy()
+    points[: round(share * len(points)), COCO17.index("left_wrist")] += 400
+    assert lift(tmp_path, "coco17", points=points) == code
+    said = capsys.readouterr()
+    assert f"wrong keypoints: left_wrist {share:.0%} of the objects (they contradict" in said.out
+    assert ("keypoint 'left_wrist' contradicts the others" in said.err) == (code == 3)
+    for format in ("npz", "json"):
+        main(
+            [
+                str(tmp_path / "keypoints.npz"),
+                "--output",
+                str(tmp_path / f"out.{format}"),
+                "--force",
+            ]
+        )
+    with np.load(tmp_path / "out.npz") as file:
+        wrong = file["wrong"]
+    frames = json.loads((tmp_path / "out.json").read_text())["frames"]
+    assert wrong.any() and [each["objects"][0]["wrong"] for each in frames] == wrong.tolist()
+
+
 @pytest.mark.parametrize("nothing", [0.0, np.nan])
 def test_padding_of_an_array_is_no_object(
     nothing: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]

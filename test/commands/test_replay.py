@@ -49,9 +49,8 @@ def answered(tmp_path: Path, points: np.ndarray) -> Path:
     sure = np.full((5, 25), 0.5, np.float32)
     order = np.arange(5)
     seen = Detections(points, 2 * sure, order, np.array(["0"] * 5), stamps_at(10, 5) + 10**18)
-    write_lifted_bag(
-        tmp_path / "answered", seen, Lifted(shapes, rotations, ones, places, 0 * ones, sure)
-    )
+    lifted = Lifted(shapes, rotations, ones, places, 0 * ones, sure, sure < 0)
+    write_lifted_bag(tmp_path / "answered", seen, lifted)
     return tmp_path / "answered"
 
 

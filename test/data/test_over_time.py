@@ -99,6 +99,15 @@ def test_looking_ahead_knows_the_bones_from_the_first_frame() -> None:
     np.testing.assert_allclose(determinants, 1, atol=1e-5)
 
 
+@pytest.mark.parametrize("smooth", [NONE, CAUSAL, BOTH])
+def test_a_wrong_keypoint_is_named_in_its_frame(smooth: str) -> None:
+    detections = walk()
+    detections.points[5, BODY25.index("left_wrist")] += 3 * detections.points[5].std(0).max()
+    frames, keypoints = np.nonzero(lifted(detections, smooth).wrong)
+    names = [LIFTER.model.layout.keypoints[i] for i in keypoints]
+    assert (frames.tolist(), names) == ([5], ["left_wrist"])
+
+
 def test_gravity_sets_a_person_upright() -> None:
     detections, up = walk(), np.array([0.0, -1, 0])
     layout = LIFTER.model.layout

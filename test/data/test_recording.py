@@ -183,7 +183,7 @@ def standing(frame_id: str) -> tuple[Recording, Detections]:
     seen = gather([Observation(points, sure)], [10**18], 17, frame_id)
     none = np.full(2, np.nan, np.float32)
     R = np.tile(np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], np.float32), (2, 1, 1))
-    lifted = Lifted(shapes, R, none, np.full((2, 2), np.nan, np.float32), none, sure)
+    lifted = Lifted(shapes, R, none, np.full((2, 2), np.nan, np.float32), none, sure, sure < 0)
     return Recording(HUMAN17, HUMAN17, seen, lifted), seen
 
 

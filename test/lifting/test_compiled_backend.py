@@ -82,6 +82,11 @@ def objects(
 PERTURBATIONS = 3  # draws; one alone may by chance change less than rounding does
 
 
+def difference(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Return the largest difference of numbers, or of truth values."""
+    return float(np.abs(np.subtract(a, b, dtype=np.float64)).max())
+
+
 def in_last_digits(
     backend: NumpyBackend,
     points: NDArray[np.float32],
@@ -147,9 +152,9 @@ def test_lifts_as_numpy_does(
     nearby = cache(partial(in_last_digits, by_numpy, points, confidence, perspective))
     for field, (ours, numpy) in enumerate(zip(arrays, expected, strict=True)):
         for i in np.flatnonzero(~lost):
-            error, close = np.abs(ours[i] - numpy[i]).max(), 1e-4 * np.abs(numpy[i]).max() + 1e-6
+            error, close = difference(ours[i], numpy[i]), 1e-4 * np.abs(numpy[i]).max() + 1e-6
             if not error <= close:  # where these digits matter, no more can be asked
-                unsure = max(np.abs(near[field][i] - numpy[i]).max() for near, _ in nearby())
+                unsure = max(difference(near[field][i], numpy[i]) for near, _ in nearby())
                 assert error <= close + 10 * unsure
 
 
@@ -205,9 +210,9 @@ def test_remembers_as_numpy_does(
         for field, (ours, numpy) in enumerate(zip(arrays, expected, strict=True)):
             close = 1e-3 * np.abs(numpy[~lost]).max(initial=0) + 1e-6
             for i in np.flatnonzero(~lost):
-                error = np.abs(ours[i] - numpy[i]).max()
+                error = difference(ours[i], numpy[i])
                 if not error <= close:
-                    unsure = max(np.abs(near[field][i] - numpy[i]).max() for near, _ in nearby())
+                    unsure = max(difference(near[field][i], numpy[i]) for near, _ in nearby())
                     assert error <= close + 10 * unsure
         np.testing.assert_array_equal(np.isnan(context.states), np.isnan(state))
         known = ~np.isnan(state)

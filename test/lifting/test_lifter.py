@@ -123,9 +123,9 @@ def test_the_mirror_image_is_lifted_to_the_mirror_image() -> None:
 
 def test_types_and_shapes() -> None:
     lifted = Lifter(random_model())(*pixels())
-    expected = Lifted((N, 17, 3), (N, 3, 3), (N,), (N, 2), (N,), (N, 17))  # type: ignore[arg-type]
-    assert tuple(array.shape for array in lifted) == tuple(expected)
-    assert all(array.dtype == np.float32 for array in lifted)
+    expected = ((N, 17, 3), (N, 3, 3), (N,), (N, 2), (N,), (N, 17), (N, 17))
+    assert tuple(array.shape for array in lifted) == expected
+    assert [array.dtype for array in lifted] == [np.float32] * 6 + [np.bool_]
     assert all(len(array) == 0 for array in Lifter(random_model())(*pixels(0)))
 
 
@@ -226,11 +226,12 @@ def test_too_few_visible_points_are_not_lifted_and_disturb_nobody(min_visible: i
     derived = shown[:, [0, 1, 12]].all(1) + 0 + shown[:, [6, 7, 13]].all(1)  # neck, mid-hip
     enough = shown.sum(1) - derived >= min_visible
     assert not enough[:3].any() and enough[3:].any()
-    for array in lifted[:-1]:
+    for array in lifted[:-2]:
         assert np.isnan(array[~enough]).all() and np.isfinite(array[enough]).all()
     assert (lifted.confidence[~enough] == 0).all() and (lifted.confidence[enough] > 0).any()
-    for array, alone in zip(lifted, lift(points[enough], confidence[enough]), strict=True):
-        np.testing.assert_allclose(array[enough], alone, rtol=1e-4, atol=1e-4)
+    both = zip(lifted.at(enough), lift(points[enough], confidence[enough]), strict=True)
+    for among, alone in both:
+        np.testing.assert_allclose(among.astype(float), alone.astype(float), rtol=1e-4, atol=1e-4)
 
 
 @every_model
@@ -243,8 +244,8 @@ def test_points_that_say_nothing_of_the_camera_are_not_lifted(
     points[0] = np.array([300, 200], np.float32) + along * np.array([1, 0.5], np.float32)
     lift = Lifter(random_model(architecture, scale))
     lifted = lift((points / 500).astype("f4"), confidence)
-    assert all(np.isnan(array[0]).all() for array in lifted[:-1])
-    assert (lifted.confidence[0] == 0).all()
+    assert all(np.isnan(array[0]).all() for array in lifted[:-2])
+    assert (lifted.confidence[0] == 0).all() and not lifted.wrong[0].any()
     assert all(np.isfinite(array[1:]).all() for array in lifted)
 
 

@@ -17,6 +17,8 @@ from deep_nrsfm_ros.lifting.sanity import (
     looks_normalised,
     orientation,
     pose,
+    wrong_keypoints,
+    wrong_keypoints_text,
 )
 
 CAMERA = Intrinsics((1000.0, 1000.0), (640.0, 360.0))
@@ -39,6 +41,7 @@ def lifted(place: tuple[float, float, float] = (0, 0, 4), residual: float = 0.05
         np.ones((N, 2), np.float32),
         np.full(N, residual, np.float32),
         np.full((N, Q), 0.8, np.float32),
+        np.zeros((N, Q), np.bool_),
     )
 
 
@@ -275,3 +278,26 @@ def test_few_faces_of_many_people_say_nothing_of_left_and_right() -> None:
     assert not pose(away, seen, HUMAN17)
     seen[:11] = 1
     assert [f.code for f in pose(away, seen, HUMAN17)] == ["handedness"]
+
+
+def often_wrong(objects: int, share: float) -> np.ndarray:
+    """Return flags (objects, 3) of which the last keypoint is wrong in a share of the objects."""
+    wrong = np.zeros((objects, 3), np.bool_)
+    wrong[: round(share * objects), 2] = True
+    return wrong
+
+
+def test_a_keypoint_that_is_often_wrong_is_named() -> None:
+    (finding,) = wrong_keypoints(often_wrong(50, 0.3), "abc")
+    assert finding.code == "wrong-keypoint"
+    assert str(finding).startswith("keypoint 'c' contradicts the others in 30% of the objects, ")
+    assert not wrong_keypoints(often_wrong(50, 0.1), "abc")
+    assert not wrong_keypoints(often_wrong(10, 1.0), "abc")  # too few
+    assert not wrong_keypoints(often_wrong(0, 0), "abc")
+
+
+def test_wrong_keypoints_are_told_from_the_worst_on() -> None:
+    wrong = often_wrong(100, 0.03)
+    wrong[:10, 0] = True
+    assert wrong_keypoints_text(wrong, "abc") == "a 10%, c 3%"
+    assert wrong_keypoints_text(wrong[50:], "abc") == wrong_keypoints_text(wrong[:0], "abc") == ""

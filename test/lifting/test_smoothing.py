@@ -30,17 +30,18 @@ def one(
     """Return an object of shape S in its own axes, turned and at its place."""
     R = rotation_from_vector(np.array(turn, float))
     parts = (S @ R.T + np.array(place), R, 1.0, np.zeros(2), 0.1, np.full(P, confidence))
-    return Lifted(*(np.asarray(part, np.float32)[None] for part in parts))
+    numbers = (np.asarray(part, np.float32)[None] for part in parts)
+    return Lifted._make((*numbers, np.zeros((1, P), np.bool_)))
 
 
 def nothing() -> Lifted:
     parts = one(confidence=0)
-    unknown = (np.full_like(part, np.nan) for part in parts[:-1])
-    return Lifted._make((*unknown, parts.confidence))
+    unknown = (np.full_like(part, np.nan) for part in parts[:-2])
+    return Lifted._make((*unknown, parts.confidence, parts.wrong))
 
 
 def both(*objects: Lifted) -> Lifted:
-    return Lifted(*(np.concatenate(parts) for parts in zip(*objects, strict=True)))
+    return Lifted._make(np.concatenate(parts) for parts in zip(*objects, strict=True))
 
 
 def run(objects: Sequence[Lifted], options: SmoothingOptions = ON, rate: float = RATE) -> Lifted:
@@ -131,7 +132,7 @@ def test_each_object_has_a_filter_of_its_own_wherever_it_stands_in_the_message()
 @pytest.mark.parametrize("listed", [True, False], ids=["not lifted", "not in the message"])
 def test_a_gap_is_filled_for_its_time_with_falling_confidence(listed: bool) -> None:
     smoother = Smoother(dataclasses.replace(ON, max_gap=0.4))
-    empty = Lifted(*(part[:0] for part in one()))
+    empty = Lifted._make(part[:0] for part in one())
     gone, identities = (nothing(), ("a",)) if listed else (empty, ())
     smoother(one(), ("a",), 10.0)
     for wait, left in ((0.1, 0.75), (0.3, 0.25)):
@@ -183,7 +184,7 @@ def test_a_clock_that_goes_far_back_begins_anew() -> None:
 
 @pytest.mark.parametrize("rate", [1, 5, 30, 240])
 def test_gaps_and_restart_follow_the_rate_of_the_stream(rate: int) -> None:
-    period, empty = 1 / rate, Lifted(*(part[:0] for part in one()))
+    period, empty = 1 / rate, Lifted._make(part[:0] for part in one())
     smoother = Smoother(ON)
     smoother(one(), ("a",), 0.0, period)
     assert smoother(empty, (), 2 * period, period)[1] == ("a",)

@@ -31,6 +31,7 @@ def objects(shapes: np.ndarray, rotations: np.ndarray | None = None) -> Lifted:
         np.zeros((n, 2), np.float32),
         ones,
         np.ones(shapes.shape[:2], np.float32),
+        np.zeros(shapes.shape[:2], np.bool_),
     )
 
 

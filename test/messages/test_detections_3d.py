@@ -55,6 +55,7 @@ def shapes(n: int, p: int) -> Lifted:
         np.zeros((n, 2), np.float32),
         np.zeros(n, np.float32),
         rng.uniform(0.2, 1, (n, p)).astype(np.float32),
+        np.zeros((n, p), np.bool_),
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gravity and heights of a camera that people contradict, and scenes in which they do not."""
+"""Gravity, heights and keypoints that people contradict, and scenes in which they do not."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from deep_nrsfm_ros.messages.scene_check import WINDOW, FloorCheck, GravityCheck
+from deep_nrsfm_ros.messages.scene_check import (
+    WINDOW,
+    FloorCheck,
+    GravityCheck,
+    WrongKeypointCheck,
+)
 
 LEVEL = np.array([0.0, -1, 0])
 DOWN, FORWARD = -LEVEL, np.array([0.0, 0, 1])
@@ -114,3 +119,17 @@ def test_some_impossible_sizes_are_no_finding() -> None:
     check = sizes(9.0)
     check.forget()
     assert not check.find(1.4, 0.5)
+
+
+def test_a_keypoint_that_is_wrong_for_seconds_is_found() -> None:
+    check, wrong = WrongKeypointCheck(), np.array([[False, True], [True, True]])
+    residual = np.array([0.2, np.nan], np.float32)  # the second object is not lifted
+    assert check.text("ab") == "none" and not check.find("ab")
+    for i in range(40):
+        check.add(i / 4, wrong & (i % 2 == 0), residual)
+        check.add(i / 4 + 0.01, wrong, residual)  # too soon after the last one
+    (finding,) = check.find("ab")
+    assert finding.code == "wrong-keypoint" and "keypoint 'b' contradicts" in str(finding)
+    assert check.text("ab") == "b 50%"
+    check.forget()
+    assert check.text("ab") == "none" and not check.find("ab")

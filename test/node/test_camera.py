@@ -245,6 +245,7 @@ def placed() -> Lifted:
         np.array([[320, 240], [np.nan, np.nan], [322, 241]], np.float32),
         residual,
         np.ones((3, 5), np.float32),
+        np.zeros((3, 5), np.bool_),
     )
 
 

@@ -97,7 +97,7 @@ class Bench:
         shape = person()[None].astype(np.float32)
         one = np.ones((1, P), np.float32)
         R = np.eye(3, dtype=np.float32)[None]
-        lifted = Lifted(shape, R, one[:, 0], shape[:, 0, :2], one[:, 0], one)
+        lifted = Lifted(shape, R, one[:, 0], shape[:, 0, :2], one[:, 0], one, one < 0)
         pipeline: Any = SimpleNamespace(model=SimpleNamespace(layout=HUMAN17), reference_length=0.5)
         at = header(stamp, frame)
         own = Header(at.stamp.sec, at.stamp.nanosec, frame)

@@ -43,6 +43,7 @@ def lifted(n: int, p: int = 5, seed: int = 0) -> Lifted:
         rng.uniform(0, 500, (n, 2)).astype(np.float32),
         np.full(n, 0.1, np.float32),
         rng.uniform(0.2, 1, (n, p)).astype(np.float32),
+        np.zeros((n, p), np.bool_),
     )
 
 

@@ -166,6 +166,20 @@ def test_a_wrong_direction_of_gravity_is_said(
             client.wait_for_health(lambda s, v: v["findings"] == "none" and s.level == b"\x00")
 
 
+def test_a_keypoint_that_is_wrong_again_and_again_is_named(
+    start_lifter: StartLifter, connect: Connect
+) -> None:
+    start_lifter(**CAMERA)
+    client = connect()
+    client.wait_for_health(lambda _, v: v["wrong keypoints"] == "none")
+    points, confidence = in_layout(COCO17)
+    points[::2, COCO17.index("left_wrist")] += 300
+    with stream(client, points, confidence):
+        status = client.wait_for_health(lambda s, v: "'left_wrist' contradicts" in v["findings"])
+        assert status.level == b"\x01" and "where it is left out: check its place" in status.message
+        assert values(status)["wrong keypoints"].startswith("left_wrist ")
+
+
 def test_the_direction_of_a_target_frame_is_shown(
     start_lifter: StartLifter, connect: Connect
 ) -> None:

@@ -61,7 +61,8 @@ def cloud(number: int) -> PointCloud2:
     """Return a message of keypoints whose stamp is its number."""
     zeros = np.zeros(1, np.float32)
     points = np.concatenate([views(1), np.zeros((1, P, 1))], -1).astype(np.float32)
-    seen = Lifted(points, zeros, zeros, zeros, zeros, confidence=np.ones((1, P), np.float32))
+    sure = np.ones((1, P), np.float32)
+    seen = Lifted(points, zeros, zeros, zeros, zeros, sure, wrong=sure < 1)
     return deserialize_message(point_cloud(Header(sec=number), seen), PointCloud2)
 
 

@@ -60,8 +60,9 @@ def recording_of(f: int = 30, layout: KeypointLayout = HUMAN17, offset: float = 
         np.tile(np.array([640, 360], np.float32), (f, 1)),
         np.full(f, 0.1, np.float32),
         sure.copy(),
+        np.zeros_like(sure, np.bool_),
     )
-    for part in lifted:
+    for part in lifted[:-1]:
         part[3] = np.nan
     lifted.confidence[3] = 0
     return Recording(layout, layout, seen, lifted)

@@ -26,9 +26,9 @@ def lifted(S: np.ndarray, seed: int = 0) -> Lifted:
     """Return object shapes S (f, p, 3) as a perfect lifter would."""
     R = rotation_from_camera(random_cameras(len(S), np.random.default_rng(seed)))
     ones = np.ones(len(S), np.float32)
-    return Lifted(
-        S @ R.swapaxes(1, 2), R, ones, np.zeros((len(S), 2), np.float32), 0 * ones, ones[:, None]
-    )
+    nothing = np.zeros((len(S), 1), np.bool_)
+    places = np.zeros((len(S), 2), np.float32)
+    return Lifted(S @ R.swapaxes(1, 2), R, ones, places, 0 * ones, ones[:, None], nothing)
 
 
 def test_the_modes_are_those_of_the_object() -> None:

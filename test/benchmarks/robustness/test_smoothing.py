@@ -27,7 +27,8 @@ def turning(degrees: float, frames: int = 100) -> Lifted:
     R = np.array([rotation_from_vector(np.radians([0, 0, degrees * i])) for i in range(frames)])
     ones = np.ones(frames)
     parts = (S @ R.swapaxes(1, 2), R, ones, np.zeros((frames, 2)), ones, np.ones((frames, 17)))
-    return Lifted(*(part.astype(np.float32) for part in parts))
+    numbers = (part.astype(np.float32) for part in parts)
+    return Lifted._make((*numbers, np.zeros((frames, 17), np.bool_)))
 
 
 def test_from_end_to_end(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
