@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from deep_nrsfm_ros.data.formats.names import (
     contradiction,
     layout_of_names,
 )
+from deep_nrsfm_ros.data.formats.unused import find_unused, unused_sentence
 from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, LAYOUTS
@@ -131,6 +132,7 @@ class DetectionsBuilder:
     Attributes:
         options: of reading.
         warnings: sentences about what was left out.
+        notes: sentences about how the input is taken, which are no cause for doubt.
         is_mediapipe: the input is landmarks, which MediaPipe gives as fractions of the image's
             size.
         is_coco: the input is objects with a category and an image, as COCO has them.
@@ -140,6 +142,7 @@ class DetectionsBuilder:
         """Start without frames."""
         self.options = options
         self.warnings: list[str] = []
+        self.notes: list[str] = []
         self._findings: dict[str, Finding] = {}
         self.is_mediapipe = self.is_coco = False
         self._groups: dict[tuple[Any, int], _Group] = {}
@@ -241,6 +244,19 @@ class DetectionsBuilder:
     def find(self, finding: Finding) -> None:
         """Add what looks wrong in the input; one of its code replaces it."""
         self._findings[finding.code] = finding
+
+    def not_used(self, kind: str, names: Iterable[str], remedies: Mapping[str, str]) -> None:
+        """Say what the input holds and the reader does not use.
+
+        Args:
+            kind: as in `unused.unused_sentence`.
+            names: likewise; a repeated one is said once.
+            remedies: as in `unused.find_unused`.
+        """
+        if listed := list(dict.fromkeys(names)):
+            self.notes.append(unused_sentence(kind, listed))
+            for finding in find_unused(kind, listed, remedies):
+                self.find(finding)
 
     def leave_out(self, reason: str, place: str) -> None:
         """Count an entry of the input that is left out."""
@@ -352,6 +368,7 @@ class DetectionsBuilder:
             usual_layout=COCO17 if self.is_coco and points.shape[1] == len(COCO17) else None,
             image_sizes=tuple(self._image_sizes.most_common()),
             warnings=(*self.warnings, *self.reasons()),
+            notes=tuple(self.notes),
             findings=tuple(self._findings.values()),
         )
 
