@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file holds and a reader does not use is named; what it seems to mean makes it a finding."""
+"""What a file holds and a reader does not use is named; with a known meaning it is a finding."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from deep_nrsfm_ros.lifting.sanity import Finding
 
@@ -39,7 +39,7 @@ def unused_sentence(kind: str, names: Sequence[str]) -> str:
     return f"not used: {kind} {', '.join(names[:_SHOWN])}{more}"
 
 
-def find_unused(kind: str, names: Sequence[str], remedies: dict[str, str]) -> list[Finding]:
+def find_unused(kind: str, names: Sequence[str], remedies: Mapping[str, str]) -> list[Finding]:
     """Return a finding if unused names seem to hold a frame, a time, an identity or a confidence.
 
     Args:
