@@ -15,7 +15,7 @@ from deep_nrsfm_ros.commands.program import Parser, program, program_name
 from deep_nrsfm_ros.model_files.folders import default_models_dir, model_folders
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_model
 from deep_nrsfm_ros.training.same_name import CUT_OFF
-from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL
+from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL, UNKNOWN
 
 COLUMNS = ("model", "object", "keypoints", "judged", "date")
 NOT_JUDGED = "-"
@@ -94,7 +94,7 @@ def list_models(folders: Sequence[Path]) -> list[Listed]:
 def _rank(listed: Listed) -> tuple[bool, str, int]:
     """Return the place of a model in the list."""
     usable = len(listed.row) == len(COLUMNS)
-    verdicts = (BETTER, AS_GOOD, ALONE, NOT_JUDGED, DOUBTFUL)
+    verdicts = (BETTER, AS_GOOD, ALONE, UNKNOWN, NOT_JUDGED, DOUBTFUL)
     return not usable, listed.row[1], verdicts.index(listed.row[3]) if usable else 0
 
 
@@ -107,7 +107,8 @@ def _verdict(model: Model) -> str:
         return DOUBTFUL
     if "rival" not in judgement:
         return ALONE
-    return AS_GOOD if judgement.get("verdict") == AS_GOOD else BETTER
+    said = judgement.get("verdict")
+    return said if said in (AS_GOOD, UNKNOWN) else BETTER
 
 
 def _quality(model: Model) -> tuple[str, ...]:

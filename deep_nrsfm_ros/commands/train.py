@@ -260,6 +260,8 @@ def _next_steps(layout: KeypointLayout, path: Path, judgement: Judgement | None)
         use = "not in use, but you can look at what it lifts"
     elif judgement and judgement.is_first_look:
         use = "too few steps for use, but you can look at what it lifts"
+    elif judgement and judgement.fits_badly:
+        use = "it fits badly; look at what it lifts"
     other = not knows(layout, HUMAN25)
     switch = ", and then ".join(switch_commands("/lifter", path.stem, other_object=other))
     lines = [f"{use}: lift FILE --model {name}, or in a lifter: {switch}"]

@@ -57,10 +57,10 @@ class Curation:
     )
     held_out: float = option(
         0.1,
-        "share of the frames that the training does not use, where there is a model to compare the "
-        "new one with: the last ones of each recording or identity, after a gap of half as many "
-        "frames, which nothing uses; 0 = none, the comparison uses the frames of the training, 0.1 "
-        "typical",
+        "share of the frames that the training does not use, and on which the new model is judged: "
+        "the last ones of each recording or identity, after a gap of half as many frames, which "
+        "nothing uses; 0, or fewer than 20 frames (50 where the object has no model) = none, the "
+        "model is judged on the frames of its training; 0.1 typical",
         low=0.0,
         high=0.5,
     )

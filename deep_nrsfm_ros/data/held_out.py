@@ -20,6 +20,11 @@ GAP = 0.5
 """Frames left out before the held-out ones, as a share of these."""
 MIN_HELD_OUT = 20
 """Frames below which nothing is held out: the judge then uses the frames of the training."""
+MIN_HELD_OUT_ALONE = 50
+"""The same where there is no model to compare with: an object without one needs its few frames.
+
+docs/devlog/training.md has the errors with and without them.
+"""
 
 
 class Split(NamedTuple):
@@ -34,7 +39,7 @@ class Split(NamedTuple):
     held_out: Dataset
 
 
-def split(dataset: Dataset, share: float) -> Split:
+def split(dataset: Dataset, share: float, fewest: int = MIN_HELD_OUT) -> Split:
     """Return the dataset without the last frames of each of its sequences, and those frames.
 
     Where the sequences are unknown, or too short to give enough frames, each quarter of the dataset
@@ -43,9 +48,10 @@ def split(dataset: Dataset, share: float) -> Split:
     Args:
         dataset: frames of each sequence in the order of their time.
         share: of the frames to hold out, 0 to 0.5; 0.1 typical.
+        fewest: frames below which nothing is held out.
     """
     n = len(dataset)
-    if share * n < MIN_HELD_OUT:
+    if share * n < fewest:
         return Split(dataset, dataset)
     place = _places(dataset.sequence_starts, n)
     if (place >= _begin(share)).sum() < max(MIN_HELD_OUT, share * n / 2):

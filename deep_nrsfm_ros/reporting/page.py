@@ -26,6 +26,7 @@ from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFile
 from deep_nrsfm_ros.reporting.drawing import bars, curve, scene, skeleton
 from deep_nrsfm_ros.reporting.shapes import shape_space
 from deep_nrsfm_ros.reporting.template import embedded, render
+from deep_nrsfm_ros.training.learned_frames import LEARNED_FRAMES
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.training.judge import Standing
@@ -141,7 +142,8 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
         warnings=[*training.warnings, *training.curated.warnings, *sufficiency.warnings],
         curves=[_curve(training.progress, field, label) for field, label in _CURVES.items()],
         comparison=_comparison(training, folders),
-        compared_frames=len(_split(training).held_out),
+        compared_frames=_compared_frames(training),
+        held_out=training.held_out is not None,
         compared_kind="the training" if training.held_out is None else "this data",
         quality=[(title, model.quality.get(key)) for key, title in _QUALITY.items()],
         shapes=shapes,
@@ -158,7 +160,7 @@ def page(training: Training, folders: Sequence[Path] = ()) -> str:
             (each, skeleton(each.points, each.visible, model.layout, each.outliers))
             for each in training.curated.outlier_frames
         ],
-        provenance=_rows(model.provenance),
+        provenance=_rows({k: v for k, v in model.provenance.items() if k != LEARNED_FRAMES}),
         scenes=embedded(scenes),
     )
 
@@ -186,6 +188,13 @@ def _split(training: Training) -> Split:
     return training.held_out or Split(training.dataset, training.dataset)
 
 
+def _compared_frames(training: Training) -> int:
+    """Return the number of frames on which models are compared."""
+    from deep_nrsfm_ros.training.judge import comparable  # imports torch
+
+    return len(comparable(_split(training), training.rival).frames.held_out)
+
+
 def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, Any]]:
     """Return a row for this model and each other one of its keypoints, the best first."""
     from deep_nrsfm_ros.training.judge import standings  # imports torch
@@ -207,6 +216,7 @@ def _comparison(training: Training, folders: Sequence[Path]) -> list[dict[str, A
             "name": standing.model.name,
             "is_this": standing.model is training.model,
             "verdict": _verdict(standing, training.model),
+            "has_learned": standing.has_learned,
             "figures": [getattr(standing.figures, name) for name in _FIGURES],
         }
         for standing in standings(_split(training), models, rival)

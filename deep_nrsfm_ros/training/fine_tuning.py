@@ -28,6 +28,7 @@ from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import Array
 from deep_nrsfm_ros.nrsfm.network import Network
 from deep_nrsfm_ros.nrsfm.recipe import Preset
+from deep_nrsfm_ros.training.learned_frames import LEARNED_FRAMES, joined_marks
 
 RARELY_SHOWN = "rarely_shown"
 """Key of a provenance: keypoints that less than half of the frames show."""
@@ -136,8 +137,10 @@ def inherit(trained: Model, start: Model) -> Model:
     """
     origin = {"model": start.name, "data": start.provenance.get("data", "unknown")}
     if trained.provenance["recipe"]["steps"] == 0:  # the network is that of the start
-        origin |= start.provenance
+        origin |= {k: v for k, v in start.provenance.items() if k != LEARNED_FRAMES}
     model = dataclasses.replace(trained, provenance=trained.provenance | {"from": origin})
+    if trained.layout.keypoints == start.layout.keypoints:  # a mark is of the keypoints of a layout
+        model.provenance[LEARNED_FRAMES] = joined_marks(trained, start)
     if not trained.layout.handedness:
         model = dataclasses.replace(model, object_frame=start.object_frame)
     if _has_better_covariance(start, trained):

@@ -29,6 +29,8 @@ from deep_nrsfm_ros.nrsfm.handedness import object_frame
 from deep_nrsfm_ros.nrsfm.network import Network, coherence, complete, reconstruct
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser, normalise
 from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
+from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.learned_frames import LEARNED_FRAMES, frame_marks, marks_in_words
 from deep_nrsfm_ros.training.trainer import Trainer
 
 _SHOWN = 0.5  # share of the frames; of keypoints shown in fewer, most errors are of filled-in ones
@@ -81,6 +83,7 @@ def finish(
         provenance[RARELY_SHOWN] = rare
     if last_step_data is not None:
         provenance["last_step"] = {"data": last_step_data.source, "frames": len(last_step_data)}
+    provenance[LEARNED_FRAMES] = _marks(trainer.frames)
     return Model(
         name,
         net,
@@ -188,6 +191,15 @@ def _provenance(trainer: Trainer, source: str) -> dict[str, Any]:
         provenance["processes"] = trainer.group.size
     provenance["versions"] = {"deep_nrsfm_ros": __version__, "torch": torch.__version__}
     return provenance
+
+
+def _marks(frames: FrameStore) -> str:
+    """Return the marks of the frames that a training uses, of its first process."""
+    points, visible = frames.points.cpu().numpy(), frames.visible.cpu().numpy()
+    usable = frames.usable.cpu().numpy()
+    if len(usable) == len(points):
+        return marks_in_words(frame_marks(points, visible))
+    return marks_in_words(frame_marks(points[usable], visible[usable]))
 
 
 def _quality(trainer: Trainer, dictionary_coherence: float) -> dict[str, float]:

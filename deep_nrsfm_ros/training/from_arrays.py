@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.data.curation import Curation, curate
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.hands import as_right_hands, check_side
-from deep_nrsfm_ros.data.held_out import split
+from deep_nrsfm_ros.data.held_out import MIN_HELD_OUT, MIN_HELD_OUT_ALONE, split
 from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
@@ -60,6 +61,7 @@ def train(
     start: Model | str | Path = "",
     recipe: Recipe | None = None,
     sequence_starts: Sequence[int] | None = (),
+    held_out: float = Curation().held_out,
     on_progress: Callable[[Progress], None] = lambda progress: None,
     on_message: Callable[[str], None] = lambda sentence: None,
 ) -> Model:
@@ -69,20 +71,26 @@ def train(
     and outliers are left out. They are checked as the command checks a file. Warnings about the
     data and the result are Python warnings.
 
-    Where the object has a model, the new one is compared with it without labels, on the last tenth
-    of each sequence, which the training does not use. A model of data that looks wrong is
-    doubtful, whatever its figures. `on_message` gets what the judge says, and a doubtful model
-    gives a warning. `provenance["judgement"]` of the result is a dict:
+    The model is judged without labels on the last tenth of each sequence, which the training does
+    not use (`held_out`), and is compared with the model of the object, where there is one. A model
+    of data that looks wrong is doubtful, whatever its figures. `on_message` gets what the judge
+    says, and a doubtful model gives a warning. `provenance["judgement"]` of the result is a dict:
 
-    - `verdict`: "better", "as_good", "alone" (no model of the package has these keypoints) or
-      "doubtful"; `doubtful`: whether it is the last one.
+    - `verdict`: "better", "as_good", "alone" (no model of the package has these keypoints),
+      "unknown" (the model of the object was trained on the held-out frames, and fits them better)
+      or "doubtful"; `doubtful`: whether it is the last one.
     - `reason`: the verdict as a sentence, with what would help.
-    - `figures`: of the new model by their names, such as `residual`, `bone_variation` and
+    - `figures`: of the new model by their names, such as `residual` (image error on the held-out
+      frames), `learned_residual` (on those of the training), `bone_variation` and
       `mirrored_share`; less is better.
     - `rival`, `rival_figures`: name and figures of the model that it is compared with; there only
       if there is one.
     - `first_look`: True where few steps from random weights have taught too little for use, and
       there is no rival; there only then.
+    - `fits_badly`: True where the image error is large (25 % on held-out frames, 20 % on those of
+      the training), and there is no rival; there only then.
+    - `rival_has_learned_the_frames`: True where the rival was trained on the held-out frames; there
+      only then.
     - `faults`: what looks wrong in the data, a sentence each; there only if something does.
 
     Args:
@@ -110,6 +118,9 @@ def train(
             of each in the order of their time: (0, 500) where 500 frames of one camera come first.
             (0,): one recording. () or None: unknown, each quarter of the frames counts as a
             sequence.
+        held_out: share of the frames, 0 to 0.5, on which the model is judged: the last ones of each
+            sequence, after a gap of half as many that nothing uses. 0, or fewer than 20 frames (50
+            where the object has no model): the training uses all, and the model is judged on these.
         on_progress: called every few seconds from the first step on, and at the end.
         on_message: called with a sentence when work of up to minutes begins before the first step,
             such as the factorisations of at most `Recipe.few_frames` frames, and at the end with
@@ -131,6 +142,7 @@ def train(
     check_name("name", name)
     check_not_shipped("name", name)
     check_side("hands", hands)
+    check(Curation(held_out=held_out))
     layout = layout_of("layout", layout, name)
     seen = from_arrays(points, confidence, layout)
     starts = np.array(() if sequence_starts is None else sequence_starts, np.int64)
@@ -162,7 +174,7 @@ def train(
         if warning:
             warnings.warn(warning, stacklevel=_CALLER)
     rival = origin or _shipped(layout)
-    frames = split(curated.dataset, Curation().held_out if rival else 0.0)
+    frames = split(curated.dataset, held_out, MIN_HELD_OUT if rival else MIN_HELD_OUT_ALONE)
     preset = PRESETS["default"]._replace(recipe=recipe or Recipe())
     setup = Setup(limb_exchange=LimbExchange.of(layout))
     if origin:

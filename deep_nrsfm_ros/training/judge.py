@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.dataset import Dataset, concatenate
 from deep_nrsfm_ros.data.hands import MIXED, mixed_sides
-from deep_nrsfm_ros.data.held_out import Split
+from deep_nrsfm_ros.data.held_out import MIN_HELD_OUT, Split
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout, Tetrahedron
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
@@ -34,9 +34,10 @@ from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.training.data_check import SourceFinding, sentences, serious
 from deep_nrsfm_ros.training.fine_tuning import RARELY_SHOWN
 from deep_nrsfm_ros.training.frames import FrameStore
+from deep_nrsfm_ros.training.learned_frames import learned_by
 from deep_nrsfm_ros.training.mirror import MIN_TESTED, MirrorCheck
 from deep_nrsfm_ros.training.steps import FROM_RANDOM
-from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL
+from deep_nrsfm_ros.training.verdicts import ALONE, AS_GOOD, BETTER, DOUBTFUL, UNKNOWN
 from deep_nrsfm_ros.wording import wording
 
 Floats = NDArray[Any]
@@ -67,6 +68,7 @@ class Figures(NamedTuple):
         difference: distance from the shapes of the model compared with, relative to their size.
         turned: share of all frames whose mirror image it has, lifted with the correction, where it
             was trained on from the model compared with. NaN for other models.
+        learned_residual: `residual` over the frames of the training, where others are held out.
     """
 
     residual: float
@@ -78,6 +80,7 @@ class Figures(NamedTuple):
     flatness: float
     difference: float
     turned: float = math.nan
+    learned_residual: float = math.nan
 
     @property
     def misfit(self) -> float:
@@ -150,10 +153,59 @@ MOST_MIRRORED = 0.05
 """Share of mirrored frames above which a model is doubtful where there is none to compare with."""
 
 
+LARGE_RESIDUAL = 0.25
+"""Residual on new frames above which a model without another one is said to fit badly.
+
+Each model of `benchmarks/real/judge.py` with more is a tenth or more worse than the best one of its
+scene. A good model of a mouse has 0.19.
+"""
+LARGE_LEARNED_RESIDUAL = 0.2
+"""The same on the frames of its training, where none are held out."""
+MISFIT_OF_LEARNED = 2.5
+"""Times the misfit of a model that was trained on the held-out frames: a new one of more is worse.
+
+A model fits the frames of its training up to 2.3 times as well as others like them (a mouse: 6.7
+and 15 %), so that less says nothing.
+"""
+
 FEW_STEPS = 2000
 """Steps from random weights below which more steps help."""
 LEARNED_RESIDUAL = 0.05
 """Residual above which a model of few steps is a first look: it has learned too little for use."""
+
+
+class Comparable(NamedTuple):
+    """The frames on which a new model is compared with the one at hand.
+
+    Attributes:
+        frames: of the training, and those held out that count.
+        left_out: number of held-out frames that do not, since the other was trained on them.
+        has_advantage: whether the other was trained on those that count, as too few others are
+            there.
+    """
+
+    frames: Split
+    left_out: int = 0
+    has_advantage: bool = False
+
+
+def comparable(frames: Split, rival: Model | None) -> Comparable:
+    """Return the frames on which a new model is compared with the one at hand.
+
+    Args:
+        frames: those that the new model was trained on, and those held out. Where nothing is held
+            out, both models may have learned all of them.
+        rival: the one at hand; None: there is none.
+    """
+    if rival is None or frames.held_out is frames.training:
+        return Comparable(frames)
+    learned = learned_by(rival, frames.held_out)
+    others = np.flatnonzero(~learned)
+    if not learned.any():
+        return Comparable(frames)
+    if len(others) < MIN_HELD_OUT:
+        return Comparable(frames, has_advantage=True)
+    return Comparable(Split(frames.training, frames.held_out[others]), int(learned.sum()))
 
 
 class Rank(NamedTuple):
@@ -181,7 +233,7 @@ class Judgement(NamedTuple):
         figures: of the new model.
         rival: name of the model at hand; "" where there is none with its keypoints.
         rival_figures: its figures.
-        verdict: BETTER, AS_GOOD, ALONE or DOUBTFUL.
+        verdict: BETTER, AS_GOOD, ALONE, UNKNOWN or DOUBTFUL.
         faults: of its data, a sentence each: a model learns what is wrong in its data, and the
             figures on such data do not show it.
         shown: a sentence with a few figures of both; reason or summary ends with it.
@@ -189,6 +241,8 @@ class Judgement(NamedTuple):
         repeated: the end of the summary that is the layout's warning.
         is_first_look: whether it has learned too little for use, in few steps from random weights,
             and the verdict is ALONE.
+        fits_badly: whether it fits new frames badly, and the verdict is ALONE.
+        has_rival_learned: whether the model at hand was trained on the frames of the figures.
     """
 
     reason: str
@@ -202,6 +256,8 @@ class Judgement(NamedTuple):
     brief_reason: str = ""
     repeated: str = ""
     is_first_look: bool = False
+    fits_badly: bool = False
+    has_rival_learned: bool = False
 
     @property
     def doubtful(self) -> bool:
@@ -228,6 +284,10 @@ class Judgement(NamedTuple):
             result |= {"rival": self.rival, "rival_figures": _rounded(self.rival_figures)}
         if self.is_first_look:
             result["first_look"] = True
+        if self.fits_badly:
+            result["fits_badly"] = True
+        if self.has_rival_learned:
+            result["rival_has_learned_the_frames"] = True
         if self.faults:
             result["faults"] = list(self.faults)
         return result
@@ -269,19 +329,21 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         rival: the one at hand; None, or one that lifts none of the frames: the new model is judged
             by its mirrored frames alone.
     """
-    comparison = Judge(frames)
+    basis = comparable(frames, rival)
+    frames, comparison = basis.frames, Judge(basis.frames)
     old = None
     if rival is not None:
         with suppress(ValueError):
             old = comparison.figures(rival)
+    has_advantage = basis.has_advantage and old is not None
     try:
         new = comparison.figures(model, rival if old else None)
     except ValueError as error:  # no training is lost because its model is poor
         unknown = Figures(*[math.nan] * len(Figures._fields))
         return Judgement(f"{error}; {_advice(model, '')} would help", "", unknown)
     name = rival.name if rival is not None and old else ""
-    verdict = _verdict(new, old)
-    figures, repeated = f"{_on(frames)}: {_shown(new, old, name)}", ""
+    verdict = _verdict(new, old, has_advantage=has_advantage)
+    figures, repeated = f"{_on(basis, name)}: {_shown(new, old, name)}", ""
     figures += _guessed(model)
     if old is None and not model.layout.handedness:
         figures += f". These figures say nothing of depth: {_mirrored_as_a_whole(model.name)}"
@@ -290,7 +352,7 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         figures += repeated
     beside = f" beside model {name!r}" if name else ""
     reason, shown = "", f"Judged{beside} {figures}"
-    if worse := worse_figures(new, old):
+    if worse := worse_figures(new, old, has_advantage=has_advantage):
         reason = "; ".join(_in_words(each, new, old, name) for each in worse)
         if old is None and worse == ["front_disagreement"]:
             reason += _fronts_in_words(comparison.fronts(model), model)
@@ -299,12 +361,22 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
     if reason:
         verdict, reason = DOUBTFUL, f"{reason}. {shown}"
     in_sentence = _IN_SENTENCES[verdict].format(name, *_gains(new, old))
+    is_held_out = frames.held_out is not frames.training
+    most = LARGE_RESIDUAL if is_held_out else LARGE_LEARNED_RESIDUAL
+    fits_badly = verdict == ALONE and new.residual > most
     is_first_look = _has_few_steps(model) and new.residual > LEARNED_RESIDUAL and verdict == ALONE
     if is_first_look:
         in_sentence = (
             f"is a first look, and has no other to compare with: {model.provenance['step']} steps "
             f"from random weights leave an image error of {percent(new.residual)}; {FROM_RANDOM} "
             "steps are usual"
+        )
+    elif fits_badly:
+        kind = "new frames" if is_held_out else "the frames of its training"
+        in_sentence = (
+            f"has no other to compare with, and fits {kind} badly: an image error of "
+            f"{percent(new.residual)}, where above {percent(most)} is much; {_advice(model, '')} "
+            "would help"
         )
     elif verdict == ALONE:
         in_sentence = f"has no other to compare with{_side_in_words(model.layout, new)}"
@@ -315,6 +387,8 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
         shown=shown,
         repeated=repeated,
         is_first_look=is_first_look,
+        fits_badly=fits_badly,
+        has_rival_learned=has_advantage,
     )
 
 
@@ -329,6 +403,8 @@ _IN_SENTENCES = {
     AS_GOOD: "is as good as model {!r}: image error and bones together are alike, within "
     f"{round(100 * SAME_MISFIT - 100)} %, and it mirrors no more frames",
     ALONE: "has no other to compare with",
+    UNKNOWN: "cannot be compared with model {!r}, which fits the held-out frames more closely, but "
+    "was trained on them",
     DOUBTFUL: "is doubtful",
 }
 
@@ -351,10 +427,12 @@ def _mirrored_as_a_whole(name: str) -> str:
     )
 
 
-def _verdict(new: Figures, old: Figures | None) -> str:
+def _verdict(new: Figures, old: Figures | None, *, has_advantage: bool = False) -> str:
     """Return the verdict on a model that the rule does not doubt."""
     if old is None:
         return ALONE
+    if has_advantage and worse_figures(new, old):
+        return UNKNOWN
     return AS_GOOD if _gains(new, old) == ("alike", "no more") else BETTER
 
 
@@ -390,12 +468,23 @@ def _is_side_known(figures: Figures) -> bool:
     return not (math.isnan(figures.mirrored_share) and math.isnan(figures.front_disagreement))
 
 
-def _on(frames: Split) -> str:
-    """Return on which frames models are compared."""
-    count = len(frames.held_out)
-    if frames.held_out is frames.training:
+def _on(basis: Comparable, name: str) -> str:
+    """Return on which frames models are compared; `name` is that of the model at hand."""
+    count = len(basis.frames.held_out)
+    if basis.frames.held_out is basis.frames.training:
         return f"on the {count} frames of its training, as none were held out"
-    return f"on {count} held-out frames, later ones that it was not trained on"
+    text = f"on {count} held-out frames, later ones that it was not trained on"
+    if basis.left_out:
+        text += f" (not on {basis.left_out} others, which model {name!r} was trained on)"
+    if not basis.has_advantage or not name:
+        return text
+    later = wording(
+        "--input or --bag", node="train.bags or train.inputs", python="as a sequence of its own"
+    )
+    return (
+        f"{text}. Model {name!r} was trained on these frames, so it is at an advantage; add a "
+        f"later recording ({later}), of which frames are held out that neither has learned. Figures"
+    )
 
 
 def _shown(new: Figures, old: Figures | None, name: str) -> str:
@@ -411,6 +500,8 @@ def _shown(new: Figures, old: Figures | None, name: str) -> str:
             texts.append("neither other views nor a front tell which frames are mirrored")
         elif not math.isnan(value):
             beside = "" if math.isnan(other) else f" ({name}: {percent(other)})"
+            if each == "residual" and not math.isnan(new.learned_residual):
+                beside += f", {percent(new.learned_residual)} on the frames of its training"
             texts.append(_SHOWN[each].format(percent(value)) + beside)
     return ", ".join(texts)
 
@@ -458,18 +549,28 @@ def _fronts_in_words(fronts: Sequence[tuple[Tetrahedron, float]], model: Model) 
     )
 
 
-def worse_figures(new: Figures, old: Figures | None) -> list[str]:
+def worse_figures(new: Figures, old: Figures | None, *, has_advantage: bool = False) -> list[str]:
     """Return the names of the figures by which the rule doubts a new model.
 
     Args:
         new: of the new model.
         old: of the one at hand; None where there is none.
+        has_advantage: whether the one at hand has learned the held-out frames, so that its misfit
+            on new ones is larger.
     """
-    return _worse(new, old) or (["misfit"] if new.residual > MOST_RESIDUAL else [])
+    most_residual = LARGE_RESIDUAL if has_advantage else MOST_RESIDUAL
+    most_misfit = MISFIT_OF_LEARNED if has_advantage else SAME_MISFIT
+    return _worse(new, old, most_misfit) or (["misfit"] if new.residual > most_residual else [])
 
 
-def _worse(new: Figures, old: Figures | None) -> list[str]:
-    """Return the names of the figures that are worse than those of the model at hand."""
+def _worse(new: Figures, old: Figures | None, most_misfit: float) -> list[str]:
+    """Return the names of the figures that are worse than those of the model at hand.
+
+    Args:
+        new: of the new model.
+        old: of the one at hand; None where there is none.
+        most_misfit: times its misfit that the new model may have.
+    """
     values = _known(new)
     shares = ("mirrored_share", "front_disagreement")
     if old is None:
@@ -498,16 +599,17 @@ def _worse(new: Figures, old: Figures | None) -> list[str]:
     if _or_zero(new.turned) > mended + MORE_WRONG_SIDES:
         return ["turned"]
     worse = ["bone_variation"] if bones > LOOSER_BONES * other_bones else []
-    return worse + (["misfit"] if new.misfit > SAME_MISFIT * old.misfit else [])
+    return worse + (["misfit"] if new.misfit > most_misfit * old.misfit else [])
 
 
-def rank(new: Figures, old: Figures | None) -> Rank:
+def rank(new: Figures, old: Figures | None, *, has_advantage: bool = False) -> Rank:
     """Return the rank of a model beside the one at hand, if there is one."""
     # The mirror image of a model that turns its frames itself says nothing against another one.
     is_rival_worse = old is not None and old.wrong_sides > new.wrong_sides + MORE_WRONG_SIDES
     is_opposed = _or_zero(new.opposed) > MOST_OPPOSED and not is_rival_worse
     opposed = new.opposed if is_opposed else 0.0
-    is_doubtful = new is not old and bool(worse_figures(new, old))
+    worse = worse_figures(new, old, has_advantage=has_advantage)
+    is_doubtful = new is not old and bool(worse)
     return Rank(is_doubtful, new is old, new.misfit + new.wrong_sides + opposed)
 
 
@@ -577,14 +679,17 @@ class Standing(NamedTuple):
     Attributes:
         model: the model.
         figures: beside the model at hand.
-        verdict: "at hand", or BETTER, AS_GOOD or DOUBTFUL beside it; "" where there is none.
+        verdict: "at hand", or BETTER, AS_GOOD, UNKNOWN or DOUBTFUL beside it; "" where there is
+            none.
         rank: orders the models.
+        has_learned: whether it was trained on some of the held-out frames.
     """
 
     model: Model
     figures: Figures
     verdict: str
     rank: Rank
+    has_learned: bool = False
 
 
 def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> list[Standing]:
@@ -595,7 +700,9 @@ def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> li
         models: the new one first.
         rival: the model at hand, with which each is compared; None: with itself.
     """
-    comparison = Judge(frames)
+    basis = comparable(frames, rival)
+    frames, comparison = basis.frames, Judge(basis.frames)
+    is_held_out = frames.held_out is not frames.training
     at_hand, old = None, None
     if rival is not None:
         with suppress(ValueError):
@@ -604,9 +711,15 @@ def standings(frames: Split, models: Sequence[Model], rival: Model | None) -> li
     for model in ([at_hand] if at_hand else []) + list(models):
         with suppress(ValueError):
             new = old if model is at_hand and old else comparison.figures(model, at_hand)
-            place = rank(new, old)
-            verdict = DOUBTFUL if place.doubtful else _verdict(new, old) if old else ""
-            result.append(Standing(model, new, "at hand" if model is at_hand else verdict, place))
+            # A new model has learned them by its start alone, if at all.
+            has_learned = model is not models[0] and is_held_out
+            has_learned = has_learned and bool(learned_by(model, frames.held_out).any())
+            has_advantage = basis.has_advantage and not has_learned
+            place = rank(new, old, has_advantage=has_advantage)
+            verdict = _verdict(new, old, has_advantage=has_advantage) if old else ""
+            if model is at_hand or place.doubtful:
+                verdict = "at hand" if model is at_hand else DOUBTFUL
+            result.append(Standing(model, new, verdict, place, has_learned))
     return sorted(result, key=lambda each: each.rank)
 
 
@@ -621,11 +734,13 @@ class Judge:
         """
         self._held_out = _spread(frames.held_out)
         self._all = _spread(frames.training)
+        self._trained_on = 0  # the first ones of all, where others are held out
         if frames.held_out is not frames.training:
             share = len(frames.held_out) / (len(frames.training) + len(frames.held_out))
             most = round(share * _MOST_FRAMES)
             kept = _spread(frames.training, _MOST_FRAMES - most)
             self._all = concatenate([kept, _spread(frames.held_out, most)])
+            self._trained_on = len(kept)
         store = FrameStore.of(self._all.points, self._all.visible)
         self._mirror_check = MirrorCheck(store, Normaliser(), _MOST_FRAMES)
         self._lifted: dict[tuple[int, bool, bool], tuple[Model, _Lifted]] = {}
@@ -664,7 +779,14 @@ class Judge:
             float(np.linalg.norm(X[..., :2], axis=(1, 2)).mean()),
             float(np.linalg.norm(align(Y, Z).aligned - Z, axis=(1, 2)).mean()),
             self._opposed(model, other, corrected=True) if other and is_trained_on else math.nan,
+            self._learned_residual(model),
         )
+
+    def _learned_residual(self, model: Model) -> float:
+        """Return the residual over the frames of the training; NaN where none are held out."""
+        residual = self._lift(model)[1][: self._trained_on]
+        is_known = np.isfinite(residual)
+        return float(np.median(residual[is_known])) if is_known.any() else math.nan
 
     def _lift(self, model: Model, *, held_out: bool = False, corrected: bool = False) -> _Lifted:
         """Return a model's shapes of all or of the held-out frames, which are computed once."""

@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.hands import as_right_hands
-from deep_nrsfm_ros.data.held_out import Split, split
+from deep_nrsfm_ros.data.held_out import MIN_HELD_OUT, MIN_HELD_OUT_ALONE, Split, split
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, load_once, save_model
 from deep_nrsfm_ros.nrsfm.recipe import LayoutLossWeights
@@ -129,8 +129,8 @@ def _train_and_save(
     _describe(prepared, reporter, start, is_resumed=is_resumed)
     old = old_model(config.output.folder, config.output.name)
     rivals = _rivals(config, prepared.dataset.layout, rival, old)
-    share = config.curation.held_out if rivals else 0.0
-    frames = split(prepared.dataset, share)
+    fewest = MIN_HELD_OUT if rivals else MIN_HELD_OUT_ALONE
+    frames = split(prepared.dataset, config.curation.held_out, fewest)
     if frames.held_out is not frames.training:
         reporter.say(_shared_out(len(prepared.dataset), frames))
     trainer = _train(config, frames.training, checkpoint, reporter, should_stop)

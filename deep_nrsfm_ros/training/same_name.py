@@ -3,8 +3,9 @@
 
 A good model, one that was trained to its end and is not doubtful, is replaced only by one that is
 not doubtful beside it. Whatever is replaced is kept once, as NAME_before. A doubtful model is
-written beside a good one of the same object as NAME_doubtful, and one that was cut off as
-NAME_unfinished. A first look, of few steps from random weights, is no good model.
+written beside a good one of the same object as NAME_doubtful, one that cannot be compared with it
+as NAME_new, and one that was cut off as NAME_unfinished. A first look, of few steps from random
+weights, is no good model, and neither is one that fits badly.
 """
 
 from __future__ import annotations
@@ -19,11 +20,12 @@ from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.model_files.folders import model_folders, shipped_models
 from deep_nrsfm_ros.model_files.matching_model import knows
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, Model, ModelFileError, load_once
+from deep_nrsfm_ros.training.verdicts import UNKNOWN
 
 if TYPE_CHECKING:
     from deep_nrsfm_ros.training.judge import Judgement
 
-BEFORE, DOUBTFUL, UNFINISHED = "_before", "_doubtful", "_unfinished"
+BEFORE, DOUBTFUL, NEW, UNFINISHED = "_before", "_doubtful", "_new", "_unfinished"
 CUT_OFF = "cut_off"
 """Key of the provenance of a model whose training did not come to its end; its value is True."""
 
@@ -48,13 +50,13 @@ class OldModel(NamedTuple):
 
     @property
     def is_good(self) -> bool:
-        """Whether it was trained to its end, is not doubtful and no first look."""
+        """Whether it was trained to its end, is not doubtful, no first look, and fits."""
         if self.model is None or self.is_cut_off:
             return False
         judgement = self.model.provenance.get("judgement")
         if not isinstance(judgement, dict):
             return True
-        return not (judgement.get("doubtful") or judgement.get("first_look"))
+        return not any(map(judgement.get, ("doubtful", "first_look", "fits_badly")))
 
     def is_at_stake(self, layout: KeypointLayout, judgement: Judgement | None) -> bool:
         """Return whether a new model of a layout may not simply take the name of this good one.
@@ -93,6 +95,8 @@ def name_beside(name: str, old: OldModel | None, judgement: Judgement | None) ->
         return name
     if judgement is None:
         return name + UNFINISHED
+    if judgement.verdict == UNKNOWN:
+        return name + NEW
     return name + DOUBTFUL if judgement.doubtful else name
 
 

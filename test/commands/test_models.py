@@ -209,16 +209,18 @@ def test_each_verdict_has_its_word(
         "a": {"doubtful": False, "verdict": "alone"},
         "b": {"doubtful": False, "verdict": "as_good", "rival": "human"},
         "c": {"doubtful": False, "verdict": "better", "rival": "human"},
+        "u": {"doubtful": False, "verdict": "unknown", "rival": "human"},
         "d": {"doubtful": False, "rival": "human"},  # of an earlier version
     }
     for name, said in verdicts.items():
         save(folders[0] / f"{name}.safetensors", provenance=PROVENANCE | {"judgement": said})
     rows = [
-        line.split() for line in listing(capsys, folders[0]) if line[:2] in ("a ", "b ", "c ", "d ")
+        line.split() for line in listing(capsys, folders[0]) if line.split(" ")[0] in verdicts
     ]
     assert {row[0]: row[3] for row in rows} == {
         "a": "alone",
         "b": "as_good",
         "c": "better",
         "d": "better",
+        "u": "unknown",
     }

@@ -31,6 +31,7 @@ from deep_nrsfm_ros.training.judge import (
     standings,
     worse_figures,
 )
+from deep_nrsfm_ros.training.learned_frames import LEARNED_FRAMES, frame_marks, marks_in_words
 from deep_nrsfm_ros.training.trainer import Trainer
 
 GOOD = Figures(
@@ -59,7 +60,10 @@ def frames(figure: Any) -> Split:
 
 @pytest.fixture(scope="module")
 def good(figure: Any, trained: Trainer) -> Model:
-    return finish(trained, "good", with_bones(figure.layout), "test")
+    model = finish(trained, "good", with_bones(figure.layout), "test")
+    # As if it had learned other frames: it is the model at hand in most of the tests.
+    provenance = {k: v for k, v in model.provenance.items() if k != LEARNED_FRAMES}
+    return dataclasses.replace(model, provenance=provenance)
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +112,88 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
         assert "on 60 held-out frames, later ones that it was not trained on" in str(judgement)
         assert f"({rival.name}: " in str(judgement) and len(str(judgement)) < 520
         assert not judgement.record()["doubtful"]
+
+
+def knowing(model: Model, data: Dataset) -> Model:
+    """Return a model that has learned the frames of a dataset, as its provenance says."""
+    marks = marks_in_words(frame_marks(data.points, data.visible))
+    return dataclasses.replace(model, provenance=model.provenance | {LEARNED_FRAMES: marks})
+
+
+def looser(model: Model, times: float) -> Model:
+    """Return a model of the same shapes whose image error is larger by noise in its weights."""
+    noise = np.random.default_rng(0)
+    network = model.network.map(
+        lambda w: w + np.float32(times * w.std()) * noise.normal(size=w.shape).astype(np.float32)
+    )
+    return dataclasses.replace(model, name="looser", network=network)
+
+
+def test_a_model_is_not_doubtful_because_the_rival_has_learned_the_held_out_frames(
+    frames: Split, good: Model, bad: Model
+) -> None:
+    new = looser(good, 0.02)
+    assert judge(frames, new, good).doubtful
+    rival = knowing(good, frames.held_out)
+    judgement = judge(frames, new, rival)
+    assert judgement.verdict == "unknown" and not judgement.doubtful
+    assert str(judgement).startswith("the new model cannot be compared with model 'good', which ")
+    said = (
+        "Model 'good' was trained on these frames, so it is at an advantage; add a later recording"
+    )
+    assert said in str(judgement)
+    assert judgement.record()["rival_has_learned_the_frames"]
+    hopeless = judge(frames, bad, rival)
+    assert hopeless.doubtful and said in str(hopeless)
+    shown = {each.model.name: each for each in standings(frames, [new, bad], rival)}
+    assert shown["looser"].verdict == "unknown" and shown["bad"].verdict == "doubtful"
+    assert shown["good"].has_learned and not shown["looser"].has_learned
+
+
+def test_held_out_frames_that_the_rival_has_learned_do_not_count(
+    frames: Split, good: Model
+) -> None:
+    known = frames.held_out[np.arange(30)]
+    parts = Dataset(
+        frames.held_out.points,
+        frames.held_out.visible,
+        frames.held_out.layout,
+        "test",
+        sequence_starts=np.array([0, 30]),
+    )
+    split_frames = Split(frames.training, parts)
+    judgement = judge(split_frames, looser(good, 0.02), knowing(good, known))
+    assert judgement.doubtful  # on the others the rival has no advantage
+    assert "on 30 held-out frames" in judgement.reason
+    assert "(not on 30 others, which model 'good' was trained on)" in judgement.reason
+
+
+def test_the_error_on_new_frames_stands_beside_that_on_learned_ones(
+    frames: Split, good: Model, bad: Model
+) -> None:
+    judgement = judge(frames, good, None)
+    learned = judgement.figures.learned_residual
+    assert learned == pytest.approx(judgement.figures.residual, rel=0.3)
+    assert f", {percent(learned)} on the frames of its training" in str(judgement)
+    nothing_held_out = judge(Split(frames.training, frames.training), good, None)
+    assert math.isnan(nothing_held_out.figures.learned_residual)
+    assert "on the frames of its training, bone" not in str(nothing_held_out)
+
+
+def test_a_model_that_fits_badly_is_not_silently_alone(
+    frames: Split, good: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deep_nrsfm_ros.training import judge as module
+
+    residual = judge(frames, good, None).figures.residual
+    monkeypatch.setattr(module, "LARGE_RESIDUAL", residual * 0.9)
+    judgement = judge(frames, good, None)
+    assert judgement.verdict == "alone" and judgement.record()["fits_badly"]
+    assert "fits new frames badly: an image error of" in str(judgement)
+    assert "more views" in str(judgement)
+    monkeypatch.setattr(module, "LARGE_LEARNED_RESIDUAL", residual * 0.5)
+    nothing_held_out = judge(Split(frames.training, frames.training), good, None)
+    assert "fits the frames of its training badly" in str(nothing_held_out)
 
 
 def test_a_front_alone_is_weak_evidence(
@@ -435,7 +521,7 @@ def test_few_steps_from_random_weights_are_a_first_look(
 ) -> None:
     from deep_nrsfm_ros.training import judge as module
 
-    monkeypatch.setattr(module, "worse_figures", lambda *_: [])
+    monkeypatch.setattr(module, "worse_figures", lambda *_, **__: [])
     alone = judge(frames, dataclasses.replace(bad, provenance={"step": 20}), None)
     assert alone.is_first_look and alone.record()["first_look"]
     assert str(alone).startswith(

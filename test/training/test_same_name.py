@@ -26,6 +26,7 @@ from deep_nrsfm_ros.training.same_name import (
 
 FIGURES = Figures(*[0.1] * 9)
 DOUBTED, BETTER = Judgement("worse", "", FIGURES), Judgement("", "it is better", FIGURES)
+UNCOMPARED = Judgement("", "it cannot be compared", FIGURES, verdict="unknown")
 
 
 def save(folder: Path, **provenance: Any) -> Path:
@@ -42,6 +43,8 @@ def save(folder: Path, **provenance: Any) -> Path:
         ({"judgement": {"doubtful": False}}, True),
         ({"judgement": {"doubtful": True}}, False),
         ({"judgement": {"doubtful": False, "first_look": True}}, False),
+        ({"judgement": {"doubtful": False, "fits_badly": True}}, False),
+        ({"judgement": {"doubtful": False, "verdict": "unknown"}}, True),
         ({CUT_OFF: True}, False),
     ],
 )
@@ -73,9 +76,10 @@ def test_a_file_that_cannot_be_read_is_kept_but_is_no_rival(tmp_path: Path) -> N
 def test_only_what_is_not_doubtful_takes_the_name(tmp_path: Path) -> None:
     save(tmp_path)
     old = old_model(tmp_path, "mine")
-    assert [name_beside("mine", old, each) for each in (BETTER, DOUBTED, None)] == [
+    assert [name_beside("mine", old, each) for each in (BETTER, DOUBTED, UNCOMPARED, None)] == [
         "mine",
         "mine_doubtful",
+        "mine_new",
         "mine_unfinished",
     ]
     assert {name_beside("mine", None, each) for each in (BETTER, DOUBTED, None)} == {"mine"}
