@@ -2,18 +2,22 @@
 """Options: fields of frozen dataclasses with a description and a range.
 
 Each option is declared once. It is a Python default, a command-line option (`add_arguments`) and,
-in the node, a ROS parameter with a descriptor (`node/parameter_bridge.py`).
+in the node, a ROS parameter with a descriptor (`node/parameter_bridge.py`). `help` of the class has
+the descriptions too (`described`).
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any, TypeVar, get_args, get_type_hints
 
 Config = TypeVar("Config")
+
+_WIDTH = 96  # of a line of a docstring
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +79,36 @@ def option(
     return dataclasses.field(
         default=default, metadata={"option": Option(description, low, high, choices, read_only)}
     )
+
+
+def described(cls: type[Config]) -> type[Config]:
+    """Return the class of a dataclass with its options in its docstring, and values checked.
+
+    Below `dataclass`, which reads the fields. The docstring has the description, the allowed values
+    and the default of each option. To make an object with a value that is not allowed raises
+    ValueError.
+    """
+    lines = [(cls.__doc__ or cls.__name__).rstrip(), "", "Attributes:"]
+    for name, field in vars(cls).items():
+        opt = field.metadata.get("option") if isinstance(field, dataclasses.Field) else None
+        if opt is None:
+            continue
+        parts = [opt.description, opt.allowed(), f"default {field.default!r}"]
+        if opt.choices and not all(choice in opt.description for choice in opt.choices):
+            parts.insert(1, f"one of {', '.join(map(repr, opt.choices))}")
+        text = f"{name}: {'; '.join(filter(None, parts))}."
+        lines += textwrap.wrap(
+            text, _WIDTH, initial_indent=" " * 4, subsequent_indent=" " * 8, break_long_words=False
+        )
+    cls.__doc__ = "\n".join(lines)
+    after: Callable[[Any], None] = vars(cls).get("__post_init__", lambda self: None)
+
+    def post_init(self: Any) -> None:
+        check(self)
+        after(self)
+
+    cls.__post_init__ = post_init  # type: ignore[attr-defined]
+    return cls
 
 
 def options(cls: type) -> list[tuple[dataclasses.Field[Any], Any, Option]]:

@@ -11,7 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deep_nrsfm_ros.configuration import add_arguments, check, option, options, override
+from deep_nrsfm_ros.configuration import (
+    add_arguments,
+    check,
+    described,
+    option,
+    options,
+    override,
+)
 
 some = settings(max_examples=40, deadline=None)
 
@@ -34,6 +41,37 @@ def parse(*words: str, base: Oven | None = None) -> Oven:
     parser = argparse.ArgumentParser(exit_on_error=False)
     add_arguments(parser, Oven)
     return override(base or Oven(), parser.parse_args(words))
+
+
+@dataclass(frozen=True)
+@described
+class Grill:
+    """Settings of a grill."""
+
+    degrees: int = option(180, "temperature in degrees", low=50, high=250)
+    fuel: str = option("gas", "what burns", choices=("gas", "coal"))
+    colour: str = "not an option"
+
+    def __post_init__(self) -> None:
+        if self.fuel == "coal" and self.degrees > 200:
+            raise ValueError("coal is not so hot")
+
+
+def test_a_described_class_says_its_options_and_refuses_wrong_values() -> None:
+    text = Grill.__doc__ or ""
+    assert text.startswith("Settings of a grill.\n")
+    assert "    degrees: temperature in degrees; at least 50 and at most 250; default 180." in text
+    assert "    fuel: what burns; one of 'gas', 'coal'; default 'gas'." in text
+    assert "colour" not in text
+    assert Grill(degrees=60) == Grill(60)
+    for wrong, complaint in (
+        ({"degrees": 10}, "degrees is 10; it must be at least 50"),
+        ({"degrees": "a"}, "degrees is 'a'; it must be a number"),
+        ({"fuel": "wood"}, "fuel is 'wood'; choose one of gas, coal"),
+        ({"fuel": "coal", "degrees": 250}, "coal is not so hot"),
+    ):
+        with pytest.raises(ValueError, match=complaint):
+            Grill(**wrong)
 
 
 def test_nothing_given_changes_nothing() -> None:

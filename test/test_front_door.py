@@ -217,7 +217,7 @@ def test_a_model_of_people_is_judged_beside_the_one_at_hand(human: Model) -> Non
     judgement = model.provenance["judgement"]
     assert judgement["rival"] == "human" and model.provenance["from"]["model"] == "human"
     assert judgement["doubtful"] and "would help" in judgement["reason"]
-    assert {"residual", "bone_variation"} <= judgement["figures"].keys()
+    assert {"image_error", "bone_variation"} <= judgement["figures"].keys()
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ WHEEL = "pose2sim/pose2sim-0.6.0-py3-none-any.whl"
 HUMAN = "human"
 HELD_OUT = 0.1
 COLUMNS = (
-    *("residual", "bone_variation", "front_disagreement", "opposed", "side_difference"),
+    *("image_error", "bone_variation", "front_disagreement", "opposed", "side_difference"),
     *("flatness", "difference"),
 )
 ORDER = "order of the judge"

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lift a file of 2D keypoints to 3D, without ROS: npz, JSON or bag in, npz, JSON or bag out.
 
-Exit code 0: the answer can be believed; 2: the input or an option is at fault; 3: the answer is
-written, and something about it looks wrong (--force: 0).
+Exit code 0: nothing looks wrong, which is no proof (an object that is no person may be mirrored or
+lie on its side, unseen); 2: the input or an option is at fault; 3: the answer is written, and
+something about it looks wrong (--force: 0).
 """
 
 from __future__ import annotations

@@ -112,8 +112,9 @@ def _verdict(model: Model) -> str:
 
 
 def _quality(model: Model) -> tuple[str, ...]:
-    """Return a note with the errors on the data of the training, if the file has them."""
-    figures = {name: model.quality.get(f"{name}_error") for name in ("reprojection", "cycle")}
+    """Return a note with the mean errors on frames of the training, if the file has them."""
+    words = {"reprojection_error": "image error", "cycle_error": "cycle error"}
+    figures = {word: model.quality.get(name) for name, word in words.items()}
     known = [f"{name} {f:.3f}" for name, f in figures.items() if isinstance(f, (int, float))]
     return (f"on the data of its training: {', '.join(known)}",) if known else ()
 

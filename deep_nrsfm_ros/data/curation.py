@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.batched import Progress, no_progress, slices
-from deep_nrsfm_ros.configuration import check, option
+from deep_nrsfm_ros.configuration import check, described, option
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.outliers import find_outliers
 from deep_nrsfm_ros.large_arrays import empty, release
@@ -29,6 +29,7 @@ _SUSPICIOUS = 0.1  # share of the data above which a count gets a warning
 
 
 @dataclass(frozen=True)
+@described
 class Curation:
     """Curation."""
 

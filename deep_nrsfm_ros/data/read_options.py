@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.messages.field_mapping import FieldMapping, Size
 
@@ -14,6 +14,7 @@ DEFAULT_RATE = 30.0
 
 
 @dataclass(frozen=True)
+@described
 class ReadOptions:
     """Reading of keypoints.
 

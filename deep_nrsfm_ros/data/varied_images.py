@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.data.dataset import Dataset
 from deep_nrsfm_ros.data.virtual_people import FACE_KEYPOINTS, FEET_KEYPOINTS
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -33,6 +33,7 @@ _HIDING_SEED, _MIRRORING_SEED, _PERSPECTIVE_SEED = 5, 6, 7
 
 
 @dataclass(frozen=True)
+@described
 class ImageVariation:
     """Variation of the images of motion capture."""
 

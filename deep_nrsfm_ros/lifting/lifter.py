@@ -32,6 +32,7 @@ from deep_nrsfm_ros.lifting.own_bones import (
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.find_layout import layout_of
 from deep_nrsfm_ros.model_files.model_file import Model, load_model
+from deep_nrsfm_ros.wording import in_python
 
 _BLOCK = 64  # objects per call in `lift_all`: more exceed the cache
 _RELEASED = 128  # blocks after which results that are in files are taken out of memory
@@ -58,8 +59,11 @@ class Lifted(NamedTuple):
         rotations: (n, 3, 3) from object to camera axes, p_camera = R p_object, det +1.
         scale: (n,) pixels per unit of `shapes`.
         translation: (n, 2) projection of the shape's origin in the image, in pixels.
-        residual: (n,) reprojection error of the network before the correction, relative to the
-            size of the keypoints; 0 = perfect, below 0.1 typical, above 0.3 poor.
+        residual: (n,) image error of the network before the correction: distance of its keypoints
+            from those given, relative to their size; 0 = perfect, below 0.1 typical, above 0.3
+            poor. It is the mean over the `test_time_rotations` of the image; the image error that
+            `train` prints is of the image alone, and so smaller on frames that a model has learned
+            (of a mouse 0.007 instead of 0.05).
         confidence: (n, p) probability in [0, 1] that the point is close to its true position.
         wrong: (n, p) bool, whether a detected keypoint contradicts the others of its object; it
             was taken as missing (option `leave_out_wrong`).
@@ -160,6 +164,45 @@ class Lifter:
         self._check_layout()
         seen = from_arrays(points, confidence, self.layout)
         return lift_all(self.lift, *self._to_model(seen.points, seen.confidence))
+
+    def check(
+        self,
+        points: ArrayLike,
+        confidence: ArrayLike | None = None,
+        image_size: tuple[int, int] | None = None,
+    ) -> list[str]:
+        """Return what looks wrong in keypoints and their shapes, a sentence each with the remedy.
+
+        A call does not check. These are the checks of the program `lift`: units, places that stand
+        for missing keypoints, confidences, a poor fit, keypoints that are often wrong; of people
+        also axes that point elsewhere, and left and right exchanged. Of another object, no check
+        tells whether it is mirrored, or lies on its side.
+
+        Args:
+            points: as of a call; many objects tell more than one.
+            confidence: as of a call.
+            image_size: width and height of the image in pixels; None: unknown.
+
+        Raises:
+            ValueError: as a call.
+        """
+        from deep_nrsfm_ros.lifting import sanity  # it imports this file
+
+        lifted = self(points, confidence)
+        seen = from_arrays(points, confidence, self.layout)
+        raw = np.asarray(points, np.float64).reshape(seen.points.shape)
+        given = seen.confidence if confidence is None else np.asarray(confidence, np.float64)
+        given = given.reshape(seen.confidence.shape)
+        is_lifted = ~np.isnan(lifted.residual)
+        answer = lifted if is_lifted.any() else None
+        with in_python():
+            found = sanity.check(seen.points, given, None, image_size, None, answer)
+            found += sanity.find_origin(raw, given)
+            if sanity.is_person(self.model.layout):
+                found += sanity.pose(lifted.rotations, seen.confidence, self.layout)
+            names = self.model.layout.keypoints
+            found += sanity.wrong_keypoints(lifted.wrong[is_lifted], names)
+        return [str(each) for each in found]
 
     def _check_layout(self) -> None:
         """Raise ValueError if the layout has fewer keypoints of the model than `min_visible`."""

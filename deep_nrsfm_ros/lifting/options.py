@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.body.person_height import trunk_length
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
 from deep_nrsfm_ros.lifting.intrinsics import MAX_FIELD_OF_VIEW, Intrinsics, check_field_of_view
 
 
 @dataclass(frozen=True)
+@described
 class LiftingOptions:
     """Lifting."""
 
@@ -113,6 +114,7 @@ class LiftingOptions:
 
 
 @dataclass(frozen=True)
+@described
 class FieldOfViewOptions:
     """Field of view."""
 
@@ -149,6 +151,7 @@ class FieldOfViewOptions:
 
 
 @dataclass(frozen=True)
+@described
 class HistoryOptions:
     """Lifting over time."""
 
@@ -198,6 +201,7 @@ class HistoryOptions:
 
 
 @dataclass(frozen=True)
+@described
 class GravityOptions:
     """Gravity."""
 

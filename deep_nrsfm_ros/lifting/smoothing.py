@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_vector, rotation_vector
 
@@ -31,6 +31,7 @@ SPEED_CUTOFF = 1.0
 
 
 @dataclass(frozen=True)
+@described
 class SmoothingOptions:
     """Smoothing over time."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.messages.decoding import INPUT_TYPES
 from deep_nrsfm_ros.messages.field_mapping import Size
 from deep_nrsfm_ros.model_files.folders import default_bags_dir, default_models_dir
@@ -18,6 +18,7 @@ layout that the input names or that fits best."""
 
 
 @dataclass(frozen=True)
+@described
 class InputOptions:
     """Model and input of the lifter."""
 

@@ -21,7 +21,7 @@ from std_msgs.msg import String
 from deep_nrsfm_ros.body.kinematic_tree import KinematicTree, Pose
 from deep_nrsfm_ros.body.motion import INTERVALS, LOST_TIME, Motion, MotionTracker
 from deep_nrsfm_ros.body.urdf import rep155_name, urdf
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.messages.serialised import Header
@@ -42,6 +42,7 @@ _URDF_CHANGE = 0.05  # of the length of a bone, from which on the URDF is publis
 
 
 @dataclass(frozen=True)
+@described
 class BodyOptions:
     """Joints."""
 

@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.lifting.options import FieldOfViewOptions
@@ -31,6 +31,7 @@ _UNKNOWN_VIEW = FieldOfViewOptions()
 
 
 @dataclass(frozen=True)
+@described
 class CameraOptions:
     """Camera of the keypoints."""
 

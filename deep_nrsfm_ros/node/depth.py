@@ -24,7 +24,7 @@ from deep_nrsfm_ros.body.depth import (
     believed_scales,
     surface_radii,
 )
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import MessageError
@@ -47,6 +47,7 @@ _ENOUGH = 50  # keypoints with depth in a period that may say so
 
 
 @dataclass(frozen=True)
+@described
 class DepthOptions:
     """Measured depth."""
 

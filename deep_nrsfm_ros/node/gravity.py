@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.messages.frame_tree import FrameTree
 from deep_nrsfm_ros.messages.serialised import Header
 from deep_nrsfm_ros.nrsfm.geometry import rotation_from_quaternion
@@ -52,6 +52,7 @@ def subscribe_to_frames(node: Node, kind: type, tree: FrameTree) -> None:
 
 
 @dataclass(frozen=True)
+@described
 class GravitySources:
     """Sources of the direction of gravity."""
 

@@ -51,7 +51,7 @@ from visualization_msgs.msg import MarkerArray
 
 from deep_nrsfm_ros.body.depth import believed_scales
 from deep_nrsfm_ros.body.floor import FloorScale, floor_factor
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.data.curation import Curation
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap, TooFewSharedError
 from deep_nrsfm_ros.layouts.layout import TRUNK, KeypointLayout
@@ -129,6 +129,7 @@ _TRAINING_GRACE = 1.0  # seconds in which a training may save its model when the
 
 
 @dataclass(frozen=True)
+@described
 class NodeOptions:
     """Node."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.lifting.lifter import Lifted
 from deep_nrsfm_ros.lifting.observation import MessageError
 from deep_nrsfm_ros.messages.frame_tree import FrameTree, Transform
@@ -28,6 +28,7 @@ _POSE_MEND = (
 
 
 @dataclass(frozen=True)
+@described
 class TargetOptions:
     """Fixed frame."""
 

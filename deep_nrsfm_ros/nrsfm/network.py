@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.nrsfm.geometry import Array, polar
 
 PAPER_WIDTHS = (125, 114, 104, 93, 83, 72, 62, 51, 41, 30, 20, 10)
@@ -31,6 +31,7 @@ _FULL_WHITENING_FLOOR = 1e-3  # variance of noise, relative to the largest, with
 
 
 @dataclass(frozen=True)
+@described
 class Architecture:
     """Network architecture."""
 

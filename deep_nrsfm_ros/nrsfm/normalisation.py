@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.nrsfm.geometry import Array, rms_radius, visible_count, visible_mean
 from deep_nrsfm_ros.nrsfm.network import Network, complete
 
@@ -29,6 +29,7 @@ class Normalised(NamedTuple):
 
 
 @dataclass(frozen=True)
+@described
 class Normaliser:
     """Normalisation of the input."""
 

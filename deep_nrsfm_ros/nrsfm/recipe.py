@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.nrsfm.network import PAPER_WIDTHS, Architecture
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
@@ -17,6 +17,7 @@ AUTOMATIC = -1
 
 
 @dataclass(frozen=True)
+@described
 class Recipe:
     """Training."""
 
@@ -150,6 +151,7 @@ class Recipe:
 
 
 @dataclass(frozen=True)
+@described
 class LayoutLossWeights:
     """Losses of the keypoint layout.
 

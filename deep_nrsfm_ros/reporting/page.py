@@ -39,18 +39,18 @@ _FRAMES = 6  # best frames, and worst frames
 _SAME_ERROR = 1e-4  # rounding, of the error of the same weights
 _MIN_GAP = 0.005  # between two of these frames, as a share of the data
 _CURVES = {
-    "loss": "reprojection error",
+    "loss": "image error",
     "cycle_error": "cycle error",
     "coherence": "coherence of the final dictionary",
 }
 _QUALITY = {
-    "reprojection_error": "reprojection",
+    "reprojection_error": "image error",
     "cycle_error": "cycle",
     "coherence": "coherence",
     "mirrored_share": "mirrored",
 }
 _FIGURES = (
-    *("residual", "bone_variation", "misfit"),
+    *("image_error", "bone_variation", "misfit"),
     *("mirrored_share", "front_disagreement", "opposed"),
 )
 _CAMERA_TO_SCREEN = np.array([1, -1, -1])  # x right, y down, z forward to x right, y up, z back

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from deep_nrsfm_ros.configuration import options
 from deep_nrsfm_ros.data.curation import KEEP_ALL, Curation
 from deep_nrsfm_ros.data.keypoint_files import recordings
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS
@@ -221,6 +222,9 @@ class TrainingConfig:
             old = getattr(self, part.name)
             if dataclasses.is_dataclass(old) and not isinstance(old, type):
                 names = {item.name for item in dataclasses.fields(old)} & values.keys()
+                for item, _, opt in options(type(old)):  # by the names that the caller knows
+                    if item.name in names:
+                        opt.check(option_names()(item.name), values[item.name])
                 changes[part.name] = dataclasses.replace(old, **{k: values[k] for k in names})
             elif part.name in values:
                 changes[part.name] = values[part.name]

@@ -80,8 +80,8 @@ def train(
       "unknown" (the model of the object was trained on the held-out frames, and fits them better)
       or "doubtful"; `doubtful`: whether it is the last one.
     - `reason`: the verdict as a sentence, with what would help.
-    - `figures`: of the new model by their names, such as `residual` (image error on the held-out
-      frames), `learned_residual` (on those of the training), `bone_variation` and
+    - `figures`: of the new model by their names, such as `image_error` (on the held-out
+      frames), `learned_image_error` (on those of the training), `bone_variation` and
       `mirrored_share`; less is better.
     - `rival`, `rival_figures`: name and figures of the model that it is compared with; there only
       if there is one.

@@ -55,7 +55,9 @@ class Figures(NamedTuple):
     """Figures of a model that need no labels; less is better. NaN: unknown.
 
     Attributes:
-        residual: relative reprojection error of the network, median over the held-out frames.
+        image_error: of the network alone, without test-time rotations and correction: distance of
+            its keypoints from the detected ones, relative to the size of the object; median over
+            the held-out frames.
         bone_variation: mean absolute deviation of a bone's length from its median over the held-out
             frames, mean over the bones. A length is relative to the bone's median and to the
             median of its frame's bones; 0.04 typical of people.
@@ -68,10 +70,11 @@ class Figures(NamedTuple):
         difference: distance from the shapes of the model compared with, relative to their size.
         turned: share of all frames whose mirror image it has, lifted with the correction, where it
             was trained on from the model compared with. NaN for other models.
-        learned_residual: `residual` over the frames of the training, where others are held out.
+        learned_image_error: `image_error` over the frames of the training; NaN where none are held
+            out.
     """
 
-    residual: float
+    image_error: float
     bone_variation: float
     mirrored_share: float
     front_disagreement: float
@@ -80,15 +83,15 @@ class Figures(NamedTuple):
     flatness: float
     difference: float
     turned: float = math.nan
-    learned_residual: float = math.nan
+    learned_image_error: float = math.nan
 
     @property
     def misfit(self) -> float:
-        """Return the root of the summed squares of `residual` and `bone_variation`.
+        """Return the root of the summed squares of `image_error` and `bone_variation`.
 
         Both are relative to the size of the object. Bones count where they are known.
         """
-        return math.hypot(self.residual, _or_zero(self.bone_variation))
+        return math.hypot(self.image_error, _or_zero(self.bone_variation))
 
     @property
     def wrong_sides(self) -> float:
@@ -97,7 +100,7 @@ class Figures(NamedTuple):
 
 
 IN_WORDS = {
-    "misfit": "its image error and its bones together are off by {} of the size of the object",
+    "misfit": "its misfit, image error and bones together, is {} of the size of the object",
     "mirrored_share": "{} of its frames are mirrored against their neighbours",
     "front_disagreement": "in {} of the frames its front is behind",
     "opposed": "it lifts {} of the frames to the mirror image of the other's",
@@ -108,9 +111,9 @@ IN_WORDS = {
 
 _BESIDE = ("opposed", "turned")  # figures that need a model beside it
 _SHOWN = {
-    "residual": "image error of the network before the correction {} of the size of the object",
+    "image_error": "image error of the network before the correction {} of the size of the object",
     "bone_variation": "bone lengths vary by {}",
-    "misfit": "both together, the root of their summed squares, {}",
+    "misfit": "misfit, the root of their summed squares, {}",
     "wrong_sides": "frames that look mirrored {}",
 }
 MIN_SEEN_SHARE = 0.25
@@ -147,19 +150,19 @@ These limits are chosen on the people of `benchmarks/real/judge.py`; the table t
 they do.
 """
 
-MOST_RESIDUAL = 0.5
-"""Residual above which a model does not fit the frames: doubtful, whatever it is compared with."""
+MOST_IMAGE_ERROR = 0.5
+"""Image error above which a model does not fit the frames: doubtful beside any other."""
 MOST_MIRRORED = 0.05
 """Share of mirrored frames above which a model is doubtful where there is none to compare with."""
 
 
-LARGE_RESIDUAL = 0.25
-"""Residual on new frames above which a model without another one is said to fit badly.
+LARGE_IMAGE_ERROR = 0.25
+"""Image error on new frames above which a model without another one is said to fit badly.
 
 Each model of `benchmarks/real/judge.py` with more is a tenth or more worse than the best one of its
 scene. A good model of a mouse has 0.19.
 """
-LARGE_LEARNED_RESIDUAL = 0.2
+LARGE_LEARNED_IMAGE_ERROR = 0.2
 """The same on the frames of its training, where none are held out."""
 MISFIT_OF_LEARNED = 2.5
 """Times the misfit of a model that was trained on the held-out frames: a new one of more is worse.
@@ -170,8 +173,8 @@ and 15 %), so that less says nothing.
 
 FEW_STEPS = 2000
 """Steps from random weights below which more steps help."""
-LEARNED_RESIDUAL = 0.05
-"""Residual above which a model of few steps is a first look: it has learned too little for use."""
+LEARNED_IMAGE_ERROR = 0.05
+"""Image error above which a model of few steps is a first look, which is too poor for use."""
 
 
 class Comparable(NamedTuple):
@@ -358,25 +361,31 @@ def compare(frames: Split, model: Model, rival: Model | None) -> Judgement:
             reason += _fronts_in_words(comparison.fronts(model), model)
         else:
             reason += f"; {_advice(model, name)} would help"
+            if rival and worse == ["misfit"] and (files := _same_sources(frames.training, rival)):
+                reason += (
+                    f". But model {name!r} was trained on {files}: if it has learned other frames "
+                    "of these seconds, it is at an advantage"
+                )
     if reason:
         verdict, reason = DOUBTFUL, f"{reason}. {shown}"
     in_sentence = _IN_SENTENCES[verdict].format(name, *_gains(new, old))
     is_held_out = frames.held_out is not frames.training
-    most = LARGE_RESIDUAL if is_held_out else LARGE_LEARNED_RESIDUAL
-    fits_badly = verdict == ALONE and new.residual > most
-    is_first_look = _has_few_steps(model) and new.residual > LEARNED_RESIDUAL and verdict == ALONE
+    most = LARGE_IMAGE_ERROR if is_held_out else LARGE_LEARNED_IMAGE_ERROR
+    fits_badly = verdict == ALONE and new.image_error > most
+    is_poor = new.image_error > LEARNED_IMAGE_ERROR
+    is_first_look = _has_few_steps(model) and is_poor and verdict == ALONE
     if is_first_look:
         in_sentence = (
             f"is a first look, and has no other to compare with: {model.provenance['step']} steps "
-            f"from random weights leave an image error of {percent(new.residual)}; {FROM_RANDOM} "
-            "steps are usual"
+            f"from random weights leave an image error of {percent(new.image_error)}; "
+            f"{FROM_RANDOM} steps are usual"
         )
     elif fits_badly:
         kind = "new frames" if is_held_out else "the frames of its training"
         in_sentence = (
             f"has no other to compare with, and fits {kind} badly: an image error of "
-            f"{percent(new.residual)}, where above {percent(most)} is much; {_advice(model, '')} "
-            "would help"
+            f"{percent(new.image_error)}, where above {percent(most)} is much; "
+            f"{_advice(model, '')} would help"
         )
     elif verdict == ALONE:
         in_sentence = f"has no other to compare with{_side_in_words(model.layout, new)}"
@@ -487,6 +496,15 @@ def _on(basis: Comparable, name: str) -> str:
     )
 
 
+def _same_sources(data: Dataset, rival: Model) -> str:
+    """Return the files and bags that a model was trained on by their names, too; "" if none was."""
+    learned = str(rival.provenance.get("data", "")).split("; ")
+    files = [each for each in data.source.split("; ") if each.startswith(("file ", "bag"))]
+    same = [each for each in files if each in learned]
+    more = f" and {len(same) - 1} more" if len(same) > 1 else ""
+    return f"a {same[0]}{more}" if same else ""
+
+
 def _shown(new: Figures, old: Figures | None, name: str) -> str:
     """Return a few figures of both models in words."""
     values = [
@@ -500,8 +518,8 @@ def _shown(new: Figures, old: Figures | None, name: str) -> str:
             texts.append("neither other views nor a front tell which frames are mirrored")
         elif not math.isnan(value):
             beside = "" if math.isnan(other) else f" ({name}: {percent(other)})"
-            if each == "residual" and not math.isnan(new.learned_residual):
-                beside += f", {percent(new.learned_residual)} on the frames of its training"
+            if each == "image_error" and not math.isnan(new.learned_image_error):
+                beside += f", {percent(new.learned_image_error)} on the frames of its training"
             texts.append(_SHOWN[each].format(percent(value)) + beside)
     return ", ".join(texts)
 
@@ -558,9 +576,10 @@ def worse_figures(new: Figures, old: Figures | None, *, has_advantage: bool = Fa
         has_advantage: whether the one at hand has learned the held-out frames, so that its misfit
             on new ones is larger.
     """
-    most_residual = LARGE_RESIDUAL if has_advantage else MOST_RESIDUAL
+    most_image_error = LARGE_IMAGE_ERROR if has_advantage else MOST_IMAGE_ERROR
     most_misfit = MISFIT_OF_LEARNED if has_advantage else SAME_MISFIT
-    return _worse(new, old, most_misfit) or (["misfit"] if new.residual > most_residual else [])
+    too_far = ["misfit"] if new.image_error > most_image_error else []
+    return _worse(new, old, most_misfit) or too_far
 
 
 def _worse(new: Figures, old: Figures | None, most_misfit: float) -> list[str]:
@@ -779,10 +798,10 @@ class Judge:
             float(np.linalg.norm(X[..., :2], axis=(1, 2)).mean()),
             float(np.linalg.norm(align(Y, Z).aligned - Z, axis=(1, 2)).mean()),
             self._opposed(model, other, corrected=True) if other and is_trained_on else math.nan,
-            self._learned_residual(model),
+            self._learned_image_error(model),
         )
 
-    def _learned_residual(self, model: Model) -> float:
+    def _learned_image_error(self, model: Model) -> float:
         """Return the residual over the frames of the training; NaN where none are held out."""
         residual = self._lift(model)[1][: self._trained_on]
         is_known = np.isfinite(residual)

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 
 
 @dataclass(frozen=True)
+@described
 class Limits:
     """Limits of a training.
 

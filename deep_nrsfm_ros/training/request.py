@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from deep_nrsfm_ros.configuration import option
+from deep_nrsfm_ros.configuration import described, option
 from deep_nrsfm_ros.data.bag_files import open_bag, opens_quickly
 from deep_nrsfm_ros.data.bag_topics import keypoint_topics
 from deep_nrsfm_ros.data.curation import Curation
@@ -33,6 +33,7 @@ UNKNOWN_SIDE = "unknown"
 
 
 @dataclass(frozen=True)
+@described
 class TrainingOptions:
     """Data and result of the service ~/train: the parameters `train.*` that no other part has."""
 

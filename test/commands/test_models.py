@@ -50,7 +50,7 @@ def test_a_model_is_listed_with_all_that_is_known_of_it(
     head, row, where, origin, errors, *_ = listing(capsys, folders[0])
     assert tuple(head.split()) == models.COLUMNS
     assert row.split() == ["mine", "human17", "17", "-", "2025-03-04"]
-    assert errors.strip() == "on the data of its training: reprojection 0.123, cycle 0.568"
+    assert errors.strip() == "on the data of its training: image error 0.123, cycle error 0.568"
     assert where.strip() == str(path)
     assert origin.strip() == "bags kitchen, yard; 321 frames; 4000 steps"
 
@@ -214,9 +214,7 @@ def test_each_verdict_has_its_word(
     }
     for name, said in verdicts.items():
         save(folders[0] / f"{name}.safetensors", provenance=PROVENANCE | {"judgement": said})
-    rows = [
-        line.split() for line in listing(capsys, folders[0]) if line.split(" ")[0] in verdicts
-    ]
+    rows = [line.split() for line in listing(capsys, folders[0]) if line.split(" ")[0] in verdicts]
     assert {row[0]: row[3] for row in rows} == {
         "a": "alone",
         "b": "as_good",

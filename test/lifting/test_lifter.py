@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks.data.walking_person import in_layout
+from deep_nrsfm_ros.data.clip import read_clip
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
@@ -273,21 +274,37 @@ def test_reference_length(length: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "complaint"),
+    ("options", "given", "complaint"),
     [
-        (LiftingOptions(correction="foo"), "correction is 'foo'; choose one of bones, learned"),
-        (LiftingOptions(reference_length=-1), "reference_length is -1; it must be at least 0"),
-        (LiftingOptions(noise=float("nan")), "noise is nan; it must be at least 0 and at most 1"),
-        (LiftingOptions(noise="0.1"), "noise is '0.1'; it must be a number"),  # type: ignore
-        (LiftingOptions(refill=-3), "refill is -3; it must be at least 0 and at most 50"),
-        (HistoryOptions(shape_time=-1), "shape_time is -1; it must be at least 0"),
+        (LiftingOptions, {"correction": "foo"}, "correction is 'foo'; choose one of bones, lear"),
+        (LiftingOptions, {"reference_length": -1}, "reference_length is -1; it must be at least 0"),
+        (LiftingOptions, {"noise": float("nan")}, "noise is nan; it must be at least 0 and at"),
+        (LiftingOptions, {"noise": "0.1"}, "noise is '0.1'; it must be a number"),
+        (LiftingOptions, {"refill": -3}, "refill is -3; it must be at least 0 and at most 50"),
+        (HistoryOptions, {"shape_time": -1}, "shape_time is -1; it must be at least 0"),
     ],
 )
-def test_an_option_out_of_its_range_is_refused(options: Any, complaint: str) -> None:
-    remembers = isinstance(options, HistoryOptions)
-    given = {"history" if remembers else "options": options}
+def test_an_option_out_of_its_range_is_refused(
+    options: Any, given: dict[str, Any], complaint: str
+) -> None:
     with pytest.raises(ValueError, match=f"^{complaint}"):
-        Lifter(random_model(), **given)
+        options(**given)
+
+
+def test_a_lifter_says_what_looks_wrong_where_it_is_asked() -> None:
+    view = read_clip().session.views[0]
+    lifter = Lifter("human", layout="body25b")
+    assert lifter.check(view.points, view.confidence) == []
+    assert lifter.check(view.points[0], view.confidence[0]) == []
+    upside_down = view.points * [1, -1] + [0, 1920]
+    (said,) = [each for each in lifter.check(upside_down, view.confidence) if "upside" in each]
+    assert "y points up, and must point down" in said and "--" not in said
+    assert "confidence" in lifter.check(view.points, 100 * view.confidence)[0]
+    assert any("relative to it" in each for each in lifter.check(*relative_to_the_first(view)))
+
+
+def relative_to_the_first(view: Any) -> tuple[np.ndarray, np.ndarray]:
+    return view.points - view.points[:, :1], np.ones(view.points.shape[:2])
 
 
 def test_an_argument_of_another_type_is_refused() -> None:

@@ -196,7 +196,7 @@ def test_other_models_are_compared_with(tmp_path: Path) -> None:
     rows = re.findall(r"<tr[^>]*><td>(mine|other|hand|broken)</td>(.*?)</tr>", text, re.DOTALL)
     assert sorted(name for name, _ in rows) == ["mine", "other"]  # those of these keypoints
     assert all(len(re.findall(r"[\d.]+ %", cells)) >= 3 for _, cells in rows)
-    assert "reprojection 0.100, cycle 0.200, coherence 0.500." in " ".join(text.split())
+    assert "image error 0.100, cycle 0.200, coherence 0.500." in " ".join(text.split())
     assert sorted(f.name for f in tmp_path.glob("*mine*")) == ["mine.html", "mine.safetensors"]
 
 
@@ -206,7 +206,7 @@ def test_the_verdict_on_the_model_is_that_of_its_training(verdict: str) -> None:
     whole.model.provenance["judgement"] = {"verdict": verdict, "doubtful": False}
     text = page(whole)
     assert re.findall(r"<td>mine</td><td>(.*?)</td>", text) == [verdict]
-    assert '<th class="figure">together</th>' in text
+    assert '<th class="figure">misfit</th>' in text
 
 
 def test_a_report_on_another_object_sets_the_layout_first(text: str) -> None:

@@ -57,6 +57,11 @@ def changed(config: Any) -> Any:
             values[field.name] = -1.0
             continue
         values[field.name] = changed(value) if dataclasses.is_dataclass(value) else other(value)
+        if opt := field.metadata.get("option"):
+            if opt.choices:
+                values[field.name] = next(each for each in opt.choices if each != value)
+            elif opt.high is not None and not isinstance(value, tuple) and value + 1 > opt.high:
+                values[field.name] = (value + opt.low) / 2 if value > opt.low else opt.high / 2
     return type(config)(**values)
 
 

@@ -35,7 +35,7 @@ from deep_nrsfm_ros.training.learned_frames import LEARNED_FRAMES, frame_marks, 
 from deep_nrsfm_ros.training.trainer import Trainer
 
 GOOD = Figures(
-    residual=0.05,
+    image_error=0.05,
     bone_variation=0.04,
     mirrored_share=0.0,
     front_disagreement=0.0,
@@ -85,7 +85,7 @@ def test_a_bad_model_is_doubted_and_told_what_would_help(
     assert str(judgement).startswith("the new model is doubtful: ")
     record = judgement.record()
     assert record["doubtful"] and record["rival"] == "good"
-    assert record["figures"]["residual"] > record["rival_figures"]["residual"]
+    assert record["figures"]["image_error"] > record["rival_figures"]["image_error"]
 
 
 def test_time_would_help_a_model_whose_factorisations_were_cut_short(
@@ -150,6 +150,16 @@ def test_a_model_is_not_doubtful_because_the_rival_has_learned_the_held_out_fram
     assert shown["good"].has_learned and not shown["looser"].has_learned
 
 
+def test_files_of_the_same_names_are_said_where_the_frames_are_others(
+    frames: Split, good: Model
+) -> None:
+    data = dataclasses.replace(frames.training, source="file cam0.npz; file cam1.npz")
+    rival = dataclasses.replace(good, provenance=good.provenance | {"data": "file cam1.npz; bag x"})
+    said = "model 'good' was trained on a file cam1.npz: if it has learned other frames"
+    assert said in judge(Split(data, frames.held_out), looser(good, 0.02), rival).reason
+    assert "if it has learned" not in judge(frames, looser(good, 0.02), rival).reason
+
+
 def test_held_out_frames_that_the_rival_has_learned_do_not_count(
     frames: Split, good: Model
 ) -> None:
@@ -172,11 +182,11 @@ def test_the_error_on_new_frames_stands_beside_that_on_learned_ones(
     frames: Split, good: Model, bad: Model
 ) -> None:
     judgement = judge(frames, good, None)
-    learned = judgement.figures.learned_residual
-    assert learned == pytest.approx(judgement.figures.residual, rel=0.3)
+    learned = judgement.figures.learned_image_error
+    assert learned == pytest.approx(judgement.figures.image_error, rel=0.3)
     assert f", {percent(learned)} on the frames of its training" in str(judgement)
     nothing_held_out = judge(Split(frames.training, frames.training), good, None)
-    assert math.isnan(nothing_held_out.figures.learned_residual)
+    assert math.isnan(nothing_held_out.figures.learned_image_error)
     assert "on the frames of its training, bone" not in str(nothing_held_out)
 
 
@@ -185,13 +195,13 @@ def test_a_model_that_fits_badly_is_not_silently_alone(
 ) -> None:
     from deep_nrsfm_ros.training import judge as module
 
-    residual = judge(frames, good, None).figures.residual
-    monkeypatch.setattr(module, "LARGE_RESIDUAL", residual * 0.9)
+    residual = judge(frames, good, None).figures.image_error
+    monkeypatch.setattr(module, "LARGE_IMAGE_ERROR", residual * 0.9)
     judgement = judge(frames, good, None)
     assert judgement.verdict == "alone" and judgement.record()["fits_badly"]
     assert "fits new frames badly: an image error of" in str(judgement)
     assert "more views" in str(judgement)
-    monkeypatch.setattr(module, "LARGE_LEARNED_RESIDUAL", residual * 0.5)
+    monkeypatch.setattr(module, "LARGE_LEARNED_IMAGE_ERROR", residual * 0.5)
     nothing_held_out = judge(Split(frames.training, frames.training), good, None)
     assert "fits the frames of its training badly" in str(nothing_held_out)
 
@@ -263,21 +273,21 @@ def test_a_rival_of_another_object_is_none(frames: Split, good: Model) -> None:
     ("change", "worse"),
     [
         ({}, []),
-        ({"residual": 0.051}, []),  # alike
-        ({"residual": 0.053}, ["misfit"]),
-        ({"residual": 0.04, "bone_variation": 0.049}, []),
-        ({"residual": 0.04, "bone_variation": 0.053}, ["misfit"]),
-        ({"residual": 0.0, "bone_variation": 0.11}, ["bone_variation", "misfit"]),
+        ({"image_error": 0.051}, []),  # alike
+        ({"image_error": 0.053}, ["misfit"]),
+        ({"image_error": 0.04, "bone_variation": 0.049}, []),
+        ({"image_error": 0.04, "bone_variation": 0.053}, ["misfit"]),
+        ({"image_error": 0.0, "bone_variation": 0.11}, ["bone_variation", "misfit"]),
         ({"mirrored_share": 0.01}, ["mirrored_share"]),
         ({"mirrored_share": math.nan, "front_disagreement": math.nan}, []),
         ({"bone_variation": math.nan}, []),
         ({"front_disagreement": 0.2, "opposed": 0.3}, ["front_disagreement"]),
-        ({"residual": 0.01, "opposed": 0.06}, ["opposed"]),
-        ({"residual": 0.09, "opposed": 0.3, "bone_variation": 0.01}, []),  # the other is folded
-        ({"residual": 0.01, "opposed": 0.04}, []),
-        ({"residual": 0.01, "turned": 0.006}, ["turned"]),  # no frame of a start should be
-        ({"residual": 0.01, "turned": 0.004}, []),
-        ({"residual": 0.01, "turned": 0.006, "bone_variation": 0.01}, ["turned"]),
+        ({"image_error": 0.01, "opposed": 0.06}, ["opposed"]),
+        ({"image_error": 0.09, "opposed": 0.3, "bone_variation": 0.01}, []),  # the other is folded
+        ({"image_error": 0.01, "opposed": 0.04}, []),
+        ({"image_error": 0.01, "turned": 0.006}, ["turned"]),  # no frame of a start should be
+        ({"image_error": 0.01, "turned": 0.004}, []),
+        ({"image_error": 0.01, "turned": 0.006, "bone_variation": 0.01}, ["turned"]),
         ({"side_difference": 9.0, "flatness": 0.0, "difference": 9.0}, []),
     ],
 )
@@ -299,7 +309,7 @@ def test_the_rule(change: dict[str, float], worse: list[str]) -> None:
 def test_a_model_that_lifts_nearly_all_frames_to_the_mirror_image_is_never_better(
     change: dict[str, float], worse: list[str]
 ) -> None:
-    at_hand = GOOD._replace(residual=0.5, mirrored_share=0.3, front_disagreement=0.3)
+    at_hand = GOOD._replace(image_error=0.5, mirrored_share=0.3, front_disagreement=0.3)
     both = {"mirrored_share": 0.3, "front_disagreement": 0.3}
     assert worse_figures(GOOD._replace(**both | change), at_hand) == worse
     if "turned" in change:  # whatever else is said of the start
@@ -341,8 +351,8 @@ def test_few_opposed_frames_do_not_change_the_order() -> None:
 
 
 def test_models_that_are_better_come_before_the_one_at_hand() -> None:
-    assert rank(GOOD._replace(residual=0.051), GOOD) < rank(GOOD, GOOD)
-    assert rank(GOOD._replace(residual=0.053), GOOD) > rank(GOOD, GOOD)
+    assert rank(GOOD._replace(image_error=0.051), GOOD) < rank(GOOD, GOOD)
+    assert rank(GOOD._replace(image_error=0.053), GOOD) > rank(GOOD, GOOD)
 
 
 def test_frames_that_a_training_has_turned_are_seen_beside_its_start_alone(
@@ -421,7 +431,7 @@ def test_the_figures_are_named_and_short(frames: Split, good: Model, bad: Model)
     assert "image error and bones together are smaller" in text
     figures = dict(zip(("new", "old"), map(Judge(frames).figures, (good, bad)), strict=True))
     new, old = (percent(each.misfit) for each in figures.values())
-    assert f"both together, the root of their summed squares, {new} (bad: {old})" in text
+    assert f"misfit, the root of their summed squares, {new} (bad: {old})" in text
     assert not re.search(r"\d\.\d\d", text)
 
 
@@ -526,7 +536,8 @@ def test_few_steps_from_random_weights_are_a_first_look(
     assert alone.is_first_look and alone.record()["first_look"]
     assert str(alone).startswith(
         "the new model is a first look, and has no other to compare with: 20 steps from random "
-        f"weights leave an image error of {percent(alone.figures.residual)}; 30000 steps are usual"
+        f"weights leave an image error of {percent(alone.figures.image_error)}; 30000 steps are "
+        "usual"
     )
     assert good.provenance["step"] < 2000 and not judge(frames, good, None).is_first_look
     for other in ({"step": 2000}, {"step": 20, "from": {"model": "human"}}, {}):
