@@ -25,8 +25,9 @@ CONVENTIONS = {
     "shape %": "the paper's: each frame rescaled to the norm of the truth and aligned by O(3), "
     "which forgives a mirrored depth",
     "point cm": "mean distance of the same alignment, the rest skeleton taken as 1.8 m high",
-    "proper %": "rescaled, aligned by proper rotations, no reflection frame by frame",
-    "mirrored %": "frames that a reflection would fit better",
+    "proper %": "rescaled, aligned by proper rotations, no reflection frame by frame; a model most "
+    "of whose frames are mirrored is reflected as a whole before",
+    "mirrored %": "frames that a reflection would fit better than most frames",
     "unscaled %": "as proper, without rescaling",
 }
 """What each figure of `figures` means."""
@@ -137,7 +138,7 @@ def evaluate(model: Model, dataset: Dataset, options: LiftingOptions) -> ShapeEr
 
 def figures(errors: ShapeErrors) -> dict[str, float]:
     """Return the errors (of shapes in metres) as tables show them, by the `CONVENTIONS`."""
-    shown = (errors.shape, HEIGHT_18 * errors.point, *errors[2:])
+    shown = (errors.shape, HEIGHT_18 * errors.point, *errors[2:-1])
     return {name: 100 * value for name, value in zip(CONVENTIONS, shown, strict=True)}
 
 
@@ -175,16 +176,26 @@ def main(argv: Sequence[str] | None = None) -> None:
             return
         models = find_models(args.models, args.models_dir)
         print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+        reflected: dict[str, None] = {}
         for model in models:
             dataset = read_split(selection, model.layout)
             for word, lifting in LIFTING.items():
                 errors = evaluate(model, dataset, lifting)
                 cells = " | ".join(f"{figure:.2f}" for figure in figures(errors).values())
                 print(f"| {model.name} | {word} | {cells} |", flush=True)
+                if errors.reflected:
+                    reflected[model.name] = None
     except (ValueError, OSError) as error:
         print(f"failed: {error}", file=sys.stderr)
         sys.exit(2)
     print("", *(f"{name}: {meaning}" for name, meaning in CONVENTIONS.items()), sep="\n")
+    for name in reflected:
+        print(
+            f"warning: model {name!r} is mirrored as a whole: most of its frames are mirror images "
+            "of the truth, and the figures without reflection are those of their reflections; a "
+            "robot would see front and back exchanged",
+            file=sys.stderr,
+        )
 
 
 if __name__ == "__main__":

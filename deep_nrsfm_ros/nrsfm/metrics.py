@@ -21,10 +21,13 @@ class ShapeErrors(NamedTuple):
             by a rotation or a reflection.
         point: the paper's point error: mean distance of a point after that alignment, in the unit
             of the truth.
-        proper: shape error after rescaling and alignment by a rotation. One reflection for all
-            frames together is allowed, since no image tells an object from its mirror image.
+        proper: shape error after rescaling and alignment by a rotation, the set as `reflected`
+            says.
         mirrored: share of frames, 0 to 0.5, whose best alignment is mirrored against the majority.
         unscaled: like `proper`, without rescaling each frame.
+        reflected: 1 if the whole set was reflected before `proper`, `mirrored` and `unscaled`,
+            because most of its frames are mirror images; else 0. That is allowed, since no image
+            tells an object from its mirror image, but a robot sees its depth the wrong way round.
     """
 
     shape: float
@@ -32,6 +35,7 @@ class ShapeErrors(NamedTuple):
     proper: float
     mirrored: float
     unscaled: float
+    reflected: float = 0.0
 
 
 def shape_errors(S: Floats, truth: Floats) -> ShapeErrors:
@@ -48,7 +52,8 @@ def shape_errors(S: Floats, truth: Floats) -> ShapeErrors:
     ratio = (size / np.maximum(np.linalg.norm(S, axis=(1, 2)), 1e-12))[:, None, None]
     free = align(ratio * S, T, allow_reflection=True)
     mirrored = free.mirrored.mean()
-    if mirrored > 0.5:
+    reflected = bool(mirrored > 0.5)
+    if reflected:
         S, mirrored = S * np.array([1, 1, -1], S.dtype), 1 - mirrored
     proper = align(S, T).rotation
 
@@ -61,6 +66,7 @@ def shape_errors(S: Floats, truth: Floats) -> ShapeErrors:
         error(ratio * S @ proper),
         float(mirrored),
         error(S @ proper),
+        float(reflected),
     )
 
 
@@ -89,7 +95,8 @@ class CameraErrors(NamedTuple):
         in_camera: mean distance in mm after the best scale and translation, without a rotation:
             the viewing direction must be right too.
         rotation: median angle in degrees between the lifted and the true shape.
-        mirrored: share of frames, 0 to 1, that a reflection aligns better than a rotation.
+        mirrored: share of frames, 0 to 1, that a reflection aligns better than a rotation; unlike
+            `ShapeErrors.mirrored` it counts all frames of a set that is mirrored as a whole.
     """
 
     aligned: float
