@@ -379,6 +379,7 @@ _API: tuple[tuple[str, tuple[str, ...]], ...] = (
             "model_files.model_file:load_model",
             "lifting.lifter:Lifter",
             "lifting.lifter:Lifter.__call__",
+            "lifting.lifter:Lifter.check",
             "lifting.lifter:Lifted",
             "lifting.options:LiftingOptions",
         ),
@@ -402,6 +403,17 @@ _API: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     ("Training", ("training.from_arrays:train", "nrsfm.recipe:Recipe")),
+    (
+        "Your own truth",
+        (
+            "nrsfm.metrics:camera_errors",
+            "nrsfm.metrics:CameraErrors",
+            "nrsfm.metrics:shape_errors",
+            "nrsfm.metrics:ShapeErrors",
+            "nrsfm.metrics:procrustes_distances",
+            "nrsfm.factorisation.rigid:rigid",
+        ),
+    ),
 )
 """Sections of the Python API, and the module and the name of each entry."""
 _INTRODUCTIONS = {
@@ -421,6 +433,20 @@ Without `seconds` each object is lifted by itself: `video(points)` lifts all fra
 [lift_video.py](../../examples/lift_video.py) does it with a real video and its calibration, and
 measures the answer against the true 3D with `nrsfm.metrics`; put your own arrays
 (frames, keypoints, 3) there.""",
+    "Lifting": """\
+A call of a `Lifter` checks the shapes of its arrays alone. Units, axes, sides and a poor fit are
+checked by `lifter.check(points)`, as by the program `lift` at its end.""",
+    "Your own truth": """\
+The functions of `nrsfm.metrics` compare shapes with a truth of yours, at the points of both:
+
+    from deep_nrsfm_ros.nrsfm.metrics import camera_errors, procrustes_distances
+    lifter = Lifter("human", layout="coco17")
+    chosen = [lifter.model.layout.index(name) for name in names]  # names of your truth's points
+    shapes = lifter(points).shapes[:, chosen]
+    print(camera_errors(shapes, truth))  # truth (n, points, 3) in the camera's axes, in any unit
+    print(procrustes_distances(shapes, truth).mean(1))  # of each frame
+
+`rigid` is a baseline: one shape for all frames. Other methods are in `nrsfm/factorisation/`.""",
 }
 """Text at the beginning of a section of the Python API."""
 _MODULES = (
@@ -457,8 +483,8 @@ def python_page() -> str:
         "`make reference`; do not edit.",
         example,
         text,
-        "`from deep_nrsfm_ros import NAME` gives each of the names below but the modules at the "
-        "end. `help(NAME)` and [the API in full](python_full.md) have results and errors too.",
+        "`from deep_nrsfm_ros import NAME` gives each of the names below but those of `nrsfm` at "
+        "the end. `help(NAME)` and [the API in full](python_full.md) have results and errors too.",
     ]
     for title, entries in _API:
         introduction = [_INTRODUCTIONS[title]] if title in _INTRODUCTIONS else []
@@ -487,7 +513,10 @@ def _entry(place: str) -> str:
     signature = "" if is_record else _signature(value)
     title = f"**`{path}{signature}`**"
     if section := _OF_PARAMETERS.get(path):
-        return f"{title}: its fields are those of [these parameters](parameters.md#{section})."
+        return (
+            f"{title}: its fields are those of [these parameters](parameters.md#{section}), "
+            "without what stands before a dot; `help` has them too. A wrong value is refused."
+        )
     described = vars(value)["__init__"] if isinstance(value, type) and not is_record else value
     items = _items(described, "Attributes" if is_record else "Args")
     rows = "\n".join(f"- `{name}`: {text}" for name, text in items.items())

@@ -83,6 +83,19 @@ def test_the_lines_of_the_python_page_on_videos_run() -> None:
     assert lifted.shapes.shape == (3, 25, 3)
 
 
+def test_the_lines_of_the_python_page_on_truth_run() -> None:
+    page = (ROOT / "docs/reference/python.md").read_text()
+    section = page.split("## Your own truth\n")[1].split("\n## ")[0]
+    lines = [line[4:] for line in section.splitlines() if line.startswith("    ")]
+    lifter, points = Lifter("human", layout="coco17"), pixels(3, 17)
+    names = ["left_hip", "right_hip", "left_knee", "right_knee", "left_shoulder"]
+    truth = 1000 * lifter(points).shapes[:, [lifter.model.layout.index(name) for name in names]]
+    variables: dict[str, Any] = {"points": points, "names": names, "truth": truth}
+    exec("\n".join(lines), variables := variables | {"Lifter": Lifter})
+    found = variables["camera_errors"](variables["shapes"], truth)
+    assert found.aligned < 1e-3 and not found.mirrored
+
+
 def test_one_object_and_many_in_any_dtype(human: Model) -> None:
     lifter, points = Lifter(human), pixels(100, 25)
     many = lifter(points)

@@ -54,7 +54,7 @@ class LiftingOptions:
         False,
         "whether the mirror image is lifted and averaged as well: slightly more accurate on "
         "average, at twice the time and with an occasional mirrored frame; needs a layout with "
-        "handedness and with pairs of left_ and right_ keypoints",
+        "handedness and with pairs of left and right keypoints",
     )
     mirrored: bool = option(
         False,

@@ -43,11 +43,16 @@ def shape_errors(S: Floats, truth: Floats) -> ShapeErrors:
 
     Args:
         S: (f, p, 3) reconstructed shapes, in any unit.
-        truth: (f, p, 3) ground truth.
+        truth: (f, p, 3) ground truth of the same points. Frames with a NaN, in shape or truth, are
+            left out.
+
+    Raises:
+        ValueError: the arrays have other shapes than (f, p, 3), or no frame is left.
 
     Source: section "NRSfM on CMU Motion Capture", tab:nrsfm, for `shape` and `point`.
     """
-    S, T = centre(S), centre(truth)
+    known = _known(S, truth)
+    S, T = centre(S[known]), centre(truth[known])
     size = np.linalg.norm(T, axis=(1, 2))
     ratio = (size / np.maximum(np.linalg.norm(S, axis=(1, 2)), 1e-12))[:, None, None]
     free = align(ratio * S, T, allow_reflection=True)
@@ -78,22 +83,54 @@ def procrustes_distances(S: Floats, truth: Floats) -> Floats:
 
     Args:
         S: (f, p, 3) reconstructed shapes, in any unit.
-        truth: (f, p, 3) ground truth.
+        truth: (f, p, 3) ground truth of the same points.
+
+    Returns:
+        NaN in all points of a frame with a NaN, in shape or truth: `np.nanmean` leaves them out.
+
+    Raises:
+        ValueError: the arrays have other shapes than (f, p, 3), or every frame has a NaN.
     """
-    S, T = centre(S), centre(truth)
+    known = _known(S, truth)
+    S, T = centre(S[known]), centre(truth[known])
     S = align(S, T).aligned
     scale = (S * T).sum((1, 2)) / np.maximum((S * S).sum((1, 2)), 1e-12)
-    distances: Floats = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
+    found: Floats = np.linalg.norm(scale[:, None, None] * S - T, axis=2)
+    if known.all():
+        return found
+    distances = np.full((len(known), found.shape[1]), np.nan, found.dtype)
+    distances[known] = found
     return distances
 
 
+def _known(S: Floats, truth: Floats) -> NDArray[np.bool_]:
+    """Return which frames (f,) have neither in shape nor in truth a NaN.
+
+    Raises:
+        ValueError: the arrays have other shapes than (f, p, 3), or there is no such frame.
+    """
+    if S.ndim != 3 or S.shape != truth.shape or S.shape[-1] != 3:
+        raise ValueError(
+            f"shapes are {S.shape} and the truth is {truth.shape}; both must be (frames, points, "
+            "3), of the same points in the same order"
+        )
+    known: NDArray[np.bool_] = (np.isfinite(S) & np.isfinite(truth)).all((1, 2))
+    if not known.any():
+        raise ValueError(
+            f"in each of the {len(S)} frames a point of the shape or of the truth is NaN: choose "
+            "the points that are known, S[:, points]"
+        )
+    return known
+
+
 class CameraErrors(NamedTuple):
-    """Errors of lifted shapes in the camera's axes, against ground truth in mm.
+    """Errors of lifted shapes in the camera's axes, against ground truth.
 
     Attributes:
-        aligned: mean distance of a point in mm after the best similarity transform.
-        in_camera: mean distance in mm after the best scale and translation, without a rotation:
-            the viewing direction must be right too.
+        aligned: mean distance of a point after the best similarity transform, in the unit of the
+            truth.
+        in_camera: the same after the best scale and translation, without a rotation: the viewing
+            direction must be right too.
         rotation: median angle in degrees between the lifted and the true shape.
         mirrored: share of frames, 0 to 1, that a reflection aligns better than a rotation; unlike
             `ShapeErrors.mirrored` it counts all frames of a set that is mirrored as a whole.
@@ -110,9 +147,13 @@ def camera_errors(shapes: Floats, truth: Floats) -> CameraErrors:
 
     Args:
         shapes: (f, p, 3) lifted shapes, in any unit.
-        truth: (f, p, 3) ground truth in mm. Frames with a NaN are left out.
+        truth: (f, p, 3) ground truth of the same points in these axes, x right, y down, z forward.
+            Frames with a NaN, in shape or truth, are left out.
+
+    Raises:
+        ValueError: the arrays have other shapes than (f, p, 3), or no frame is left.
     """
-    known = np.isfinite(truth).all((1, 2))
+    known = _known(shapes, truth)
     S, T = centre(shapes[known].astype(float)), centre(truth[known])
     scale = (S * T).sum((1, 2)) / (S * S).sum((1, 2))
     distances = np.linalg.norm(scale[:, None, None] * S - T, axis=2)

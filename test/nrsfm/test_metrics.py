@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -124,3 +126,26 @@ def test_a_mirrored_shape_is_found_out() -> None:
     half[:10, :, 2] *= -1
     error = camera_errors(half, person())
     assert error.mirrored == 0.5 and error.aligned > 50
+
+
+def test_frames_with_a_nan_are_left_out_alike() -> None:
+    truth, S, _ = frames(3)
+    kept = np.delete(np.arange(len(S)), [4, 7])
+    S[4] = np.nan  # as a lifter returns what it has not lifted
+    truth[7, 2, 0] = np.nan
+    for errors in (shape_errors, camera_errors):
+        assert errors(S, truth) == errors(S[kept], truth[kept])
+    distances = procrustes_distances(S, truth)
+    assert np.isnan(distances[[4, 7]]).all()
+    np.testing.assert_array_equal(distances[kept], procrustes_distances(S[kept], truth[kept]))
+
+
+@pytest.mark.parametrize("errors", [shape_errors, camera_errors, procrustes_distances])
+def test_arrays_that_do_not_fit_are_refused(errors: Callable[..., object]) -> None:
+    truth, S, _ = frames(3)
+    with pytest.raises(ValueError, match=r"shapes are \(20, 5, 3\) and the truth is \(20, 10, 3\)"):
+        errors(S[:, :5], truth)
+    with pytest.raises(ValueError, match="the same points in the same order"):
+        errors(S[..., :2], truth[..., :2])
+    with pytest.raises(ValueError, match="in each of the 20 frames a point"):
+        errors(S, truth * np.nan)

@@ -16,7 +16,16 @@ Floats = NDArray[Any]
 def rigid(W: Floats) -> Floats:
     """Return one shape for all frames: factorisation with the metric upgrade.
 
-    Tomasi and Kanade, "Shape and motion from image streams under orthography", IJCV 1992.
+    Args:
+        W: (f, p, 2) images of the same p points, all visible. Each frame must be centred over its
+            points, and all of one scale: `W -= W.mean(1, keepdims=True)`, then
+            `W /= np.linalg.norm(W, axis=(1, 2), keepdims=True)`. Pixels as they are give a wrong
+            shape.
+
+    Returns:
+        (f, p, 3) the shape, f times the same, in the unit of W; possibly a mirror image.
+
+    Source: Tomasi and Kanade, "Shape and motion from image streams under orthography", IJCV 1992.
     """
     S = rigid_shape(W, rigid_rotations(W))
     return np.repeat(S[None], len(W), axis=0)
