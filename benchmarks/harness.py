@@ -235,6 +235,7 @@ def run_program(
     argv: Sequence[str] | None = None,
     seeds: Sequence[int] = (0, 1),
     own: argparse.ArgumentParser | None = None,
+    content: tuple[str, str] = ("cmu/", "CMU subjects"),
 ) -> None:
     """Run a benchmark as a program: parse options, print and write its table.
 
@@ -247,11 +248,13 @@ def run_program(
         argv: the command line without the options of `own`; None: that of the process.
         seeds: default of --seeds.
         own: options of this benchmark alone, which --help lists too.
+        content: what --data holds, and what --subjects names.
     """
+    holds, named = content
     parser = argparse.ArgumentParser(description=description, parents=[own] if own else [])
-    parser.add_argument("--data", type=Path, required=True, help="folder that holds cmu/")
+    parser.add_argument("--data", type=Path, required=True, help=f"folder that holds {holds}")
     parser.add_argument("--output", type=Path, default=Path("runs/benchmarks"))
-    parser.add_argument("--subjects", nargs="+", default=list(subjects), help="CMU subjects")
+    parser.add_argument("--subjects", nargs="+", default=list(subjects), help=named)
     parser.add_argument(
         "--seeds", nargs="*", type=int, default=list(seeds), help="none: without trainings"
     )

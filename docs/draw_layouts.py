@@ -18,10 +18,11 @@ from PIL import Image
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.reporting.drawing import COLOURS, MIDDLE
 
 FOLDER = Path(__file__).parent / "reference" / "layouts"
 Point = tuple[float, float]
-_LEFT, _RIGHT, _MIDDLE = "#1b7f3b", "#c2570c", "#1f4e9c"
+_LEFT, _RIGHT, _MIDDLE = COLOURS["left"], COLOURS["right"], MIDDLE
 
 # Of the left side, in the middle 0; the right side is its mirror image.
 _BODY: dict[str, Point] = {

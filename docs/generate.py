@@ -118,8 +118,8 @@ def layouts_page() -> str:
     return (
         "# Keypoint layouts\n\nThe presets, each with its keypoints in the order in which they "
         "come. Made by `make reference`; do not edit. A picture has the index "
-        "of each keypoint: left is green, right is orange. `python -m docs.draw_layouts` draws "
-        "them.\n\n" + "\n".join(rows) + "\n"
+        "of each keypoint: left is blue, right is red, as in reports and viewers. "
+        "`python -m docs.draw_layouts` draws them.\n\n" + "\n".join(rows) + "\n"
     )
 
 

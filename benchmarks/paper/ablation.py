@@ -44,7 +44,7 @@ def trained(session: Session, subject: str, dataset: Dataset, name: str, seed: i
     No variant is repaired: the repair would hide what each part does against mirrored frames.
     """
     variant = VARIANTS[name]
-    recipe = {"steps": session.steps or STEPS, "reference": "off"} | variant.recipe
+    recipe = {"steps": session.steps or STEPS, "mirror_repair": "off"} | variant.recipe
     preset = session.preset("default", seed, **recipe)
     architecture = dataclasses.replace(preset.architecture, **variant.architecture)
     return session.trained(

@@ -177,7 +177,8 @@ def benchmark(session: Session) -> Table:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command; `--subjects` are sequences or categories here."""
-    run_program(benchmark, __doc__, SEQUENCES, argv)
+    named = f"sequences, of {' '.join(SEQUENCES)}; or categories (default: all sequences)"
+    run_program(benchmark, __doc__, SEQUENCES, argv, content=("nrsfm/*.mat", named))
 
 
 if __name__ == "__main__":

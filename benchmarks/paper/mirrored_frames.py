@@ -34,23 +34,23 @@ _LIFTED = ("network alone", "as shipped")
 _SHOWN = ("shape %", "proper %", "mirrored %")
 _FOUND = "found without labels %"
 _RECIPES: dict[str, dict[str, Any]] = {
-    "one seed": {"seeds": 1, "reference": "off"},
-    "one seed, repaired": {"seeds": 1, "reference": "repair"},
+    "one seed": {"seeds": 1, "mirror_repair": "off"},
+    "one seed, repaired": {"seeds": 1, "mirror_repair": "if_found"},
     "default": {},
-    "default, reference always": {"reference": "always"},
+    "default, reference always": {"mirror_repair": "always"},
     "fast": {},
 }
 _PAPER = "paper"  # with its repair
 _REPAIR_SHARE = 0.1  # of the steps of the paper's network
 _LEGEND = {
     _FOUND: "share of mirrored training frames by the mirror test, which sees no 3D label",
-    "one seed": "the default recipe with --seeds 1 --reference off",
+    "one seed": "the default recipe with --seeds 1 --mirror-repair off",
     "one seed, repaired": "the default recipe with --seeds 1",
     "default": "the default recipe: up to 3 seeds, the first that mirrors no frame",
-    "default, reference always": "the default recipe with --reference always",
+    "default, reference always": "the default recipe with --mirror-repair always",
     "fast": "--preset fast",
     "paper": "the paper's network and schedule",
-    "paper, repaired": "the same, then a tenth of its steps with --cycle 2 --reference always",
+    "paper, repaired": "the same, then a tenth of its steps with --cycle 2 --mirror-repair always",
 }
 
 
@@ -94,7 +94,7 @@ def _of_the_paper(session: Session, subject: str, dataset: Dataset) -> dict[str,
 def repaired(model: Model, dataset: Dataset, recipe: Recipe) -> Model:
     """Return a model after a tenth of its steps with the cycle loss on reference shapes."""
     steps = max(int(recipe.steps * _REPAIR_SHARE), 1)
-    recipe = dataclasses.replace(recipe, steps=steps, cycle=2.0, reference="always")
+    recipe = dataclasses.replace(recipe, steps=steps, cycle=2.0, mirror_repair="always")
     preset = Preset(model.network.architecture, model.normaliser, recipe)
     trainer = train(dataset.points, dataset.visible, preset, Setup(model.network))
     return finish(trainer, model.name, dataset.layout, dataset.source)

@@ -126,7 +126,9 @@ def _shown(errors: ShapeErrors) -> dict[str, float]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command; `--subjects` are categories here."""
-    run_program(benchmark, __doc__, (CHAIRS, FACES, *CATEGORIES), argv)
+    all_of_them = (CHAIRS, FACES, *CATEGORIES)
+    named = f"categories, of {' '.join(all_of_them)} (default: all)"
+    run_program(benchmark, __doc__, all_of_them, argv, content=("the .mat files", named))
 
 
 if __name__ == "__main__":

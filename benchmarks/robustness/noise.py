@@ -34,7 +34,7 @@ TEST_STRIDE = 5
 """Models are trained on all frames and tested on every n-th."""
 TRAINED: dict[str, dict[str, float]] = {
     "default": {},
-    "augmented by noise": {"noise": max(RATIOS.values())},
+    "augmented by noise": {"added_noise": max(RATIOS.values())},
 }
 LEGEND = {
     "noise": "||noise||_F / ||W||_F of each frame, Gaussian; the truth is without",

@@ -193,8 +193,8 @@ def curate(
     Args:
         dataset: is not changed.
         options: what to drop; None = defaults.
-        on_progress: called after each few thousand frames of both passes, of which the second
-            counts as many as the first; an exception ends the curation.
+        on_progress: called after each few thousand frames of both passes, in each of which a frame
+            counts half; an exception ends the curation.
 
     Raises:
         ValueError: an option is out of range, or no frame has enough visible keypoints.
@@ -214,7 +214,7 @@ def curate(
             candidates.points,
             candidates.visible,
             options.min_change,
-            lambda done, total: on_progress(done, 2 * total),
+            lambda done, total: on_progress(done // 2, total),
         )
         if not changed.all():
             frames = frames[changed]
@@ -228,7 +228,7 @@ def curate(
             candidates.points,
             visible,
             options.outlier_threshold,
-            lambda done, total: on_progress(count + round(count * done / total), 2 * count),
+            lambda done, total: on_progress((count + round(count * done / total)) // 2, count),
         )
     number = outliers.sum(1)
     keep = (number <= _MAX_OUTLIER_SHARE * visible.sum(1)) & (

@@ -76,8 +76,9 @@ class FieldMapping:
             object; "": there is none.
         score: of an object, in the object, or with "/" a list with one for each object; "": there
             is none.
-        keypoints: the list of keypoints of an object, or the fields of all keypoints, see above. An
-            object with an empty list is left out.
+        keypoints: the list of keypoints of an object, whose items have x, y, confidence and
+            keypoint_id; or the fields of all keypoints; "": x, y, confidence and keypoint_id are
+            lists themselves. An object with an empty list is left out.
         count: the number of keypoints in the list, in the object; the places behind them are not
             used; "": all of them.
         counts: pairs of a value of `count` and the number that it stands for; (): the number.

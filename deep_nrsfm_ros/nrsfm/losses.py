@@ -120,7 +120,7 @@ class Objective:
             mask = mask if complete else torch.cat((mask, torch.ones_like(T[:, :1]).mT))
         visible = self._observe(net, Batch(points, mask), generator)
         unit = visible.unit.expand(len(points), 1, 1)
-        if complete and not (self.recipe.noise or self.recipe.mask):
+        if complete and not (self.recipe.added_noise or self.recipe.mask):
             W = visible.W[:b]  # the target is the input
         else:
             W = centre_visible((points[:b] - visible.origin[:b]) / unit[:b], mask[:b])
@@ -188,11 +188,11 @@ class Objective:
         """
         points, mask = batch
         device = points.device
-        if self.recipe.noise:
+        if self.recipe.added_noise:
             noise = torch.randn(points.shape, generator=generator, device=device)
             level = torch.rand(len(points), generator=generator, device=device)
             size = frobenius(centre_visible(points, mask)) / frobenius(noise)
-            points = points + (self.recipe.noise * level * size)[:, None, None] * noise
+            points = points + (self.recipe.added_noise * level * size)[:, None, None] * noise
         if self.recipe.mask:
             level = self.recipe.mask * torch.rand(
                 (len(points), 1, 1), generator=generator, device=device

@@ -65,7 +65,7 @@ class Recipe:
         low=0,
         high=100,
     )
-    noise: float = option(
+    added_noise: float = option(
         0.0,
         "largest random noise added to the input while training, as a share of the object's size; "
         "0 = off, 0.05 typical",
@@ -79,14 +79,14 @@ class Recipe:
         low=0.0,
         high=0.9,
     )
-    reference: str = option(
-        "repair",
-        "when frames whose depth is mirrored are repaired while training: repair = while a test "
+    mirror_repair: str = option(
+        "if_found",
+        "when frames whose depth is mirrored are repaired while training: if_found = while a test "
         "finds such frames, always = in any case, from a fifth of the steps on, off = never. They "
         "are repaired by shapes made of similar frames, which the cycle loss takes in place of the "
         "network's own. Without effect where cycle is 0, where factorisations teach the network "
         "(few_frames), or where frames show one side only",
-        choices=("repair", "always", "off"),
+        choices=("if_found", "always", "off"),
     )
     error_scale: float = option(
         1.0,
@@ -210,7 +210,7 @@ PRESETS: dict[str, Preset] = {
     "fast": Preset(
         Architecture(),
         Normaliser(),
-        Recipe(steps=10_000, optimiser="soap", reference="always"),
+        Recipe(steps=10_000, optimiser="soap", mirror_repair="always"),
     ),
     "paper": Preset(
         Architecture(widths=PAPER_WIDTHS, whitening=0.0),

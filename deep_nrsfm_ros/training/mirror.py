@@ -213,7 +213,7 @@ class KnownShapesSource:
             factorised: what is taught from the first step to the last instead; see `few_frames`.
         """
         self.factorised = factorised
-        self.check, self.mode = check, recipe.reference
+        self.check, self.mode = check, recipe.mirror_repair
         self.interval = max(recipe.steps // 10, 1)
         self.first = max(min(recipe.screening, self.interval), 1)  # a random network has no axes
         self.reference: Tensor | None = None

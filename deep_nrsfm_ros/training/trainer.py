@@ -130,7 +130,7 @@ class Trainer:
             self.optimiser = Soap(self.weights, shapes, group)
         self.objective = Objective(normaliser, recipe, layout_loss=setup.layout_loss)
         self.gradient_function = GradientFunction(self.objective, self.net, self.batch)
-        plain = dataclasses.replace(recipe, noise=0.0, mask=0.0, cycle=1.0)
+        plain = dataclasses.replace(recipe, added_noise=0.0, mask=0.0, cycle=1.0)
         self.plain_objective = Objective(normaliser, plain, whitened=False)
         self.generator = torch.Generator(device)
         self.known: KnownShapes | None = None

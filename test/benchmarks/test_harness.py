@@ -82,7 +82,7 @@ def test_reads_the_protocols_split(session: Session) -> None:
 
 
 def test_preset_has_seed_steps_and_options(session: Session) -> None:
-    assert session.preset("paper", 7, noise=0.1).recipe == dataclasses.replace(
+    assert session.preset("paper", 7, added_noise=0.1).recipe == dataclasses.replace(
         PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1, start_share=0.0, limb_exchange=0.0
     )
     whole = dataclasses.replace(session, steps=None)

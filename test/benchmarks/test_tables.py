@@ -356,7 +356,7 @@ def test_a_variant_is_the_default_but_for_what_it_changes(
     model = ablation.trained(session, "01", dataset, name, 0)
     architecture, recipe = ablation.VARIANTS[name]
     # A repair of mirrored frames would hide what the changed part brings.
-    default = session.preset("default", 0, reference="off")
+    default = session.preset("default", 0, mirror_repair="off")
     assert model.network.architecture == dataclasses.replace(default.architecture, **architecture)
     expected = dataclasses.asdict(dataclasses.replace(default.recipe, **recipe))
     assert model.provenance["recipe"] == expected

@@ -241,4 +241,4 @@ def test_progress_counts_to_one_total() -> None:
     still = dataset(10)[np.repeat(np.arange(10), 50)]
     counts: list[tuple[int, int]] = []
     curate(still, Curation(), lambda done, total: counts.append((done, total)))
-    assert len(still) == 500 and counts == [(500, 1000), (1000, 1000)]
+    assert len(still) == 500 and counts == [(250, 500), (500, 500)]

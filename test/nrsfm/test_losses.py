@@ -145,7 +145,7 @@ def test_known_shapes_are_seen_by_the_cameras_that_are_given_for_them() -> None:
 def test_what_a_missing_point_holds_does_not_matter() -> None:
     points, visible = batch(incomplete=True)
     filled = np.where(visible[..., None], points, 123.0)
-    a, b = (losses(network(), (x, visible), Recipe(noise=0.1)) for x in (points, filled))
+    a, b = (losses(network(), (x, visible), Recipe(added_noise=0.1)) for x in (points, filled))
     # The random numbers are the same, so noise, cameras and losses must be.
     for x, y in zip(a, b, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5)
@@ -206,7 +206,7 @@ def test_the_gradient_reaches_every_weight(threshold: str, recovery: str) -> Non
         torch.from_numpy(points.astype(np.float32)),
         torch.from_numpy(visible[..., None].astype(np.float32)),
     )
-    recipe = Recipe(noise=0.1, mask=0.3)
+    recipe = Recipe(added_noise=0.1, mask=0.3)
     Objective(Normaliser(), recipe)(net, frames, None, torch.Generator()).total.backward()
     heads = {"code_head", "camera_head"} if recovery == "closed_form" else set()
     for name, weight in net.trainable_weights():
@@ -229,7 +229,7 @@ def test_noise_and_hidden_points_spoil_the_input_not_the_target(trained: Any, fi
 
     clean = reprojection()
     assert clean < 0.1
-    assert clean < reprojection(noise=0.2) < reprojection(noise=0.8)
+    assert clean < reprojection(added_noise=0.2) < reprojection(added_noise=0.8)
     assert clean < reprojection(mask=0.2) < reprojection(mask=0.8)
 
 

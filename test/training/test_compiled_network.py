@@ -156,7 +156,7 @@ def test_a_training_without_the_kernel_goes_the_same_way(
     points = rng.standard_normal((50, len(CMU31), 2)).astype(np.float32)
     visible = rng.random((50, len(CMU31))) < (0.8 if gaps else 1)
     preset = PRESETS[name]
-    recipe = dataclasses.replace(preset.recipe, batch=8, noise=0.1, mask=0.2 if gaps else 0.0)
+    recipe = dataclasses.replace(preset.recipe, batch=8, added_noise=0.1, mask=0.2 if gaps else 0.0)
 
     def trained() -> Trainer:
         trainer = Trainer(FrameStore.of(points, visible), preset._replace(recipe=recipe), 0)

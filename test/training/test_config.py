@@ -169,9 +169,9 @@ def test_a_start_brings_its_architecture(tmp_path: Path) -> None:
     path = tmp_path / "old.safetensors"
     frame = np.eye(3, dtype=np.float32)
     save_model(path, Model("old", network, layout, Normaliser("none"), frame))
-    config = parsed("--from", "old", "--output", str(tmp_path), "--noise", "0.5")
+    config = parsed("--from", "old", "--output", str(tmp_path), "--added-noise", "0.5")
     assert (config.start, config.architecture) == (str(path), architecture)
-    assert (config.normaliser.scale, config.recipe.noise) == ("none", 0.5)
+    assert (config.normaliser.scale, config.recipe.added_noise) == ("none", 0.5)
 
 
 def test_paths_become_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

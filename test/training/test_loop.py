@@ -34,7 +34,7 @@ from test.fixtures.training_options import by_dataclass
 SMALL = Preset(
     Architecture(widths=(8, 4)),
     Normaliser(),
-    Recipe(steps=12, batch=16, noise=0.1, mask=0.2, seeds=1),
+    Recipe(steps=12, batch=16, added_noise=0.1, mask=0.2, seeds=1),
 )
 SCREENED = {"steps": 40, "seeds": 3, "screening": 4}
 FRAMES = 200

@@ -98,7 +98,7 @@ def test_a_warning_gives_the_share() -> None:
 def test_a_seed_that_mirrors_nothing_has_no_rivals(
     figure: Any, monkeypatch: pytest.MonkeyPatch, shares: list[float], tried: int
 ) -> None:
-    recipe = Recipe(steps=40, batch=16, seeds=3, screening=4, reference="off")
+    recipe = Recipe(steps=40, batch=16, seeds=3, screening=4, mirror_repair="off")
     preset = Preset(Architecture(widths=(8, 4)), Normaliser(), recipe)
     measured = iter([*shares, 0.0])  # the last one is that of the end
     calls: list[float] = []
@@ -156,9 +156,9 @@ def test_a_network_that_mirrors_is_repaired(figure: Any, trained: Trainer) -> No
     assert check.share(trainer.net) < 0.02
 
 
-@pytest.mark.parametrize("reference", ["repair", "always", "off"])
-def test_who_is_taught(figure: Any, trained: Trainer, reference: str) -> None:
-    recipe = dataclasses.replace(trained.preset.recipe, reference=reference, steps=10)
+@pytest.mark.parametrize("repair", ["if_found", "always", "off"])
+def test_who_is_taught(figure: Any, trained: Trainer, repair: str) -> None:
+    recipe = dataclasses.replace(trained.preset.recipe, mirror_repair=repair, steps=10)
     start = trained.net.map(lambda w: w.detach().numpy().copy())
     check = MirrorCheck(frames_of(figure), Normaliser())
     trainer = Trainer(frames_of(figure), trained.preset._replace(recipe=recipe), 0, Setup(start))
@@ -169,7 +169,7 @@ def test_who_is_taught(figure: Any, trained: Trainer, reference: str) -> None:
         taught.append(source.reference is not None)
         trainer.step += 1
     # The network mirrors nothing, so that nothing is repaired.
-    assert taught == ([False, False, True, True] if reference == "always" else [False] * 4)
+    assert taught == ([False, False, True, True] if repair == "always" else [False] * 4)
 
 
 def test_without_a_cycle_loss_nothing_is_taught(figure: Any, trained: Trainer) -> None:

@@ -38,7 +38,7 @@ from deep_nrsfm_ros.training.request import (
 MODEL = Path("present.safetensors")
 PARTS = TrainingParameters(
     TrainingOptions(),
-    Recipe(steps=77, noise=0.25),
+    Recipe(steps=77, added_noise=0.25),
     LayoutLossWeights(bone_length_weight=1.5),
     Limits(minutes=2.5, patience=0.25, keep_best=False),
     Curation(min_visible=7, min_change=0.25),
@@ -211,7 +211,7 @@ def test_resuming_keeps_to_the_record_and_tells_what_differs(tmp_path: Path) -> 
     recorded = dataclasses.replace(
         asked.config,
         data=dataclasses.replace(asked.config.data, bags=(tmp_path / "keypoints",)),
-        recipe=Recipe(steps=30, noise=0.25),
+        recipe=Recipe(steps=30, added_noise=0.25),
         output=OutputConfig(tmp_path, "mine", 9),
         resume=False,
     )
