@@ -379,7 +379,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for finding in summary.findings:
         warn(str(finding))
     if summary.findings and not args.force:
-        warn(f"the answer is doubtful: exit code {EXIT_DOUBTFUL} (--force: 0)")
+        warn(f"something looks wrong: exit code {EXIT_DOUBTFUL} (--force: 0)")
         sys.exit(EXIT_DOUBTFUL)
 
 

@@ -27,7 +27,7 @@ from deep_nrsfm_ros.lifting.sanity import (
 from deep_nrsfm_ros.lifting.weights import keypoint_weight, trusted
 from deep_nrsfm_ros.model_files.model_file import Model
 
-_FEW_LIFTED = 0.5  # fraction of the objects below which the answer is doubtful
+_FEW_LIFTED = 0.5  # fraction of the objects below which something looks wrong
 
 
 @dataclass(frozen=True)

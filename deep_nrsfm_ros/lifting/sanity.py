@@ -32,7 +32,7 @@ POOR_RESIDUAL = 0.3
 USUAL_RESIDUAL = 0.1
 """Median reprojection error of objects below which the fit is usual."""
 LOW_CONFIDENCE = 0.3
-"""Median confidence of objects below which the answer is doubtful."""
+"""Median confidence of objects below which something looks wrong."""
 OUTSIDE = 0.05
 """Fraction of keypoints outside the image above which its size is wrong."""
 

@@ -83,7 +83,12 @@ def test_reads_the_protocols_split(session: Session) -> None:
 
 def test_preset_has_seed_steps_and_options(session: Session) -> None:
     assert session.preset("paper", 7, added_noise=0.1).recipe == dataclasses.replace(
-        PRESETS["paper"].recipe, seed=7, steps=STEPS, noise=0.1, start_share=0.0, limb_exchange=0.0
+        PRESETS["paper"].recipe,
+        seed=7,
+        steps=STEPS,
+        added_noise=0.1,
+        start_share=0.0,
+        limb_exchange=0.0,
     )
     whole = dataclasses.replace(session, steps=None)
     assert whole.preset("default", 0).recipe.steps == FROM_RANDOM
@@ -142,7 +147,7 @@ def test_goes_on_where_it_stopped(
     "change",
     [
         lambda e, p: (e, p._replace(recipe=dataclasses.replace(p.recipe, seed=4))),
-        lambda e, p: (e, p._replace(recipe=dataclasses.replace(p.recipe, noise=0.1))),
+        lambda e, p: (e, p._replace(recipe=dataclasses.replace(p.recipe, added_noise=0.1))),
         lambda e, p: (
             e,
             p._replace(architecture=dataclasses.replace(p.architecture, widths=(9, 4))),
