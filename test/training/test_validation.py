@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from deep_nrsfm_ros.nrsfm.network import Architecture, initialise
 from deep_nrsfm_ros.nrsfm.normalisation import Normaliser
 from deep_nrsfm_ros.training.config import COMMAND_LINE, PARAMETERS, TrainingConfig
 from deep_nrsfm_ros.training.validation import validate
+from deep_nrsfm_ros.wording import in_node
 
 
 def save(path: Path, layout: KeypointLayout) -> Path:
@@ -105,7 +107,8 @@ def test_the_caller_reads_the_name_that_it_has_set(
     config: TrainingConfig, changes: dict[str, Any], on_command_line: str, as_parameter: str
 ) -> None:
     for names, complaint in ((COMMAND_LINE, on_command_line), (PARAMETERS, as_parameter)):
-        with pytest.raises(ValueError, match=complaint):
+        caller = in_node() if names is PARAMETERS else nullcontext()
+        with caller, pytest.raises(ValueError, match=complaint):
             validate(config.with_options(changes), names)
 
 
