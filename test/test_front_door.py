@@ -233,6 +233,38 @@ def test_a_model_of_people_is_judged_beside_the_one_at_hand(human: Model) -> Non
     assert {"image_error", "bone_variation"} <= judgement["figures"].keys()
 
 
+def test_a_model_knows_the_frames_of_its_training_again() -> None:
+    points, _ = in_layout(HUMAN25, 600)
+    quick = Recipe(steps=1, batch=4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        first = train(points, layout=HUMAN25, name="first", recipe=quick, held_out=0)
+        again = train(1.5 * points, layout=HUMAN25, start=first, recipe=quick)
+        held_out = train(points, layout=HUMAN25, name="first", recipe=quick)
+        later = train(points, layout=HUMAN25, start=held_out, recipe=quick)
+    said = again.provenance["judgement"]
+    assert said["rival"] == "first" and said["rival_has_learned_the_frames"]
+    assert "Model 'first' was trained on these frames" in said["reason"]
+    assert "rival_has_learned_the_frames" not in later.provenance["judgement"]
+    with pytest.raises(ValueError, match="held_out is 0.6; it must be at least 0 and at most 0.5"):
+        train(points, layout=HUMAN25, held_out=0.6)
+
+
+def test_frames_are_held_out_of_an_object_without_a_model() -> None:
+    points, _ = in_layout(HUMAN25, 600)
+    names = [f"k{i}" for i in range(25)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        recipe = Recipe(steps=30, batch=16, seeds=1)
+        model = train(points, layout=names, recipe=recipe)
+        few = train(points[:400], layout=names, recipe=recipe)
+    said = model.provenance["judgement"]
+    assert said["verdict"] == "alone" and "held-out frames, later ones" in said["reason"]
+    assert said["figures"]["image_error"] > 0 and said["figures"]["learned_image_error"] > 0
+    assert "as none were held out" in few.provenance["judgement"]["reason"]
+    assert "learned_image_error" not in few.provenance["judgement"]["figures"]
+
+
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [

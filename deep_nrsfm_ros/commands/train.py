@@ -45,6 +45,7 @@ from deep_nrsfm_ros.training.limits import Limits
 from deep_nrsfm_ros.training.reporter import CancelledError, Reporter, SilentReporter
 from deep_nrsfm_ros.training.resume import resume_arguments
 from deep_nrsfm_ros.training.run import TrainingResult, run
+from deep_nrsfm_ros.training.verdicts import UNKNOWN
 from deep_nrsfm_ros.wording import in_node
 
 if TYPE_CHECKING:  # it imports torch
@@ -260,6 +261,8 @@ def _next_steps(layout: KeypointLayout, path: Path, judgement: Judgement | None)
         use = "not in use, but you can look at what it lifts"
     elif judgement and judgement.is_first_look:
         use = "too few steps for use, but you can look at what it lifts"
+    elif judgement and judgement.verdict == UNKNOWN:
+        use = "whether it is better is unknown; to use it"
     elif judgement and judgement.fits_badly:
         use = "it fits badly; look at what it lifts"
     other = not knows(layout, HUMAN25)

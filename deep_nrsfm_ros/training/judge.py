@@ -482,7 +482,7 @@ def _on(basis: Comparable, name: str) -> str:
     count = len(basis.frames.held_out)
     if basis.frames.held_out is basis.frames.training:
         return f"on the {count} frames of its training, as none were held out"
-    text = f"on {count} held-out frames, later ones that it was not trained on"
+    text = f"on {count} held-out frames, later ones that the new model was not trained on"
     if basis.left_out:
         text += f" (not on {basis.left_out} others, which model {name!r} was trained on)"
     if not basis.has_advantage or not name:

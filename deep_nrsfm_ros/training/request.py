@@ -98,7 +98,8 @@ class TrainingOptions:
     activate: str = option(
         "if_better",
         "whether to switch to the new model when the training has finished: if_better = if its "
-        "figures without labels are not worse than those of the present one, it is of the object "
+        "figures without labels are not worse than those of the present one (nor `unknown`, since "
+        "that was trained on the frames of the comparison), it is of the object "
         "that the lifter lifts, and its depth cannot be mirrored as a whole; always; never",
         choices=("if_better", "always", "never"),
     )

@@ -630,6 +630,7 @@ def test_a_first_look_is_not_offered_for_use(tmp_path: Path) -> None:
     for judgement, use in (
         (alone, "use it: lift FILE"),
         (alone._replace(is_first_look=True), "too few steps for use, but you can look at what it"),
+        (alone._replace(verdict="unknown"), "whether it is better is unknown; to use it: lift"),
         (alone._replace(fits_badly=True), "it fits badly; look at what it lifts: lift FILE"),
         (alone._replace(reason="worse"), "not in use, but you can look at what it lifts: lift"),
     ):

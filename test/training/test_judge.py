@@ -109,7 +109,9 @@ def test_a_model_as_good_is_not_doubted_nor_is_one_that_replaces_a_bad_one(
         assert judgement.record()["verdict"] == judgement.verdict == verdict
         than = "as good as" if rival is good else "better than"
         assert str(judgement).startswith(f"the new model is {than} model {rival.name!r}")
-        assert "on 60 held-out frames, later ones that it was not trained on" in str(judgement)
+        assert "on 60 held-out frames, later ones that the new model was not trained on" in str(
+            judgement
+        )
         assert f"({rival.name}: " in str(judgement) and len(str(judgement)) < 520
         assert not judgement.record()["doubtful"]
 
