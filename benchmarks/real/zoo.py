@@ -54,7 +54,7 @@ COLUMNS = {
     "frame: what is to be had without deformation and without truth",
     "true mean PA %": "PA of the mean of the test's true shapes: low where an object hardly "
     "deforms, but nobody who sees images alone has it",
-    "reprojection %": "what one pass of the network leaves of the image; the only figure without "
+    "image error %": "what one pass of the network leaves of the image; the only figure without "
     "truth",
 }
 _REFLECTIONS = [1, 1, 1], [1, 1, -1]
@@ -190,7 +190,7 @@ def trained(thing: Object, name: str, path: Path, steps: int) -> tuple[Model, fl
 
 def figures(thing: Object, S: Floats, residual: Floats) -> dict[str, float]:
     """Return the errors of shapes S (f, p, 3) of the test, as far as there is truth."""
-    shown = {"reprojection %": 100 * float(np.nanmean(residual))}
+    shown = {"image error %": 100 * float(np.nanmean(residual))}
     truth = thing.test.shapes
     if truth is None:
         return shown

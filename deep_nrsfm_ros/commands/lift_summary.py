@@ -39,7 +39,7 @@ class Summary:
         total: number of objects; padding of arrays is none.
         frames: number of frames.
         left_out: number of objects that were not lifted, by reason.
-        residual: median reprojection error of the lifted objects; NaN if there is none.
+        residual: median residual of the lifted objects; NaN if there is none.
         confidence: median confidence of the lifted objects; NaN if there is none.
         wrong_keypoints: which keypoints were left out as wrong, and of how many objects; "" if it
             is less than 1 %.

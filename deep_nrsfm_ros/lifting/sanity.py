@@ -28,9 +28,9 @@ Size = tuple[int, int]
 """Width and height of an image in pixels."""
 
 POOR_RESIDUAL = 0.3
-"""Median reprojection error of objects from which on the fit is poor."""
+"""Median residual of objects from which on the fit is poor."""
 USUAL_RESIDUAL = 0.1
-"""Median reprojection error of objects below which the fit is usual."""
+"""Median residual of objects below which the fit is usual."""
 LOW_CONFIDENCE = 0.3
 """Median confidence of objects below which something looks wrong."""
 OUTSIDE = 0.05
@@ -276,7 +276,7 @@ def quality(residual: Floats, confidence: Floats, image_size: Size | None = None
     """Return whether the lifted objects fit their keypoints poorly or have low confidence.
 
     Args:
-        residual: (n,) reprojection errors; NaN where not lifted.
+        residual: (n,) as in `Lifted`; NaN where not lifted.
         confidence: (n,) of the objects.
         image_size: with which they were lifted; None: without.
     """

@@ -180,7 +180,7 @@ class StreamCheck:
             pipeline: with which they were lifted.
             size: of the image in pixels; None: that of the pipeline.
             intrinsics: of the camera; None: not used.
-            residual: median reprojection error of the last second; NaN if nothing was lifted.
+            residual: median residual of the last second; NaN if nothing was lifted.
         """
         if not self._recent:
             return []

@@ -18,7 +18,7 @@ OK, WARN, ERROR = range(3)
 _MAX_SILENCE = 3.0  # seconds without a message
 _PROBLEM_TIME = 60.0  # seconds for which a problem is shown
 _PROBLEM_OVER = 2.0  # seconds after which its age is shown too
-_MAX_RESIDUAL = 0.3  # median reprojection error
+_MAX_RESIDUAL = 0.3  # median residual
 _MIN_CONFIDENCE = 0.3  # median confidence of objects
 
 
@@ -42,7 +42,7 @@ class LifterDiagnostics:
     ERROR: messages were received and none could be lifted; or a publisher cannot be received and no
         other message was lifted.
     WARN: some messages were rejected; no message for 3 s; more messages were dropped than received;
-        the median reprojection error is above 0.3; the median confidence is below 0.3; or
+        the median residual is above 0.3; the median confidence is below 0.3; or
         something is wrong with the frame of the points.
     OK: otherwise.
 
@@ -88,7 +88,7 @@ class LifterDiagnostics:
 
     @property
     def residual(self) -> float:
-        """The median reprojection error of objects since the last report; NaN if none."""
+        """The median residual of objects since the last report; NaN if none."""
         return self._medians()[0]
 
     def lifted(
@@ -98,7 +98,7 @@ class LifterDiagnostics:
 
         Args:
             seconds: processing time.
-            residual: (n,) reprojection error of its objects, NaN if not lifted.
+            residual: (n,) residuals of its objects, NaN if not lifted.
             confidence: (n, p) of their keypoints.
         """
         self._last_input = self._clock()
@@ -147,7 +147,7 @@ class LifterDiagnostics:
             "rate [Hz]": f"{rate:.1f}",
             "processing time p50 [ms]": f"{np.median(seconds) * 1e3:.3f}",
             "processing time max [ms]": f"{seconds.max() * 1e3:.3f}",
-            "reprojection error": f"{residual:.4f}",
+            "residual": f"{residual:.4f}",
             "confidence": f"{confidence:.2f}",
             "messages lifted": str(self.total_lifted),
             "messages without objects": str(self.total_empty),
@@ -170,7 +170,7 @@ class LifterDiagnostics:
         return self.last_problem + (f" ({age:.0f} s ago)" if age >= _PROBLEM_OVER else "")
 
     def _medians(self) -> tuple[float, float]:
-        """Return median reprojection error and confidence of the lifted objects, NaN if none."""
+        """Return median residual and confidence of the lifted objects, NaN if none."""
         if not self._residuals:
             return np.nan, np.nan
         residual = np.concatenate(self._residuals)
@@ -200,7 +200,7 @@ class LifterDiagnostics:
             )
         problems = [self.frame_problem] if self.frame_problem else []
         if residual > _MAX_RESIDUAL:
-            problems.insert(0, f"poor fit: median reprojection error {residual:.2f}")
+            problems.insert(0, f"poor fit: median residual {residual:.2f}")
         elif confidence < _MIN_CONFIDENCE:
             problems.insert(0, f"low confidence: median {confidence:.2f}")
         if problems:

@@ -717,7 +717,7 @@ class LifterNode(Node):
 
         Args:
             level: of the diagnostics.
-            residual: median reprojection error of the last second; NaN if nothing was lifted.
+            residual: median residual of the last second; NaN if nothing was lifted.
             idle: there was no message in the last second.
         """
         if idle:

@@ -39,7 +39,7 @@ def test_lifting_is_ok_and_measured(health: LifterDiagnostics, clock: Clock) -> 
     assert values["rate [Hz]"] == "1.5"
     assert values["processing time p50 [ms]"] == "2.000"
     assert values["processing time max [ms]"] == "9.000"
-    assert values["reprojection error"] == "0.0500"
+    assert values["residual"] == "0.0500"
     assert values["confidence"] == "0.80"
     assert values["messages lifted"] == "3"
 
@@ -113,7 +113,7 @@ def test_points_without_a_frame_are_a_warning_beside_others(health: LifterDiagno
     assert "no frame_id" not in health.report().message
     health.lifted(0.001, POOR, SURE)
     health.frame_problem = "no frame_id"
-    assert health.report().message == "poor fit: median reprojection error 0.60; no frame_id"
+    assert health.report().message == "poor fit: median residual 0.60; no frame_id"
 
 
 def test_a_model_of_fewer_keypoints_may_take_over_between_two_reports(
@@ -127,7 +127,7 @@ def test_a_model_of_fewer_keypoints_may_take_over_between_two_reports(
 def test_objects_that_could_not_be_lifted_do_not_spoil_the_error(health: LifterDiagnostics) -> None:
     health.lifted(0.001, np.array([np.nan, 0.1], np.float32), SURE)
     values = health.report().values
-    assert (values["reprojection error"], values["confidence"]) == ("0.1000", "0.80")
+    assert (values["residual"], values["confidence"]) == ("0.1000", "0.80")
     health.lifted(0.001, np.array([np.nan], np.float32), SURE[:1])
     assert health.report().level == OK
 

@@ -97,7 +97,7 @@ class Played(NamedTuple):
         latencies: from publishing keypoints to receiving points, of the messages lifted, seconds;
             negative where two clocks were compared.
         rate: points received per second, Hz.
-        error: median of the reprojection errors in the diagnostics.
+        error: median of the residuals in the diagnostics.
     """
 
     stamps: list[int]
@@ -299,7 +299,7 @@ class Client:
         for status in message.status:
             if status.name == "/lifter: lifting":
                 self.health = {pair.key: pair.value for pair in status.values}
-                self._errors.append(float(self.health["reprojection error"]))
+                self._errors.append(float(self.health["residual"]))
 
     def _take_training(self, message: DiagnosticStatus, _: Info) -> None:
         """Keep the latest training status."""

@@ -43,7 +43,7 @@ def test_right_shapes_have_no_error_and_a_reflection_of_all_is_forgiven(fly: Pat
         shown = zoo.figures(thing, thing.test.shapes * mirror, residual)
         assert shown["PA %"] == pytest.approx(0, abs=1e-3)
         assert shown["mirrored %"] == 0
-        assert shown["reprojection %"] == pytest.approx(10)
+        assert shown["image error %"] == pytest.approx(10)
         assert shown["rigid PA %"] > 30 and shown["true mean PA %"] > 30
 
 
@@ -65,7 +65,7 @@ def test_photographs_have_no_truth_and_few_points_are_left_out(tmp_path: Path) -
     np.savez(tmp_path / "birds_cub" / "birds_cub.npz", points=points)
     thing = zoo.birds(tmp_path)
     assert len(thing.training) == 26 and len(thing.test) == 3
-    assert set(zoo.figures(thing, np.zeros((3, 15, 3)), np.ones(3))) == {"reprojection %"}
+    assert set(zoo.figures(thing, np.zeros((3, 15, 3)), np.ones(3))) == {"image error %"}
 
 
 @pytest.mark.parametrize("name", ["mouse22", "fly12", "chair10", "bird15", "car20"])
