@@ -441,7 +441,7 @@ def test_three_dimensions_are_refused(tmp_path: Path) -> None:
     more = np.concatenate([values, np.ones_like(values)], -1)
     more[..., 2] = 0
     text = wide(["fnum"], [(i,) for i in range(5)], names, more)
-    assert "it is 3D" in complaint(tmp_path / "a.csv", text)
+    assert "it is 3D (nose has z, error and ncams)" in complaint(tmp_path / "a.csv", text)
     lines = [
         (i, part, *xyz)
         for i, person in enumerate(values.tolist())

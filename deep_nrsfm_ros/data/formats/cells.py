@@ -51,7 +51,7 @@ class Numbers:
             line: of the row in the file.
         """
         try:
-            values = [float(cell) for cell in cells]
+            values = list(map(float, cells))
             self.read += len(cells)
         except ValueError:
             values = [self.one(cell, line) for cell in cells]

@@ -374,7 +374,7 @@ def _of_individuals(parts: list[Part], names: Sequence[str]) -> list[Part]:
         dotted = re.fullmatch(r"([^.]+)\.(.+)", part.name)
         is_track = dotted and any(f"{dotted[1]}.{c}" in names for c in ("track", "score"))
         numbered = re.fullmatch(r"([A-Za-z]+)[_ ]?(\d+)[_. :-](.+)", part.name)
-        known = {"id", "ind", "individual"}.union(*_TRACKS)
+        known = {"id", "ind", "p"}.union(*_TRACKS)
         if dotted and is_track:
             splits.append((dotted[1], dotted[2]))
         elif numbered and numbered[1].lower() in known:

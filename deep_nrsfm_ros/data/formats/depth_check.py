@@ -15,6 +15,7 @@ _FLAT = 1e-6  # of a coordinate: a z that varies by less is none
 _NEAR = 0.1  # of the range of z, within which it is about 0
 _INSIDE = 0.02  # of a range, by which 0 lies inside
 _NEARLY_ALL = 0.9  # of the objects
+_SHOWN = 2  # values that a message names
 _HAND = 21  # landmarks of MediaPipe's hand, all before the wrist, whose z is 0
 
 
@@ -66,16 +67,12 @@ class DepthCheck:
         is_relative = (is_near if self._is_lenient else is_inside)[:, 2].mean() >= _NEARLY_ALL
         is_centred = is_inside[:, :2].all(1).mean() >= _NEARLY_ALL
         if is_centred or not is_relative:
-            raise KeypointFileError(three_d(self._names[0], z[:, 0]))
+            name, values = self._names[0], z[:, 0]
+            shown = [f"{value:g}" for value in values[np.isfinite(values)][:_SHOWN]]
+            example = f": z of {name} is {', '.join([*shown, '...'])}" if shown else ""
+            raise KeypointFileError(three_d(f"z changes{example}"))
 
 
-def three_d(name: str, values: NDArray[np.float64] | None = None) -> str:
-    """Return the sentence that a table is 3D.
-
-    Args:
-        name: of a keypoint.
-        values: its z; None = it is not that which tells it.
-    """
-    shown = [] if values is None else [f"{v:g}" for v in values[np.isfinite(values)][:2]]
-    example = f": z of {name} is {', '.join([*shown, '...'])}" if shown else ""
-    return f"it is 3D (z changes{example}): lift needs the 2D keypoints that they come from"
+def three_d(sign: str) -> str:
+    """Return the sentence that a table is 3D, by a sign of it."""
+    return f"it is 3D ({sign}): lift needs the 2D keypoints that they come from"

@@ -54,7 +54,7 @@ def read_h5(path: Path, builder: DetectionsBuilder) -> None:
                 columns, index, values = _pandas_table(group)
             else:
                 columns, index, values = _pandas_fixed(group)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # h5py raises the second for damaged groups
         raise KeypointFileError(f"damaged or no HDF5: {error}") from None
     except (KeyError, pickle.UnpicklingError, AttributeError) as error:
         raise KeypointFileError(f"no table as DeepLabCut writes it: {error}") from None

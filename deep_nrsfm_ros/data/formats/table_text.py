@@ -41,7 +41,8 @@ def table_rows(path: Path, comments: list[str]) -> Iterator[Iterator[Row]]:
             counted = max(",;\t|", key=line.count)
             delimiter = counted if counted in line else " "
         lines = [line]
-        if comments and _is_all_numbers(line, delimiter):  # np.savetxt writes # before the header
+        # np.savetxt writes # before the header.
+        if comments and _follows(comments[-1], line, delimiter):
             lines.insert(0, comments.pop() + "\n")
             skipped -= 1
         yield _cells(chain(lines, file), delimiter, skipped)
@@ -84,9 +85,11 @@ def _header(file: IO[str], comments: list[str]) -> tuple[str, int, str]:
     raise KeypointFileError("the file is empty")
 
 
-def _is_all_numbers(line: str, delimiter: str) -> bool:
-    """Return whether all cells of a line are numbers."""
-    return all(is_number(cell) for cell in (line.split(delimiter) if delimiter else [line]))
+def _follows(head: str, line: str, delimiter: str) -> bool:
+    """Return whether a line has as many cells as a header, and mostly numbers."""
+    names, cells = head.split(delimiter), line.split(delimiter)
+    numbers = sum(is_number(cell) for cell in cells)
+    return len(names) == len(cells) > 1 and 2 * numbers > len(cells)
 
 
 def is_number(cell: str) -> bool:

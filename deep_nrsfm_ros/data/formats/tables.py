@@ -70,7 +70,7 @@ def read_csv(path: Path, builder: DetectionsBuilder) -> None:
         if {"x", "y"} <= plain and sum(part.is_complete for part in find_parts(head)) < _WIDE:
             columns = find_columns(head, (), has_points=True)
             is_id = columns.keypoint is not None and words(head[columns.keypoint]) == ["id"]
-            if columns.keypoint is not None and not (is_id and columns.confidence is None):
+            if columns.keypoint is not None and (columns.z is not None or not is_id):
                 _landmark_rows(head, columns, body, builder)
                 return
         _coordinate_columns(head, body, builder)
@@ -321,7 +321,7 @@ def _finish_checks(checks: Sequence[DepthCheck | None]) -> None:
 
 
 def _used(things: Sequence[Thing]) -> list[int]:
-    """Return the columns that hold numbers of keypoints, in their order."""
+    """Return the columns that hold numbers of keypoints, in ascending order."""
     columns = [
         np.concatenate(
             [t.xy.ravel(), t.confidence, t.depth if t.depth is not None else t.confidence]
@@ -337,7 +337,11 @@ def _values(
     """Return the numbers (width,) in the used cells of a row, NaN elsewhere."""
     values = np.full(width, np.nan)
     count = len(row)
-    values[used] = numbers.row([row[i] if i < count else "" for i in used], line)
+    if count > used[-1]:
+        cells = [row[i] for i in used]
+    else:
+        cells = [row[i] if i < count else "" for i in used]
+    values[used] = numbers.row(cells, line)
     return values
 
 
@@ -555,7 +559,7 @@ def _refuse_3d(head: Sequence[str], parts: Sequence[Part]) -> None:
     endings = {words(cell)[-1] for cell in head if words(cell)}
     for part in parts:
         if part.is_complete and "z" in part.at and endings >= _OF_3D:
-            raise KeypointFileError(three_d(part.name))
+            raise KeypointFileError(three_d(f"{part.name} has z, error and ncams"))
 
 
 def _find_units(head: Sequence[str], things: Sequence[Thing], builder: DetectionsBuilder) -> None:
