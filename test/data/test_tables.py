@@ -368,6 +368,11 @@ def test_a_third_column_of_each_keypoint_may_be_its_confidence(tmp_path: Path) -
     found = read(tmp_path / "a.csv", wide([], [()] * 5, ("x", "y", "quality")))
     (finding,) = found.findings
     assert "column 'quality' of each keypoint" in finding.message
+    columns = [(scorer, part, c.replace("likelihood", "sureness")) for scorer, part, c in COLUMNS]
+    text = deeplabcut(columns, VALUES.reshape(5, -1), ("scorer", "bodyparts", "coords"))
+    (finding,) = read(tmp_path / "a.csv", text).findings
+    assert "column 'sureness' of each keypoint" in finding.message
+    assert "call it 'likelihood'" in finding.message
     for name in ("p", "prob", "vis", "visible", "certainty", "kp_score"):
         found = read(tmp_path / "a.csv", wide([], [()] * 5, ("x", "y", name)))
         assert_mouse(found)
@@ -376,7 +381,9 @@ def test_a_third_column_of_each_keypoint_may_be_its_confidence(tmp_path: Path) -
 
 def test_rows_without_a_frame_of_several_animals(tmp_path: Path) -> None:
     found = read(tmp_path / "a.csv", wide(["track"], [("ab"[i % 2],) for i in range(5)]))
-    assert "add a column 'frame'" in found.findings[0].message
+    assert "and 2 identities (track): add a column 'frame'" in found.findings[0].message
+    found = read(tmp_path / "a.csv", wide(["track"], [("ab"[i // 3],) for i in range(5)]))
+    assert not codes(found)
     found = read(tmp_path / "a.csv", wide([""], [(i,) for i in range(5)]))
     assert not codes(found)
     found = read(tmp_path / "a.csv", wide([""], [(3 * i,) for i in range(5)]))

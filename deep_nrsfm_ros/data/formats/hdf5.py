@@ -17,8 +17,13 @@ from deep_nrsfm_ros.data.formats.builder import (
     KeypointFileError,
     as_identity,
 )
+from deep_nrsfm_ros.data.formats.individuals import (
+    Column,
+    add_individuals,
+    find_individuals,
+    parts_of,
+)
 from deep_nrsfm_ros.data.formats.table_frames import RowFrames
-from deep_nrsfm_ros.data.formats.tables import Column, add_things, find_things, parts_of
 from deep_nrsfm_ros.extras import require_extra
 
 _PROJECT = (
@@ -63,8 +68,8 @@ def read_h5(path: Path, builder: DetectionsBuilder) -> None:
         (frames.of(number + 1, number, key, ()), row)
         for number, (key, row) in enumerate(zip(index, values, strict=False))
     )
-    things = find_things(parts_of([_column(c) for c in columns]), builder)
-    add_things(things, ((at, row) for at, row in table if at >= 0), builder)
+    individuals = find_individuals(parts_of([_column(c) for c in columns], builder), builder)
+    add_individuals(individuals, ((at, row) for at, row in table if at >= 0), builder)
     frames.finish()
 
 
