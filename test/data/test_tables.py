@@ -402,7 +402,7 @@ def test_several_videos_are_said(tmp_path: Path) -> None:
         ),
     )
     found = read(tmp_path / "a.csv", text)
-    assert "2 videos (a, b)" in found.findings[0].message
+    assert "2 videos or cameras (a, b)" in found.findings[0].message
     cells = [("ab"[i // 3] + ".mp4", i) for i in range(5)]
     for name in ("video", "video_path", "file"):
         found = read(tmp_path / "a.csv", wide([name, "frame"], cells))
@@ -466,6 +466,11 @@ def test_tables_of_several_cameras_and_without_names(tmp_path: Path) -> None:
     head = [f"pt{i}_cam{j}_{c}" for i in range(2) for j in (1, 2) for c in "XY"]
     assert "several cameras (cam1, cam2)" in complaint(tmp_path / "a.csv", rows(head, *lines))
     assert "no names of columns but numbers" in complaint(tmp_path / "a.csv", rows(*lines))
+    text = 'nose,tail\n"(1, 2)","(3, 4)"\n'
+    assert "several numbers, such as '(3, 4)'" in complaint(tmp_path / "a.csv", text)
+    cells = [(i // 2, f"cam{i % 2}") for i in range(10)]
+    found = read(tmp_path / "a.csv", wide(["frame", "camera"], cells, values=TWO))
+    assert "2 videos or cameras (cam0, cam1)" in found.findings[0].message
 
 
 def test_cells_with_a_unit_are_said(tmp_path: Path) -> None:

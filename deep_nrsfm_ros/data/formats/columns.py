@@ -28,7 +28,7 @@ _TRACKS = (
         *("participant", "pid", "tid", "skeleton", "mouse", "rat"),
     },
     {"body", "object", "obj", "target"},
-    {"pose", "instance", "inst"},
+    {"pose", "instance", "inst", "detection", "det"},
 )
 """Words of an identity, the surer ones first."""
 _POINTS = {
@@ -75,7 +75,7 @@ _OF_TIME = {
     ),
     *("from", "the"),
 }
-_VIDEO = {"video", "videos", "clip", "movie"}
+_VIDEO = {"video", "videos", "clip", "movie", "camera", "cam", "view"}
 _OF_VIDEO = {*_NUMBERED, "file", "path", "filename"}
 _GLUED = ("frame", "image", "img", "track", "person", "landmark", "keypoint", "joint", "body")
 _USUAL = {

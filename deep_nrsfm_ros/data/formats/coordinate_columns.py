@@ -28,6 +28,7 @@ from deep_nrsfm_ros.data.formats.table_frames import RowFrames
 from deep_nrsfm_ros.data.formats.table_text import Row, is_number
 
 _SAMPLE = 500  # rows that tell what a column holds
+_LONGEST = 40  # characters of a cell that a message shows
 _OF_3D = {"error", "ncams"}  # columns of a keypoint that Anipose triangulates
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 
@@ -37,8 +38,15 @@ def read_coordinate_columns(
 ) -> None:
     """Read a table with a row for each object and a column for each coordinate: nose_x, ..."""
     parts = _of_one_camera(find_parts(head))
+    sample = list(islice(rows, _SAMPLE))
     if not any(part.is_complete for part in parts):
         shown = ", ".join(head[:6])
+        cells = [cell.strip() for _, row in sample[:1] for cell in row]
+        if lists := [cell for cell in cells if cell[:1] in ("(", "[", "{")]:
+            raise KeypointFileError(
+                f"its cells hold several numbers, such as {lists[-1][:_LONGEST]!r}: write a column "
+                "for each coordinate (nose_x, nose_y, ...), or JSON"
+            )
         if sum(is_number(cell) for cell in head) > len(head) / 2:
             raise KeypointFileError(
                 f"its first line has no names of columns but numbers ({shown}): write a line such "
@@ -46,7 +54,6 @@ def read_coordinate_columns(
             )
         raise KeypointFileError(f"it is {EXPECTED}; its columns are {shown}")
     taken = {i for part in parts if {"x", "y"} & set(part.at) for i in part.at.values()}
-    sample = list(islice(rows, _SAMPLE))
     columns = _without_videos(head, taken, sample)
     columns = _without_row_numbers(head, columns, sample)
     _refuse_3d(head, parts)

@@ -184,6 +184,7 @@ def _column(levels: Any) -> Column:
     texts = [str(level) for level in levels] if isinstance(levels, (tuple, list)) else []
     if len(texts) not in (3, 4):
         raise KeypointFileError(
-            f"its columns are {levels!r:.60}, not scorer, bodypart and coordinate of DeepLabCut"
+            f"its columns are {levels!r:.60}, not scorer, bodypart and coordinate of DeepLabCut; "
+            "columns such as nose_x are read from a .csv (DataFrame.to_csv)"
         )
     return (texts[1] if len(texts) == 4 else "", texts[-2], texts[-1])

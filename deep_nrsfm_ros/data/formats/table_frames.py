@@ -72,7 +72,7 @@ class RowFrames:
         return index
 
     def video(self, name: str) -> None:
-        """Remember that a row is of a video, or of a folder of images."""
+        """Remember that a row is of a video or camera, or of a folder of images."""
         if name and len(self._videos) < _MOST:
             self._videos[name] = None
 
@@ -84,8 +84,8 @@ class RowFrames:
             self._builder.find(
                 Finding(
                     "videos",
-                    f"its frames are of {len(self._videos)} videos ({names}{more}), and count as "
-                    "one recording: write a file for each",
+                    f"its frames are of {len(self._videos)} videos or cameras ({names}{more}), and "
+                    "count as one recording: write a file for each",
                 )
             )
         untimed = self._is_timed.count(0)
