@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,26 +14,38 @@ _OBJECTS = 500  # that are looked at
 _FLAT = 1e-6  # of a coordinate: a z that varies by less is none
 _NEAR = 0.1  # of the range of z, within which it is about 0
 _INSIDE = 0.02  # of a range, by which 0 lies inside
+_VISIBILITY = {"visibility", "presence", "v", "vis"}
 _NEARLY_ALL = 0.9  # of the objects
 _SHOWN = 2  # values that a message names
 _HAND = 21  # landmarks of MediaPipe's hand, all before the wrist, whose z is 0
 
 
+def is_visibility(names: Collection[str]) -> bool:
+    """Return whether names of columns have one that MediaPipe gives a confidence."""
+    return not _VISIBILITY.isdisjoint(names)
+
+
 class DepthCheck:
     """Looks at x, y and z of a table's first objects.
 
-    MediaPipe's z is relative: 0 at the hips or the wrist, while x and y are places in the image.
+    MediaPipe's z is relative: 0 at the hips or the wrist, negative before them, while x and y are
+    places in the image.
     """
 
-    def __init__(self, names: Sequence[str], *, has_confidence: bool) -> None:
+    def __init__(
+        self, names: Sequence[str], *, has_confidence: bool, has_visibility: bool = False
+    ) -> None:
         """Start without objects.
 
         Args:
             names: of the q keypoints that have a z.
-            has_confidence: they have a confidence, as MediaPipe's visibility is.
+            has_confidence: they have a confidence of any name.
+            has_visibility: it has the name that MediaPipe gives it, so that some of its landmarks
+                may have been left out, such as the hips.
         """
         self._names = names
         self._is_lenient = has_confidence or len(names) == _HAND
+        self._may_be_before = has_visibility
         self._objects: list[NDArray[np.float64]] = []
 
     def add(self, xyz: NDArray[np.float64]) -> None:
@@ -64,6 +76,8 @@ class DepthCheck:
         span = high - low
         is_inside = (low <= -_INSIDE * span) & (high >= _INSIDE * span) & (span > 0)
         is_near = (low <= _NEAR * span) & (high >= -_NEAR * span)
+        if self._may_be_before:
+            is_near |= high < 0
         is_relative = (is_near if self._is_lenient else is_inside)[:, 2].mean() >= _NEARLY_ALL
         is_centred = is_inside[:, :2].all(1).mean() >= _NEARLY_ALL
         if is_centred or not is_relative:

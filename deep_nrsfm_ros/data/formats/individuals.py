@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from deep_nrsfm_ros.data.formats.builder import DetectionsBuilder, KeypointFileError, as_identity
 from deep_nrsfm_ros.data.formats.cells import Numbers
 from deep_nrsfm_ros.data.formats.columns import CONFIDENCE, COORDINATES, Part
-from deep_nrsfm_ros.data.formats.depth_check import DepthCheck
+from deep_nrsfm_ros.data.formats.depth_check import DepthCheck, is_visibility
 from deep_nrsfm_ros.lifting.sanity import Finding
 
 EXPECTED = (
@@ -58,6 +58,7 @@ class Individual:
         confidence: columns (q,) of the confidence, -1 for none.
         depth: columns (q,) of z; None where a keypoint has none.
         keypoints: names of the q keypoints.
+        has_visibility: the confidence has the name that MediaPipe gives it.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Individual:
     confidence: NDArray[np.int64]
     depth: NDArray[np.int64] | None
     keypoints: Sequence[str]
+    has_visibility: bool = False
 
     def values(self, row: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return x, y and confidence (q, 3) in the values of a row.
@@ -125,7 +127,8 @@ def find_individuals(
         has_depth = all("z" in at for at in complete.values())
         depth = np.array([at["z"] for at in complete.values()]) if has_depth else None
         confidence = _confidence_columns(complete)
-        individuals.append(Individual(who, kind, xy, confidence, depth, list(complete)))
+        is_visible = all(is_visibility(at) for at in complete.values())
+        individuals.append(Individual(who, kind, xy, confidence, depth, list(complete), is_visible))
     if not individuals:
         raise KeypointFileError(f"no keypoint has columns x and y; it is {EXPECTED}")
     return individuals
@@ -167,7 +170,11 @@ def depth_checks(individuals: Sequence[Individual]) -> list[DepthCheck | None]:
     checks: list[DepthCheck | None] = []
     for individual in individuals:
         is_sure = bool((individual.confidence >= 0).all())
-        check = DepthCheck(individual.keypoints, has_confidence=is_sure)
+        check = DepthCheck(
+            individual.keypoints,
+            has_confidence=is_sure,
+            has_visibility=individual.has_visibility,
+        )
         checks.append(None if individual.depth is None else check)
     return checks
 

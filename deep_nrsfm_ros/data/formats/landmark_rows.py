@@ -11,8 +11,8 @@ import numpy as np
 from deep_nrsfm_ros.data.formats.builder import DetectionsBuilder, KeypointFileError, as_identity
 from deep_nrsfm_ros.data.formats.cells import Numbers, is_missing
 from deep_nrsfm_ros.data.formats.column_findings import say_unused
-from deep_nrsfm_ros.data.formats.columns import Columns
-from deep_nrsfm_ros.data.formats.depth_check import DepthCheck
+from deep_nrsfm_ros.data.formats.columns import Columns, words
+from deep_nrsfm_ros.data.formats.depth_check import DepthCheck, is_visibility
 from deep_nrsfm_ros.data.formats.table_frames import RowFrames
 from deep_nrsfm_ros.data.formats.table_text import Row, is_number
 from deep_nrsfm_ros.lifting.sanity import Finding
@@ -92,7 +92,10 @@ def read_landmark_rows(
         at = {mark: i for i, mark in enumerate(order)}
         builder.name_keypoints(list(order))
     builder.is_mediapipe = True
-    check = DepthCheck(list(order), has_confidence=columns.confidence is not None)
+    name = "" if columns.confidence is None else head[columns.confidence]
+    check = DepthCheck(
+        list(order), has_confidence=bool(name), has_visibility=is_visibility(words(name))
+    )
     for (index, who), landmarks in objects.items():
         values = np.full((q, 4), np.nan)
         for mark, value in landmarks.items():
