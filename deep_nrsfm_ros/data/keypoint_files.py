@@ -27,9 +27,11 @@ from deep_nrsfm_ros.data.formats.builder import (
     KeypointFileError,
 )
 from deep_nrsfm_ros.data.formats.frame_numbers import natural
+from deep_nrsfm_ros.data.formats.hdf5 import read_h5
 from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
 from deep_nrsfm_ros.data.formats.json_items import Readable
-from deep_nrsfm_ros.data.formats.tables import read_csv, read_h5, read_trc
+from deep_nrsfm_ros.data.formats.tables import read_csv
+from deep_nrsfm_ros.data.formats.trc import read_trc
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
@@ -351,12 +353,17 @@ FORMATS = (
         has_categories=True,
     ),
     Format(
-        "a table (.csv) of DeepLabCut, MediaPipe, or with columns such as nose_x",
+        "a table (.csv) of DeepLabCut, SLEAP, MediaPipe, or with columns such as nose_x",
         (".csv", ".tsv"),
         partial(_table, read_csv),
         has_categories=True,
     ),
-    Format("a table (.h5) of DeepLabCut", (".h5", ".hdf5"), partial(_table, read_h5), True),
+    Format(
+        "a table (.h5) of DeepLabCut or SLEAP",
+        (".h5", ".hdf5", ".slp"),
+        partial(_table, read_h5),
+        has_categories=True,
+    ),
     Format("2D markers (.trc) of Sports2D", (".trc",), partial(_table, read_trc)),
     Format("such JSON of a frame a line (.jsonl, .jsonl.gz)", (".jsonl", ".jsonl.gz"), _lines),
 )
