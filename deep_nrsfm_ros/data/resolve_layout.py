@@ -15,6 +15,7 @@ from deep_nrsfm_ros.data.formats.names import (
 )
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.spelling import match_names
 from deep_nrsfm_ros.lifting.layout_fit import (
     LayoutFit,
     ambiguity,
@@ -29,6 +30,7 @@ from deep_nrsfm_ros.wording import wording
 
 _SHOWN = 4  # names in a text
 _TIE = 0.02  # difference of residuals that chance makes
+_MOST_MISSING = 1 / 3  # of the keypoints of a target, which an input may leave out
 _LIMBS = 3  # keypoints of a side, without which a person has only one
 
 
@@ -119,7 +121,9 @@ def check_names(layout: KeypointLayout, target: KeypointLayout, owner: str) -> N
     """
     if layout.name != NAMED_BY_INPUT:
         return NameCheck()
-    names, wanted = layout.keypoints, target.keypoints
+    wanted = target.keypoints
+    own = {place: name for name, place in match_names(layout.keypoints, wanted).items()}
+    names = [own.get(place, name) for place, name in enumerate(layout.keypoints)]
     close = misspelt(names, wanted)
     guesses = ", ".join(f"{name} ({other}?)" for name, other in list(close.items())[:_SHOWN])
     guesses += ", ..." * (len(close) > _SHOWN)
@@ -160,7 +164,39 @@ def check_names(layout: KeypointLayout, target: KeypointLayout, owner: str) -> N
                 "those that belong to it",
             )
         )
+    if not findings and (finding := _find_unnamed(names, target, filled, owner)):
+        findings.append(finding)
     return NameCheck(tuple(findings), tuple(warnings))
+
+
+def _find_unnamed(
+    names: Sequence[str], target: KeypointLayout, filled: Sequence[str], owner: str
+) -> Finding | None:
+    """Return the finding that an input calls many keypoints of the target otherwise, or None.
+
+    A detector of people may give a face and fingers that the target lacks: they are no names of
+    its keypoints.
+
+    Args:
+        names: of the keypoints of the input.
+        target: layout to which they are mapped.
+        filled: keypoints of the target that the input names.
+        owner: as of `check_names`.
+    """
+    missing = [name for name in target.keypoints if name not in filled]
+    parts = (part for name in target.keypoints for part in target.derived.get(name, ()))
+    taken = set(match_names(names, (*target.keypoints, *parts)).values())
+    others = [name for place, name in enumerate(names) if place not in taken]
+    if is_person(target):
+        others = unknown_names(others, target.keypoints)
+    if len(missing) <= _MOST_MISSING * len(target) or len(others) < _LIMBS:
+        return None
+    return Finding(
+        "unnamed",
+        f"the input names {len(filled)} of the {len(target)} keypoints of {owner}, and "
+        f"{len(others)} other ones ({_shown(others)}): {_shown(missing)} are guessed; rename those "
+        "that they are",
+    )
 
 
 def _shown(names: Sequence[str]) -> str:

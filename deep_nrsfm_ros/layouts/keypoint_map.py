@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.spelling import match_names
 
 _MIN_SHARED = 4  # a shape is unique from four points on
 _SHOWN = 6  # names of keypoints in an error text
@@ -52,7 +53,7 @@ class KeypointMap:
     """
 
     def __init__(self, source: KeypointLayout, target: KeypointLayout) -> None:
-        """Match the names of the two layouts.
+        """Match the names of the two layouts, equal ones first (`spelling.match_names`).
 
         A keypoint of the target whose name the source layout lacks is derived, if the target says
         how, or stays missing. A keypoint that is missing in one frame only is not derived.
@@ -62,7 +63,8 @@ class KeypointMap:
         """
         self.source, self.target = source, target
         self.identical = source.keypoints == target.keypoints
-        sources = {name: i for i, name in enumerate(source.keypoints)}
+        parts = (part for name in target.keypoints for part in target.derived.get(name, ()))
+        sources = match_names(source.keypoints, (*target.keypoints, *parts))
         direct = [(t, sources[name]) for t, name in enumerate(target.keypoints) if name in sources]
         self._to = np.array([t for t, _ in direct], int)
         self._from = np.array([s for _, s in direct], int)

@@ -199,7 +199,7 @@ def _layout(arrays: Mapping[str, NDArray[Any]], options: ReadOptions) -> Keypoin
             f"its `names` are {len(names)}, and `points` has {q} keypoints: save a name for each, "
             "or leave `names` out"
         )
-    named = layout_of_names(names.tolist())
+    named = layout_of_names(names.tolist(), options.owners())
     reason = contradiction(options.layout, named) if options.layout else ""
     if options.layout and reason:
         raise KeypointFileError(
