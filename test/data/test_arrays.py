@@ -86,6 +86,14 @@ def test_times_under_another_name(form: str, name: str, times: Any, tmp_path: Pa
         npz(tmp_path, 5, **arrays, **{name: times})
 
 
+def test_fractions_are_no_frames_and_no_nanoseconds(tmp_path: Path) -> None:
+    with pytest.raises(KeypointFileError, match="`frame` has fractions; whole numbers are needed"):
+        npz(tmp_path, points=ROWS, frame=FRAME / 10)
+    found = npz(tmp_path, points=ROWS, frame=FRAME.astype(float), stamps=np.arange(F) / 10)
+    np.testing.assert_allclose(np.diff(found.stamps), 1e8, atol=1000)
+    assert "its times (`stamps`) are taken for seconds" in found.notes
+
+
 def test_times_that_are_none_are_said(tmp_path: Path) -> None:
     for times in (RNG.uniform(0, 1, F * P), np.arange(5) / 10, np.full(F * P, np.nan)):
         found = npz(tmp_path, points=ROWS, frame=FRAME, timestamps=times)

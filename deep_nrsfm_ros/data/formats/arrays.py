@@ -41,6 +41,7 @@ from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale, find_origin
 _MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
 _TEXTS = ("identities", "names", "frame_names")
 _MEDIAPIPE = 33  # landmarks of MediaPipe Pose, of x, y, z, visibility
+_LATEST = 2.0**62  # ns
 _MANY = 0.5  # fraction of objects that makes a suspicion a warning
 _OF_OTHERS = {
     "positions_2d": "VideoPose3D's data_2d_*.npz",
@@ -145,7 +146,9 @@ def _use_others(
     Returns:
         Sentences on how the arrays are taken.
     """
-    notes = list[str]()
+    notes, roles = list[str](), dict(roles)
+    if "stamps" in rows and _has_fractions(rows["stamps"]):  # in seconds, then
+        rows["times"], roles["times"] = rows.pop("stamps"), "stamps"
     numbers, times = rows.pop("numbers", None), rows.pop("times", None)
     taken = dict(roles)
     if numbers is not None and not _use_numbers(rows, numbers):
@@ -170,10 +173,18 @@ def _use_others(
     return [*taken_for(taken), *notes]
 
 
+def _has_fractions(array: NDArray[Any]) -> bool:
+    """Return whether an array has a number that is no whole one."""
+    if array.dtype.kind != "f" or array.ndim != 1:
+        return False
+    finite = array[np.isfinite(array)]
+    return bool((finite != np.round(finite)).any())
+
+
 def _use_numbers(rows: dict[str, NDArray[Any]], numbers: NDArray[Any]) -> bool:
     """Set the frames by their numbers in the input; return False if they are none."""
-    is_whole = np.isfinite(numbers).all() and (np.abs(numbers) < 2**62).all()
-    if not is_whole or (numbers != np.round(numbers)).any():
+    exact = numbers.astype(np.float64)
+    if not (np.abs(exact) < 2**62).all() or (exact != np.round(exact)).any():  # NaN compares false
         return False
     frame, m = rows.get("frame"), len(rows["points"])
     numbers = numbers.astype(np.int64).ravel()
@@ -198,22 +209,22 @@ def _use_times(rows: dict[str, NDArray[Any]], times: NDArray[Any], unit: str) ->
     values, m = times.astype(np.float64), len(rows["points"])
     if not np.isfinite(values).all() or (np.diff(values) < 0).any():
         return ""
-    if "frame" not in rows:
-        if len(values) != m:
-            return ""
-        values, rows["frame"] = np.unique(values, return_inverse=True)
-    frame = rows["frame"]
+    frame = rows.get("frame")
+    if frame is None and len(values) == m:
+        values, frame = np.unique(values, return_inverse=True)
+    if frame is None:
+        return ""
     f = max(int(frame.max(initial=-1)) + 1, len(rows.get("frame_numbers", ())))
     if len(values) == m != f:
         shown, first = np.unique(frame, return_index=True)
         values = np.interp(np.arange(f), shown, values[first])
     unit = unit or plausible_unit(values)
-    if len(values) != f or not unit:
+    if len(values) != f or not unit or np.abs(values).max(initial=0) >= _LATEST / UNITS[unit]:
         return ""
     # Relative to the first one: a float64 of seconds since 1970 has steps of 0.2 us.
-    start = float(values[0]) if len(values) else 0.0
-    rows["stamps"] = np.round((values - start) * UNITS[unit]).astype(np.int64)
-    rows["stamps"] += round(start) * UNITS[unit] if abs(start) < 2**53 else 0
+    start = round(float(values[0])) if f else 0
+    rows["frame"] = frame
+    rows["stamps"] = np.round((values - start) * UNITS[unit]).astype(np.int64) + start * UNITS[unit]
     return unit
 
 
@@ -543,6 +554,9 @@ def _numbers(
     if array.dtype.kind not in "fiu" or shape is not None and array.shape != shape:
         wanted = "of numbers" if shape is None else f"of numbers {shape}"
         raise KeypointFileError(f"`{name}` is {array.dtype} {array.shape}; {wanted} is needed")
-    if kind is np.int64 and not (np.abs(array) < 2**63).all():
+    if kind is np.int64 and not (np.abs(array.astype(np.float64)) < 2**63).all():
         raise KeypointFileError(f"`{name}` has a number that is no whole one of 64 bits")
+    if kind is np.int64 and _has_fractions(array):
+        times = ", and the times in ns `stamps`" if name == "frame" else ""
+        raise KeypointFileError(f"`{name}` has fractions; whole numbers are needed{times}")
     return array.astype(kind)
