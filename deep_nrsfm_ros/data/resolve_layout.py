@@ -30,7 +30,6 @@ from deep_nrsfm_ros.wording import wording
 
 _SHOWN = 4  # names in a text
 _TIE = 0.02  # difference of residuals that chance makes
-_MOST_MISSING = 1 / 3  # of the keypoints of a target, which an input may leave out
 _LIMBS = 3  # keypoints of a side, without which a person has only one
 
 
@@ -128,13 +127,14 @@ def check_names(layout: KeypointLayout, target: KeypointLayout, owner: str) -> N
     guesses = ", ".join(f"{name} ({other}?)" for name, other in list(close.items())[:_SHOWN])
     guesses += ", ..." * (len(close) > _SHOWN)
     try:
-        filled = KeypointMap(layout, target).filled
+        mapping = KeypointMap(layout, target)
     except ValueError:
         raise ValueError(
             f"its keypoints are named {_shown(names)}, and those of {owner} "
             f"{_shown(wanted)}: rename them{f', such as {guesses}' if guesses else ''}, or name "
             f"the layout in whose order they are with {layout_option()}"
         ) from None
+    filled = mapping.filled
     findings, warnings = list[Finding](), list[str]()
     if close and are_mostly_known(names, wanted):
         findings.append(
@@ -164,39 +164,15 @@ def check_names(layout: KeypointLayout, target: KeypointLayout, owner: str) -> N
                 "those that belong to it",
             )
         )
-    if not findings and (finding := _find_unnamed(names, target, filled, owner)):
-        findings.append(finding)
+    if not findings and (unnamed := mapping.unnamed()):
+        findings.append(
+            Finding(
+                "unnamed",
+                f"the input names {unnamed.filled} of {owner}, and {unnamed.others}: "
+                f"{unnamed.missing} are guessed; rename those that they are",
+            )
+        )
     return NameCheck(tuple(findings), tuple(warnings))
-
-
-def _find_unnamed(
-    names: Sequence[str], target: KeypointLayout, filled: Sequence[str], owner: str
-) -> Finding | None:
-    """Return the finding that an input calls many keypoints of the target otherwise, or None.
-
-    A detector of people may give a face and fingers that the target lacks: they are no names of
-    its keypoints.
-
-    Args:
-        names: of the keypoints of the input.
-        target: layout to which they are mapped.
-        filled: keypoints of the target that the input names.
-        owner: as of `check_names`.
-    """
-    missing = [name for name in target.keypoints if name not in filled]
-    parts = (part for name in target.keypoints for part in target.derived.get(name, ()))
-    taken = set(match_names(names, (*target.keypoints, *parts)).values())
-    others = [name for place, name in enumerate(names) if place not in taken]
-    if is_person(target):
-        others = unknown_names(others, target.keypoints)
-    if len(missing) <= _MOST_MISSING * len(target) or len(others) < _LIMBS:
-        return None
-    return Finding(
-        "unnamed",
-        f"the input names {len(filled)} of the {len(target)} keypoints of {owner}, and "
-        f"{len(others)} other ones ({_shown(others)}): {_shown(missing)} are guessed; rename those "
-        "that they are",
-    )
 
 
 def _shown(names: Sequence[str]) -> str:

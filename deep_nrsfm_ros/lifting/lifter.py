@@ -136,6 +136,13 @@ class Lifter:
         history = _checked("history", history, HistoryOptions)
         self.layout = model.layout if layout is None else layout_of("layout", layout)
         self._to_model = KeypointMap(self.layout, model.layout)
+        are_names = not isinstance(layout, (KeypointLayout, str, Path)) and layout is not None
+        if are_names and (unnamed := self._to_model.unnamed()):
+            warnings.warn(
+                f"layout names {unnamed.filled} of model {model.name!r}, and {unnamed.others}: "
+                f"{unnamed.missing} are guessed; rename those that they are",
+                stacklevel=2,
+            )
         self.constants = _constants(model, self.options, history, self._to_model)
         backend = CompiledBackend if supports(model.network) else NumpyBackend
         self.backend = backend(self.constants)

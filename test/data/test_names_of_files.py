@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -156,5 +157,12 @@ def test_lift_uses_each_name_of_the_model(tmp_path: Path) -> None:
     main([str(write("npz", tmp_path, names, points)), *arguments])
     with np.load(output) as file:
         np.testing.assert_allclose(by_file, file["shapes"], atol=1e-4)
-    lifted = Lifter(model, layout=[f"{name}".lower() for name in names])(points)
-    assert lifted.confidence.min() > 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lifted = Lifter(model, layout=[name.lower() for name in names])(points)
+        assert lifted.confidence.min() > 0
+        Lifter(model, layout=names[:9])
+    with pytest.warns(
+        UserWarning, match="names 9 of the 21 keypoints of model 'mouse', and 12 other"
+    ):
+        Lifter(model, layout=[*names[:9], *"abcdefghijkl"])
