@@ -211,6 +211,13 @@ def test_a_depth_is_no_confidence(tmp_path: Path) -> None:
     assert not npy(tmp_path, np.concatenate([PEOPLE[:, 0], given], -1)).warnings
 
 
+def test_three_coordinates_are_said(tmp_path: Path) -> None:
+    z = RNG.uniform(-800, 800, (F, Q, 1))
+    found = npy(tmp_path, np.concatenate([PEOPLE[:, 0], z], -1))
+    assert codes(found) == ["depth"] and (found.confidence == 1).all() and not found.warnings
+    assert "save points[..., :2]" in str(found.findings[0])
+
+
 def test_four_numbers_are_those_of_mediapipe(tmp_path: Path) -> None:
     values = RNG.uniform(1, 500, (F, 33, 4))
     values[..., 3] = RNG.uniform(0.1, 1, (F, 33))

@@ -42,6 +42,8 @@ _MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
 _TEXTS = ("identities", "names", "frame_names")
 _MEDIAPIPE = 33  # landmarks of MediaPipe Pose, of x, y, z, visibility
 _LATEST = 2.0**62  # ns
+_FRACTION = 2.0  # depths of MediaPipe, in widths of the image, are below it
+_SAMPLE = 5000  # objects
 _MANY = 0.5  # fraction of objects that makes a suspicion a warning
 _OF_OTHERS = {
     "positions_2d": "VideoPose3D's data_2d_*.npz",
@@ -336,19 +338,21 @@ def _detections(
         if points.shape[1] != _MEDIAPIPE:
             warnings = [*warnings, "four numbers of a keypoint are read as x, y, z, confidence"]
     m, q = points.shape[:2]
+    solid = list[Finding]()
     if "confidence" in arrays:
         confidence = _confidence(arrays["confidence"], (m, q))
         points = np.concatenate([points[..., :2], confidence[..., None]], -1)
     elif points.shape[2] == 3 and (depths := _count_depths(points)):
+        solid = _find_solid(points)
         points[..., 2] = 1
-        warnings = [*warnings, depths]
+        warnings = warnings if solid else [*warnings, depths]
     frame = _frame_of_each(arrays, m)
     frames, stamps = _frames_and_stamps(arrays, frame, options)
     scores = _scores(arrays, m, options)
     identities, warning = _identities(arrays, frame)
     warnings = [*warnings, warning] if warning else warnings
     given = points[..., 2] if points.shape[2] == 3 else np.ones((m, q))
-    findings = confidence_scale(given) + find_origin(points[..., :2], given)
+    findings = solid + confidence_scale(given) + find_origin(points[..., :2], given)
     observation = to_observation(points, options.min_confidence)
     is_padding = _is_padding(points, options) if has_padding else np.zeros(m, bool)
     order = np.argsort(frame, kind="stable")
@@ -391,6 +395,22 @@ def _count_depths(points: NDArray[Any]) -> str:
         f"the third number of a keypoint is negative in {count} of {shown} objects: it is a depth "
         "and no confidence, so all keypoints count as seen"
     )
+
+
+def _find_solid(points: NDArray[Any]) -> list[Finding]:
+    """Return whether (m, q, 3) with depths look like 3D points, whose depths are no fractions."""
+    third = points[:: max(1, len(points) // _SAMPLE), :, 2]
+    third = np.abs(third[np.isfinite(third) & (third != 0)])
+    if not third.size or (third > _FRACTION).mean() <= _MANY:
+        return []
+    return [
+        Finding(
+            "depth",
+            f"the third number of a keypoint goes to {third.max():.4g} and is negative in many "
+            "objects: it is a depth. If the points are 3D, `lift` needs the 2D keypoints that they "
+            "come from; if x and y are pixels of the image, save points[..., :2]",
+        )
+    ]
 
 
 def _is_padding(points: NDArray[Any], options: ReadOptions) -> NDArray[np.bool_]:
