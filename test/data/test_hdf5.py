@@ -126,7 +126,7 @@ def test_one_animal_of_sleap_without_tracks(tmp_path: Path) -> None:
 
 
 def test_a_project_of_sleap_is_to_be_exported(tmp_path: Path) -> None:
-    path = tmp_path / "labels.slp"
+    path = tmp_path / "labels.h5"
     with h5py.File(path, "w") as file:
         for name in ("metadata", "frames", "instances", "points", "pred_points"):
             file[name] = np.zeros(3)

@@ -180,13 +180,23 @@ def test_a_keypoint_file_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: 
         "identities": np.array(["a", "b", "a", "c"]),
     }
 
+    others = {  # known by their shapes and the words in their names
+        "points": values["points"],
+        "keypoint_scores": np.ones((4, p)),
+        "frame_idx": np.array([0, 0, 1, 3]),
+        "timestamps": np.array([0.0, 0.0, 0.1, 0.2]),
+        "track_ids": np.array([1, 2, 1, 3]),
+        "fps": np.array([10.0]),
+    }
+
     def jsonl(content: object) -> bytes:
         return b"\n".join([json.dumps(content).encode()] * 2)
 
     def one(spoiler: Spoiler) -> str:
         kind = spoiler.choice(("json", "jsonl", "jsonl.gz", "npz"))
         if kind == "npz":
-            arrays = {name: value.copy() for name, value in values.items()}
+            chosen = spoiler.choice((values, others))
+            arrays = {name: value.copy() for name, value in chosen.items()}
             name = spoiler.choice([*arrays])
             changed = (
                 spoiler.anything(arrays[name].ravel()) if name != "identities" else arrays[name][1:]
