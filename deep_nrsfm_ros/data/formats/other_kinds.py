@@ -26,7 +26,7 @@ _REMEDIES = {
         "index=False)"
     ),
     (".slp",): (
-        "projects of SLEAP are not read: export it (File > Export Analysis CSV or HDF5), or in Python "
+        "projects of SLEAP are not read: export them (File > Export Analysis), or in Python "
         "np.save(NEW, sleap_io.load_file(FILE).numpy()), which is (frames, animals, q, 2)"
     ),
     (".nwb",): f"files of NWB are not read: load it in Python (pynwb), and save {_ARRAY}",
