@@ -423,6 +423,7 @@ the camera, and remembers it from frame to frame, as the ROS node does:
 
     from deep_nrsfm_ros import Intrinsics, Lifter, VideoLifter
     camera = Intrinsics((1000, 1000), (640, 360))  # fx, fy and cx, cy in pixels
+    # or as OpenCV and ROS calibrate: Intrinsics.from_matrix(K, distortion)
     camera = Intrinsics.from_field_of_view(65, (1280, 720))  # or roughly: degrees of the width
     video = VideoLifter(Lifter("human", layout="coco17"), camera)
     for i, frame in enumerate(points):  # a person, or (n, 17, 2) of n people

@@ -246,6 +246,7 @@ def read_objects(args: argparse.Namespace, model: Model, layout: KeypointLayout 
         image_size=_camera_of_options(args).image_size,
         layout=layout,
         fallback=None if is_person(model.layout) else model.layout,
+        target=model.layout,
     )
     with progress("reading") as on_progress:
         detections = read_keypoints(args.input, options, on_progress)

@@ -6,13 +6,15 @@ from __future__ import annotations
 import dataclasses
 import gzip
 import io
+import shutil
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from tempfile import TemporaryDirectory
+from typing import IO, Any, BinaryIO, NamedTuple, cast
 
 import numpy as np
 
@@ -27,9 +29,12 @@ from deep_nrsfm_ros.data.formats.builder import (
     KeypointFileError,
 )
 from deep_nrsfm_ros.data.formats.frame_numbers import natural
+from deep_nrsfm_ros.data.formats.hdf5 import read_h5
 from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
 from deep_nrsfm_ros.data.formats.json_items import Readable
-from deep_nrsfm_ros.data.formats.tables import read_csv, read_h5, read_trc
+from deep_nrsfm_ros.data.formats.other_kinds import remedy_of
+from deep_nrsfm_ros.data.formats.tables import read_csv
+from deep_nrsfm_ros.data.formats.trc import read_trc
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
@@ -121,12 +126,7 @@ def _format_of(path: Path) -> Format:
     for form in FORMATS:
         if name.endswith(form.suffixes):
             return form
-    if name.endswith(_PICKLES):
-        raise KeypointFileError(
-            "it is a pickle, which could run code when it is read: load it yourself if you trust "
-            "it, and save np.savez(NEW, points=array (objects, q, 2), frame=array (objects,))"
-        )
-    raise KeypointFileError(f"it is of no known kind; expected {KINDS}")
+    raise KeypointFileError(remedy_of(name) or f"it is of no known kind; expected {KINDS}")
 
 
 def _refuse(options: ReadOptions, names: tuple[str, ...], kind: str) -> None:
@@ -211,16 +211,28 @@ def _without_border(detections: Detections, size: Size) -> Detections:
 def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
     """Return the objects in a JSON file of any detector."""
     builder = DetectionsBuilder(options)
-    with path.open("rb") as file:
-        problem = _read_document(
-            JsonReader(builder), _Counted(file, path, on_progress), DefaultFrame(path.name)
-        )
+    with path.open("rb") as raw, _unpacked(raw, path) as file:
+        try:
+            problem = _read_document(
+                JsonReader(builder), _Counted(file, raw, path, on_progress), DefaultFrame(path.name)
+            )
+        except (EOFError, OSError, zlib.error) as error:  # of what is compressed
+            if not builder.frames:
+                raise
+            problem = str(error)
     if problem and not builder.frames:
         reasons = builder.reasons()
         raise KeypointFileError("; ".join([problem, *reasons]))
     if problem:
         _find_damage(builder, problem)
     return builder.detections("it has no frame")
+
+
+def _unpacked(raw: BinaryIO, path: Path) -> AbstractContextManager[BinaryIO]:
+    """Return the content of an open file, without its compression."""
+    if not path.name.lower().endswith(".gz"):
+        return nullcontext(raw)
+    return cast("AbstractContextManager[BinaryIO]", gzip.open(raw))
 
 
 def _find_damage(builder: DetectionsBuilder, problem: str) -> None:
@@ -245,15 +257,18 @@ def _read_document(reader: JsonReader, file: Readable, frame: DefaultFrame) -> s
 
 
 class _Counted:
-    """A file that reports how much of it is read."""
+    """A file that reports how much of it is read: of what is compressed, as its size is."""
 
-    def __init__(self, file: IO[bytes], path: Path, on_progress: Progress) -> None:
-        self._file, self._size, self._on_progress = file, path.stat().st_size, on_progress
+    def __init__(self, file: IO[bytes], raw: IO[bytes], path: Path, on_progress: Progress) -> None:
+        self._raw = raw
+        # A damaged archive gives what comes before the damage by `read1` alone.
+        self._read = file.read1 if isinstance(file, gzip.GzipFile) else file.read
+        self._size, self._on_progress = path.stat().st_size, on_progress
 
     def read(self, size: int = -1, /) -> bytes:
         """Return at most `size` bytes."""
-        data = self._file.read(size)
-        self._on_progress(min(self._file.tell(), self._size), self._size)
+        data = self._read(size)
+        self._on_progress(min(self._raw.tell(), self._size), self._size)
         return data
 
 
@@ -261,7 +276,6 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
     """Return the objects in a file that has in each line a document, which is a frame."""
     builder = DetectionsBuilder(options)
     size = path.stat().st_size
-    is_compressed = path.name.lower().endswith(".gz")
 
     def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
         lines = (line for line in file if line.strip())
@@ -269,7 +283,7 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
             yield DefaultFrame(f"line {number + 1}", number, is_document=True), line
             on_progress(min(raw.tell(), size), size)  # of what is compressed, as the size is
 
-    with path.open("rb") as raw, gzip.open(raw) if is_compressed else nullcontext(raw) as file:
+    with path.open("rb") as raw, _unpacked(raw, path) as file:
         try:
             _read_frames(builder, documents())
         except (EOFError, OSError, zlib.error) as error:
@@ -287,7 +301,14 @@ def _table(
 ) -> Detections:
     """Return the objects in a table."""
     builder = DetectionsBuilder(options)
-    read(path, builder)
+    if not path.name.lower().endswith(".gz"):
+        read(path, builder)
+        return builder.detections("it has no row")
+    with TemporaryDirectory() as folder, path.open("rb") as raw, _unpacked(raw, path) as content:
+        unpacked = Path(folder, path.stem)
+        with unpacked.open("wb") as file:
+            shutil.copyfileobj(content, file)
+        read(unpacked, builder)
     return builder.detections("it has no row")
 
 
@@ -337,7 +358,6 @@ def _read_frames(
 _FEW_AT_BORDER = 0.01  # fraction of keypoints below which the border is no cause for doubt
 _BLOCK = 4096  # objects that are compared at once
 _SAMPLE = 256  # messages of a topic that `sample_bag` reads at least
-_PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 """Images beside the files of their keypoints are no keypoints, and usual."""
 _FOLDER = Format("a folder of .json files, one a frame", (), _folder, has_categories=True)
@@ -345,20 +365,29 @@ FORMATS = (
     Format("an .npz with `points`", (".npz",), lambda path, options, _: read_npz(path, options)),
     Format("an .npy", (".npy",), lambda path, options, _: read_npy(path, options)),
     Format(
-        "JSON of COCO, OpenPose, MMPose, AlphaPose, MediaPipe or PoseNet (.json)",
-        (".json",),
+        "JSON of COCO, OpenPose, MMPose, AlphaPose, MediaPipe or PoseNet (.json, .json.gz)",
+        (".json", ".json.gz"),
         _json,
         has_categories=True,
     ),
     Format(
-        "a table (.csv) of DeepLabCut, MediaPipe, or with columns such as nose_x",
-        (".csv", ".tsv"),
+        "a table (.csv, .csv.gz) of DeepLabCut, SLEAP, MediaPipe, or with columns such as nose_x",
+        (".csv", ".tsv", ".csv.gz", ".tsv.gz"),
         partial(_table, read_csv),
         has_categories=True,
     ),
-    Format("a table (.h5) of DeepLabCut", (".h5", ".hdf5"), partial(_table, read_h5), True),
+    Format(
+        "a table (.h5) of DeepLabCut or SLEAP",
+        (".h5", ".hdf5"),
+        partial(_table, read_h5),
+        has_categories=True,
+    ),
     Format("2D markers (.trc) of Sports2D", (".trc",), partial(_table, read_trc)),
-    Format("such JSON of a frame a line (.jsonl, .jsonl.gz)", (".jsonl", ".jsonl.gz"), _lines),
+    Format(
+        "such JSON of a frame a line (.jsonl, .ndjson, also with .gz)",
+        (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz"),
+        _lines,
+    ),
 )
 """The formats of single files."""
 KINDS = "; ".join(

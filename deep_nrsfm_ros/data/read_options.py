@@ -29,6 +29,8 @@ class ReadOptions:
             = the input says it.
         fallback: layout of an input that names none itself, e.g. that of the model; None = such
             an input is read with as many keypoints as it has.
+        target: layout to which the keypoints are mapped by name; what an input calls as it does,
+            in any spelling, is that keypoint. None = unknown.
     """
 
     topic: str = option(
@@ -47,6 +49,7 @@ class ReadOptions:
     max_frames: int | None = None
     layout: KeypointLayout | None = None
     fallback: KeypointLayout | None = None
+    target: KeypointLayout | None = None
     missing_value: float | None = option(
         None,
         "x and y of a missing keypoint, besides NaN and (0, 0); none = no other, -1 typical",
@@ -62,6 +65,10 @@ class ReadOptions:
         "name or number of the category to read from a COCO file; empty = the only category with "
         "keypoints",
     )
+
+    def owners(self) -> list[KeypointLayout]:
+        """Return the layouts whose names an input may use, the one that is mapped to first."""
+        return [each for each in (self.target, self.layout, self.fallback) if each]
 
 
 DEFAULT_READ_OPTIONS = ReadOptions()

@@ -15,6 +15,7 @@ from deep_nrsfm_ros.data.formats.names import (
 )
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.spelling import match_names
 from deep_nrsfm_ros.lifting.layout_fit import (
     LayoutFit,
     ambiguity,
@@ -119,18 +120,21 @@ def check_names(layout: KeypointLayout, target: KeypointLayout, owner: str) -> N
     """
     if layout.name != NAMED_BY_INPUT:
         return NameCheck()
-    names, wanted = layout.keypoints, target.keypoints
+    wanted = target.keypoints
+    own = {place: name for name, place in match_names(layout.keypoints, wanted).items()}
+    names = [own.get(place, name) for place, name in enumerate(layout.keypoints)]
     close = misspelt(names, wanted)
     guesses = ", ".join(f"{name} ({other}?)" for name, other in list(close.items())[:_SHOWN])
     guesses += ", ..." * (len(close) > _SHOWN)
     try:
-        filled = KeypointMap(layout, target).filled
+        mapping = KeypointMap(layout, target)
     except ValueError:
         raise ValueError(
             f"its keypoints are named {_shown(names)}, and those of {owner} "
             f"{_shown(wanted)}: rename them{f', such as {guesses}' if guesses else ''}, or name "
             f"the layout in whose order they are with {layout_option()}"
         ) from None
+    filled = mapping.filled
     findings, warnings = list[Finding](), list[str]()
     if close and are_mostly_known(names, wanted):
         findings.append(
@@ -158,6 +162,14 @@ def check_names(layout: KeypointLayout, target: KeypointLayout, owner: str) -> N
                 f"the input names {seen} {other}_ keypoints of {owner} and no {side}_ one, but "
                 f"{len(unknown)} unknown ones ({_shown(unknown)}): that side is guessed; rename "
                 "those that belong to it",
+            )
+        )
+    if not findings and (unnamed := mapping.unnamed()):
+        findings.append(
+            Finding(
+                "unnamed",
+                f"the input names {unnamed.filled} of {owner}, and {unnamed.others}: "
+                f"{unnamed.missing} are guessed; rename those that they are",
             )
         )
     return NameCheck(tuple(findings), tuple(warnings))

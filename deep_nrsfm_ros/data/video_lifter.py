@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.lifting.history import Context
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
-from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all
+from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter, lift_all, warn_of_scale
 from deep_nrsfm_ros.lifting.numpy_backend import Float32
 from deep_nrsfm_ros.lifting.observation import from_arrays
 from deep_nrsfm_ros.lifting.options import unit_vector
@@ -50,7 +51,8 @@ class VideoLifter:
         """
         if camera is not None and not isinstance(camera, Intrinsics):
             raise TypeError(
-                f"camera is a {type(camera).__name__}; give Intrinsics((fx, fy), (cx, cy)), or "
+                f"camera is a {type(camera).__name__}; give Intrinsics((fx, fy), (cx, cy)), "
+                "Intrinsics.from_matrix(K, distortion), or "
                 "Intrinsics.from_field_of_view(degrees, (width, height))"
             )
         lifter(np.zeros((0, len(lifter.layout), 2)))  # checks `min_visible` against the layout
@@ -88,9 +90,10 @@ class VideoLifter:
                 are found.
 
         Raises:
-            ValueError: the arrays do not fit each other or the layout, or there is not an identity
-                for each object.
+            ValueError: the arrays do not fit each other or the layout, there is not an identity
+                for each object, or the time is not finite.
         """
+        warn_of_scale(confidence)
         seen = from_arrays(points, confidence, self.lifter.layout)
         n = len(seen.points)
         if identities and len(identities) != n:
@@ -99,6 +102,8 @@ class VideoLifter:
         if seconds is None:
             self.identities = tuple(identities) or ("",) * n
             return lift_all(self._lift_alone, *keypoints)
+        if not math.isfinite(seconds):
+            raise ValueError(f"seconds is {seconds}; give the time of the frame, or None")
         stamp = round(1e9 * seconds)
         moment = self._clock(stamp, stamp)
         if moment.restarted:

@@ -4,13 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.layouts.spelling import match_names
 
 _MIN_SHARED = 4  # a shape is unique from four points on
+_MOST_MISSING = 1 / 3  # of the keypoints of a target, which a source may leave out
+_MANY_OTHERS = 3  # names of a source that the target lacks, which may be those that it misses
 _SHOWN = 6  # names of keypoints in an error text
 
 
@@ -37,6 +42,20 @@ def _shown(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + ", ..." * (len(names) > _SHOWN)
 
 
+class Unnamed(NamedTuple):
+    """Keypoints of a target that may have another name in the source, in words.
+
+    Attributes:
+        filled: "4 of the 7 keypoints".
+        others: "3 other ones (a, b, c)", of the source.
+        missing: the first names of those that nothing fills.
+    """
+
+    filled: str
+    others: str
+    missing: str
+
+
 class KeypointMap:
     """Maps keypoints of a source layout to a target layout by name.
 
@@ -45,6 +64,7 @@ class KeypointMap:
         target: layout of the output.
         identical: True if both have the same keypoints in the same order.
         filled: names of the keypoints of the target that the source has, or that follow from them.
+        unused: names of the source that the target does not have, and that nothing follows from.
         derivations: pairs (m, 2) of a keypoint of the target and a keypoint that it follows from,
             in the order of the first. A visible keypoint adds no information where all that it
             follows from are visible. The pair (t, t) marks a keypoint that this map computes; it
@@ -52,7 +72,7 @@ class KeypointMap:
     """
 
     def __init__(self, source: KeypointLayout, target: KeypointLayout) -> None:
-        """Match the names of the two layouts.
+        """Match the names of the two layouts, equal ones first (`spelling.match_names`).
 
         A keypoint of the target whose name the source layout lacks is derived, if the target says
         how, or stays missing. A keypoint that is missing in one frame only is not derived.
@@ -62,7 +82,8 @@ class KeypointMap:
         """
         self.source, self.target = source, target
         self.identical = source.keypoints == target.keypoints
-        sources = {name: i for i, name in enumerate(source.keypoints)}
+        parts = (part for name in target.keypoints for part in target.derived.get(name, ()))
+        sources = match_names(source.keypoints, (*target.keypoints, *parts))
         direct = [(t, sources[name]) for t, name in enumerate(target.keypoints) if name in sources]
         self._to = np.array([t for t, _ in direct], int)
         self._from = np.array([s for _, s in direct], int)
@@ -74,6 +95,8 @@ class KeypointMap:
             and all(part in sources for part in target.derived[name])
         ]
         mapped = (*direct, *self._derived)
+        used = set(sources.values())
+        self.unused = tuple(name for i, name in enumerate(source.keypoints) if i not in used)
         self.filled = tuple(target.keypoints[t] for t, _ in mapped)
         if len(mapped) < _MIN_SHARED:
             raise TooFewSharedError(
@@ -82,6 +105,22 @@ class KeypointMap:
                 f"{_shown(source.keypoints)}; {target.name!r} has {_shown(target.keypoints)}"
             )
         self.derivations = self._find_derivations()
+
+    def unnamed(self) -> Unnamed | None:
+        """Return the keypoints of the target that may have another name; None if few may.
+
+        A detector of people may give a face and fingers that the target lacks: they are no names
+        of its keypoints.
+        """
+        missing = [name for name in self.target.keypoints if name not in self.filled]
+        others = self.unused
+        if {"left_hip", "left_ankle"} <= set(self.target.keypoints):
+            known = {name for layout in LAYOUTS.values() for name in layout.keypoints}
+            others = tuple(name for name in others if name not in known)
+        if len(missing) <= _MOST_MISSING * len(self.target) or len(others) < _MANY_OTHERS:
+            return None
+        counts = f"{len(self.filled)} of the {len(self.target)} keypoints"
+        return Unnamed(counts, f"{len(others)} other ones ({_shown(others)})", _shown(missing))
 
     def _find_derivations(self) -> NDArray[np.int32]:
         """Return the attribute `derivations`."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -56,9 +56,11 @@ class Intrinsics:
             k1 k2 k3 k4 of `equidistant` (fisheye); (): no distortion.
         lens: one of `COEFFICIENTS`.
 
+    `from_matrix` takes a camera matrix and the distortion as OpenCV and ROS have them.
+
     Raises:
-        ValueError: unknown lens, wrong number of coefficients, a number that is not finite, or a
-            focal length that is not above 0.
+        ValueError: unknown lens, wrong number of coefficients, of focal lengths or of coordinates,
+            a number that is not finite, or a focal length that is not above 0.
     """
 
     focal: tuple[float, float]
@@ -67,7 +69,10 @@ class Intrinsics:
     lens: str = PLUMB_BOB
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
+        """Check the numbers, and keep them as tuples."""
+        for name in ("focal", "principal"):
+            object.__setattr__(self, name, _pair(name, getattr(self, name)))
+        object.__setattr__(self, "distortion", _coefficients(self.distortion))
         if self.lens not in COEFFICIENTS:
             raise ValueError(f"lens is {self.lens!r}; choose one of {', '.join(COEFFICIENTS)}")
         if len(self.distortion) not in COEFFICIENTS[self.lens]:
@@ -79,6 +84,36 @@ class Intrinsics:
             raise ValueError(f"camera has a number that is not finite: {self}")
         if min(self.focal) <= 0:
             raise ValueError(f"focal length is {min(self.focal)}; it must be above 0 pixels")
+
+    @classmethod
+    def from_matrix(
+        cls, matrix: ArrayLike, distortion: ArrayLike = (), lens: str = ""
+    ) -> Intrinsics:
+        """Return the camera of a camera matrix K, as camera calibration writes it.
+
+        Args:
+            matrix: (3, 3) with rows (fx, 0, cx), (0, fy, cy), (0, 0, 1) in pixels: `K` of OpenCV,
+                or the 9 numbers of `k` of a CameraInfo.
+            distortion: coefficients in any shape, as for the attribute: `dist` of OpenCV, `d` of a
+                CameraInfo. (): no distortion.
+            lens: one of `COEFFICIENTS`; "": `rational_polynomial` for 8 coefficients, else
+                `plumb_bob`. Of a fisheye camera say `equidistant`.
+
+        Raises:
+            ValueError: the matrix is none of a camera without skew, or as of the class.
+        """
+        K = np.asarray(matrix, np.float64)
+        K = K.reshape(3, 3) if K.shape == (9,) else K
+        if K.shape != (3, 3):
+            raise ValueError(f"camera matrix is of shape {K.shape}; it must be (3, 3)")
+        if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], (0, 0, 0, 0, 1)):
+            raise ValueError(
+                f"camera matrix is {K.tolist()}; it must have the rows (fx, 0, cx), (0, fy, cy) "
+                "and (0, 0, 1)"
+            )
+        coefficients = _coefficients(distortion)
+        usual = RATIONAL if len(coefficients) == COEFFICIENTS[RATIONAL][-1] else PLUMB_BOB
+        return cls((K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), coefficients, lens or usual)
 
     @classmethod
     def from_field_of_view(cls, degrees: float, size: tuple[int, int]) -> Intrinsics:
@@ -201,6 +236,26 @@ class Intrinsics:
         converged = (np.abs(step) <= _TOLERANCE) & (theta < np.pi / 2)
         plane: Array = distorted * _ratio(np.tan(np.where(converged, theta, np.nan)), radius)
         return plane
+
+
+def _pair(name: str, value: object) -> tuple[float, float]:
+    """Return two numbers; raise ValueError that says what to give instead."""
+    wanted = {"focal": "(fx, fy)", "principal": "(cx, cy)"}[name]
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu" or array.shape != (2,):
+        is_matrix = array.ndim == 2 or array.size == 9
+        given = f"of shape {array.shape}" if array.size > 4 else repr(value)
+        remedy = "Intrinsics.from_matrix(K, distortion)" if is_matrix else f"{wanted} in pixels"
+        raise ValueError(f"{name} of Intrinsics is {given}; give {remedy}")
+    return float(array[0]), float(array[1])
+
+
+def _coefficients(distortion: ArrayLike) -> tuple[float, ...]:
+    """Return the coefficients of a lens, in whatever shape they come: OpenCV's are (1, 5)."""
+    array = np.asarray(distortion)
+    if array.size and array.dtype.kind not in "fiu":
+        raise ValueError(f"distortion of Intrinsics is {distortion!r}; give numbers")
+    return tuple(array.ravel().astype(np.float64).tolist())
 
 
 def _ratio(a: Array, b: Array) -> Array:

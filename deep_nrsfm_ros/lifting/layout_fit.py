@@ -210,11 +210,17 @@ def better_layout(
     if best.layout.keypoints == current.keypoints or not is_clearly_better(best, residual):
         return None
     name = best.layout.name
+    remedy = wording(f"set the keypoint layout to {name}", python=f"give layout={name!r}")
+    if name not in LAYOUTS:  # that of the model
+        remedy = wording(
+            "set the keypoint layout to that of the model (-p keypoint_layout:=model, or no "
+            "--keypoint-layout)",
+            python="leave layout out",
+        )
     return Finding(
         "layout",
         f"poor fit as {current.name}: is it {name}? It fits {best.residual:.2f} instead of "
-        f"{residual:.2f}; "
-        + wording(f"set the keypoint layout to {name}", python=f"give layout={name!r}"),
+        f"{residual:.2f}; {remedy}",
     )
 
 

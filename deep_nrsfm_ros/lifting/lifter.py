@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -108,7 +109,7 @@ class Lifter:
         model: Model | str | Path,
         options: LiftingOptions | None = None,
         *,
-        layout: KeypointLayout | str | Path | Sequence[str] | None = None,
+        layout: KeypointLayout | str | Path | Sequence[str] | NDArray[np.str_] | None = None,
         history: HistoryOptions | None = None,
     ) -> None:
         """Prepare a backend for the model.
@@ -139,6 +140,13 @@ class Lifter:
         history = _checked("history", history, HistoryOptions)
         self.layout = model.layout if layout is None else layout_of("layout", layout)
         self._to_model = KeypointMap(self.layout, model.layout)
+        are_names = not isinstance(layout, (KeypointLayout, str, Path)) and layout is not None
+        if are_names and (unnamed := self._to_model.unnamed()):
+            warnings.warn(
+                f"layout names {unnamed.filled} of model {model.name!r}, and {unnamed.others}: "
+                f"{unnamed.missing} are guessed; rename those that they are",
+                stacklevel=2,
+            )
         self.constants = _constants(model, self.options, history, self._to_model)
         backend = CompiledBackend if supports(model.network) else NumpyBackend
         self.backend = backend(self.constants)
@@ -150,9 +158,10 @@ class Lifter:
             points: (n, q, 2) or (q, 2) keypoints in the layout of this lifter, x right and y down,
                 in pixels or any other unit that is the same for x and y: multiply shares of width
                 and height, from 0 to 1, by the image's size. A keypoint at (0, 0) or with a NaN is
-                missing.
+                missing, and so is one that a mask of `numpy.ma` hides.
             confidence: (n, q) or (q,), from 0, which is missing, to 1; a boolean array of
-                visibility serves too. None: all keypoints have confidence 1.
+                visibility serves too. On another scale there is a Python warning, and more than 1
+                counts as 1. None: all keypoints have confidence 1.
 
         Returns:
             The n objects; n is 1 for points (q, 2).
@@ -162,6 +171,7 @@ class Lifter:
                 can have as many keypoints as the option `min_visible` asks for.
         """
         self._check_layout()
+        warn_of_scale(confidence)
         seen = from_arrays(points, confidence, self.layout)
         return lift_all(self.lift, *self._to_model(seen.points, seen.confidence))
 
@@ -295,6 +305,17 @@ class Lifter:
         if self.options.mirrored:
             lifted = _mirrored(lifted)
         return mark_not_lifted(lifted, not_lifted) if not_lifted.any() else lifted
+
+
+def warn_of_scale(confidence: ArrayLike | None) -> None:
+    """Give a Python warning, at the caller's caller, for confidences that are not from 0 to 1."""
+    if confidence is None:
+        return
+    from deep_nrsfm_ros.lifting.sanity import confidence_scale  # it imports this module
+
+    given = np.atleast_1d(np.asarray(confidence))
+    for finding in confidence_scale(given) if given.dtype.kind in "fiu" else ():
+        warnings.warn(str(finding), stacklevel=3)
 
 
 def _checked(argument: str, given: Any, cls: type[_Options]) -> _Options:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -199,14 +199,15 @@ def from_arrays(
     """Return an observation of arrays in any dtype, with missing keypoints as `to_observation`.
 
     Args:
-        points: (n, q, 2), or (q, 2) of one object, x right and y down.
+        points: (n, q, 2), or (q, 2) of one object, x right and y down. What a mask of `numpy.ma`
+            hides is missing, in the confidence too.
         confidence: (n, q) or (q,), from 0 to 1, or booleans; None: all are 1.
         layout: of the q keypoints.
 
     Raises:
         ValueError: the arrays do not fit each other or the layout.
     """
-    xy, q = np.asarray(points), len(layout)
+    xy, q = unmasked(points, np.nan), len(layout)
     xy = xy[None] if xy.ndim == 2 else xy
     if xy.ndim != 3 or xy.shape[1:] != (q, 2) or xy.dtype.kind not in "fiu":
         hint = ""
@@ -219,7 +220,7 @@ def from_arrays(
     xy = xy.astype(np.float64)
     if confidence is None:
         return to_observation(xy)
-    certainty = np.asarray(confidence)
+    certainty = unmasked(confidence, 0)
     if certainty.shape != np.shape(points)[:-1] or certainty.dtype.kind not in "fiub":
         raise ValueError(
             f"confidence is {certainty.shape} of {certainty.dtype}; points of {np.shape(points)} "
@@ -227,6 +228,17 @@ def from_arrays(
         )
     certainty = certainty.reshape(xy.shape[:2]).astype(np.float64)
     return to_observation(np.concatenate((xy, certainty[..., None]), -1))
+
+
+def unmasked(values: ArrayLike, missing: float) -> NDArray[Any]:
+    """Return values as an array, with `missing` where a mask of `numpy.ma` hides them."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return np.asarray(values)
+    is_hidden = np.broadcast_to(np.asarray(values.mask), values.shape)
+    plain = np.asarray(values.data)
+    if not is_hidden.any() or plain.dtype.kind not in "fiub":
+        return plain
+    return np.where(is_hidden, missing, plain)
 
 
 def check_keypoints(count: int, keypoints: int, field: str) -> None:

@@ -188,7 +188,8 @@ def find_sentinel(points: Floats, visible: NDArray[np.bool_]) -> tuple[Floats, i
     A spot such as (-1, -1) or (9999, 9999) is one when 0.1 % of the visible keypoints lie on it:
     both coordinates are negative or 0, or they are equal. Any other spot, such as the middle of the
     image, is one when 1 % lie on it, of three different keypoints or more. A spot without a
-    negative coordinate must have far more of them than any other spot.
+    negative coordinate must have far more of them than any other spot, and is none where one
+    keypoint lies on it in nearly every object: it is the origin of the others.
 
     Args:
         points: (n, q, 2).
@@ -208,12 +209,29 @@ def find_sentinel(points: Floats, visible: NDArray[np.bool_]) -> tuple[Floats, i
         if not spot or spot[1] < max(_MIN_REPEATS, least * total):
             continue
         is_there = visible & (points == spot[0]).all(-1)
+        if _is_origin(is_there, least * total):
+            continue
         next_spot = _most_frequent(points[visible & ~is_there])
         stands_out = not next_spot or spot[1] >= _STANDS_OUT * next_spot[1]
         # A keypoint that stands still is on one spot, but not three of them.
         if stands_out and (least == _MARKED or is_there.any(0).sum() >= _MIN_REPEATS):
             return spot
     return None
+
+
+def _is_origin(is_there: NDArray[np.bool_], least: float) -> bool:
+    """Return whether one keypoint makes a spot: it is there in each object, and others hardly are.
+
+    So it is where the points are relative to that keypoint and a constant is added.
+
+    Args:
+        is_there: (n, q) whether a keypoint is on the spot.
+        least: keypoints on a spot that stands for missing ones.
+    """
+    times = is_there.sum(0)
+    is_always = times >= _NEARLY_ALL * len(is_there)
+    others = int(times[~is_always].sum())
+    return bool(is_always.sum() == 1) and others < max(_MIN_REPEATS, least)
 
 
 def _most_frequent(points: Floats) -> tuple[Floats, int] | None:

@@ -39,6 +39,7 @@ from deep_nrsfm_ros.lifting.sanity import (
     to_pixels,
 )
 from deep_nrsfm_ros.messages.decoding import implied_layout, is_normalised, type_name
+from deep_nrsfm_ros.messages.options import MODEL_ORDER
 from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import MessageReader
 from deep_nrsfm_ros.messages.stamps import check_stamps
@@ -59,6 +60,11 @@ class Choice(NamedTuple):
 
     layout: KeypointLayout
     reason: str
+
+    @property
+    def value(self) -> str:
+        """The value of the parameter `keypoint_layout`; what is no preset is the model's own."""
+        return self.layout.name if self.layout.name in LAYOUTS else MODEL_ORDER
 
 
 class _Sample(NamedTuple):

@@ -6,6 +6,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.layout_file import LAYOUT_SUFFIXES, LayoutFileError, read_layout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS, preset
@@ -48,14 +51,16 @@ def find_layout(option: str, name_or_path: str) -> KeypointLayout:
 
 
 def layout_of(
-    option: str, value: KeypointLayout | str | Path | Sequence[str], name: str = "keypoints"
+    option: str,
+    value: KeypointLayout | str | Path | Sequence[str] | NDArray[np.str_],
+    name: str = "keypoints",
 ) -> KeypointLayout:
     """Return the keypoint layout that an argument of the Python API stands for.
 
     Args:
         option: name of the argument, for error messages.
         value: a layout, what `find_layout` takes, as a string or a path, or the names of the
-            keypoints in the order of the arrays.
+            keypoints in the order of the arrays, as a sequence or an array of texts.
         name: name of a layout that is made of the names of keypoints.
 
     Raises:
@@ -66,6 +71,8 @@ def layout_of(
         return value
     if isinstance(value, (str, Path)):
         return find_layout(option, str(value))
+    if isinstance(value, np.ndarray) and value.ndim == 1:  # of an .npz
+        value = value.tolist()
     if isinstance(value, Sequence) and all(isinstance(each, str) for each in value):
         return KeypointLayout(name, tuple(value))
     raise TypeError(

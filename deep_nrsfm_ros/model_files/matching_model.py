@@ -10,6 +10,7 @@ from pathlib import Path
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap, TooFewSharedError
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import HUMAN25, LAYOUTS
+from deep_nrsfm_ros.layouts.spelling import match_names
 from deep_nrsfm_ros.model_files.find_layout import NUMBERED, find_layout
 from deep_nrsfm_ros.model_files.folders import shipped_models
 from deep_nrsfm_ros.model_files.model_file import MODEL_SUFFIX, ModelFileError, load_once
@@ -22,7 +23,7 @@ _MIN_SHARED = 0.7  # of the keypoints of the smaller layout; people of all prese
 
 def knows(model: KeypointLayout, layout: KeypointLayout) -> bool:
     """Return whether two layouts are of one object: most keypoints of the smaller have one name."""
-    shared = set(model.keypoints) & set(layout.keypoints)
+    shared = match_names(model.keypoints, layout.keypoints)
     return len(shared) >= max(4, _MIN_SHARED * min(len(model), len(layout)))
 
 

@@ -569,7 +569,7 @@ class LifterNode(Node):
         )
         self.get_logger().info(
             f"keypoint_layout auto: {choice.layout.name} ({choice.reason}); "
-            f"-p keypoint_layout:={choice.layout.name} sets it for good"
+            f"-p keypoint_layout:={choice.value} sets it for good"
         )
 
     def _moment(self, source: KeypointTopic, stamp: int) -> Moment:

@@ -26,7 +26,8 @@ WRONG_LAYOUT = "layout"
 """Code of the finding that another layout fits clearly better: no model can come of such data."""
 SERIOUS = {
     *("poor-fit", "orientation", "handedness", "normalised", "sentinel", "origin"),
-    *("confidence-scale", "misspelt", "one-side", "incomplete", "mixed-hands"),
+    *("confidence-scale", "misspelt", "one-side", "unnamed", "depth"),
+    *("incomplete", "mixed-hands"),
 }
 """Codes of the findings that make a model doubtful: it learns what is wrong in its data."""
 

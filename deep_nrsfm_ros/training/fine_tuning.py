@@ -24,6 +24,7 @@ from collections.abc import Callable
 import numpy as np
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.spelling import match_names
 from deep_nrsfm_ros.model_files.model_file import Model
 from deep_nrsfm_ros.nrsfm.geometry import Array
 from deep_nrsfm_ros.nrsfm.network import Network
@@ -53,8 +54,8 @@ def start_from(model: Model, layout: KeypointLayout) -> Network:
     Raises:
         ValueError: fewer than 4 keypoints match.
     """
-    new = {name: i for i, name in enumerate(layout.keypoints)}
-    pairs = [(i, new[name]) for i, name in enumerate(model.layout.keypoints) if name in new]
+    places = match_names(layout.keypoints, model.layout.keypoints)
+    pairs = [(i, places[k]) for i, k in enumerate(model.layout.keypoints) if k in places]
     if len(pairs) < _FEWEST:
         raise ValueError(
             f"model {model.name!r} and layout {layout.name!r} share {len(pairs)} keypoints by "

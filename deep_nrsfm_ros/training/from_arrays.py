@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from deep_nrsfm_ros.configuration import check
 from deep_nrsfm_ros.data.curation import Curation, curate
@@ -23,7 +23,7 @@ from deep_nrsfm_ros.data.sufficiency import assess_sufficiency
 from deep_nrsfm_ros.extras import require_extra
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.lifting.observation import Observation, from_arrays
+from deep_nrsfm_ros.lifting.observation import Observation, from_arrays, unmasked
 from deep_nrsfm_ros.lifting.sanity import confidence_scale, find_origin, looks_normalised
 from deep_nrsfm_ros.model_files.find_layout import layout_of
 from deep_nrsfm_ros.model_files.matching_model import FROM_NONE, matching_model
@@ -54,8 +54,8 @@ def train(
     points: ArrayLike,
     confidence: ArrayLike | None = None,
     *,
-    layout: KeypointLayout | str | Path | Sequence[str],
-    object: KeypointLayout | str | Path | Sequence[str] | None = None,
+    layout: KeypointLayout | str | Path | Sequence[str] | NDArray[np.str_],
+    object: KeypointLayout | str | Path | Sequence[str] | NDArray[np.str_] | None = None,
     hands: str = "",
     name: str = "trained",
     start: Model | str | Path = "",
@@ -210,8 +210,11 @@ def _findings(
     Raises:
         ValueError: another layout fits clearly better.
     """
-    given = np.ones(np.shape(points)[:-1]) if confidence is None else np.asarray(confidence, float)
-    whole = confidence_scale(given) + find_origin(np.asarray(points), given)
+    xy = unmasked(points, np.nan)
+    given = np.ones(xy.shape[:-1])
+    if confidence is not None:
+        given = unmasked(confidence, 0).astype(float)
+    whole = confidence_scale(given) + find_origin(xy, given)
     findings = [SourceFinding("", finding) for finding in whole]
     # Only fractions of an image's size have units of their own for x and y.
     is_normalised = looks_normalised(seen.points, seen.confidence > 0)

@@ -24,6 +24,7 @@ from deep_nrsfm_ros.data.held_out import MIN_HELD_OUT, Split
 from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout, Tetrahedron
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.layouts.spelling import match_names
 from deep_nrsfm_ros.lifting.lifter import Lifter, lift_all
 from deep_nrsfm_ros.lifting.options import LiftingOptions
 from deep_nrsfm_ros.lifting.sanity import Finding
@@ -864,7 +865,7 @@ def _lift(model: Model, data: Dataset, options: LiftingOptions) -> _Lifted:
     lifted = lift_all(Lifter(model, options).lift, *mapped)
     sound = np.isfinite(lifted.shapes).all((1, 2)) & np.isfinite(lifted.residual)
     S = np.zeros((*data.visible.shape, 3))
-    places = {name: i for i, name in enumerate(model.layout.keypoints)}
+    places = match_names(model.layout.keypoints, data.layout.keypoints)
     common = [i for i, name in enumerate(data.layout.keypoints) if name in places]
     source = [places[data.layout.keypoints[i]] for i in common]
     S[:, common] = np.where(sound[:, None, None], lifted.shapes[:, source], 0)

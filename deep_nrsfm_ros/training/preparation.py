@@ -249,7 +249,8 @@ class _Reader:
         is_only_source = len(data.files()) == 1 and not data.bags
         named = source if data.keypoint_layout and is_only_source else None
         fallback = None if self._choice else source
-        options = dataclasses.replace(self._options, layout=named, fallback=fallback)
+        target = self._map.target
+        options = dataclasses.replace(self._options, layout=named, fallback=fallback, target=target)
         for path in _own_files(data)[0]:
             try:
                 own = _options_for(path, options)

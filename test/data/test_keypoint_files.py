@@ -233,7 +233,20 @@ def test_wrong_arrays_are_named(tmp_path: Path, arrays: dict[str, Any], expected
         ("a.jsonl", "", "is empty"),
         ("a.jsonl.gz", "no gzip", "a.jsonl.gz: "),
         ("a.npz", "no zip", "a.npz: "),
-        ("a.txt", "", "a.txt: it is of no known kind; expected a bag"),
+        ("a.poses", "", "a.poses: it is of no known kind; expected a bag"),
+        ("a.txt", "", r"a.txt: plain text .* np.save\(NEW, np.loadtxt\(FILE\).reshape"),
+        ("a.MAT", "", "a.MAT: .*scipy.io.loadmat"),
+        ("a.parquet", "", "pandas.read_parquet.*to_csv"),
+        ("a.xlsx", "", "save it as .csv"),
+        ("a.slp", "", r"SLEAP .*np.save\(NEW, sleap_io"),
+        ("a.nwb", "", "pynwb"),
+        ("a.bvh", "", "it is motion capture, which is 3D already"),
+        ("a.c3d", "", "it is motion capture, which is 3D already"),
+        ("a.pkl", "", "could run code"),
+        ("a.yaml", "", "json.dump"),
+        ("a.mp4", "", "run a detector first"),
+        ("a.json.zip", "", "it is an archive: unpack it"),
+        ("a.trc.gz", "", "it is compressed: unpack it"),
         ("a.mcap", "no bag", "a.mcap cannot be read"),
         ("folder/a.txt", "", "it holds .txt files: YOLO labels"),
     ],
@@ -244,6 +257,41 @@ def test_other_files_are_refused(tmp_path: Path, name: str, text: str, expected:
     path.write_text(text)
     with pytest.raises(ValueError, match=expected):
         read_keypoints(path.parent if path.parent != tmp_path else path, OPTIONS)
+
+
+@pytest.mark.parametrize("suffix", [".json.gz", ".ndjson", ".ndjson.gz", ".JSONL.GZ", ".csv.gz"])
+def test_other_names_and_compressed_files_are_read(
+    suffix: str, tmp_path: Path, seen: Detections
+) -> None:
+    if ".csv" in suffix:
+        text = "frame," + ",".join(f"{name}_x,{name}_y" for name in COCO17.keypoints)
+        rows = np.random.default_rng(0).uniform(1, 500, (3, 2 * Q))
+        text += "".join(f"\n{i}," + ",".join(map(str, row)) for i, row in enumerate(rows))
+    else:
+        plain = write("coco" if suffix == ".json.gz" else "jsonl", tmp_path, seen)
+        text = plain.read_text()
+    path = tmp_path / f"other{suffix}"
+    is_packed = suffix.lower().endswith(".gz")
+    path.write_bytes(gzip.compress(text.encode()) if is_packed else text.encode())
+    done = list[tuple[int, int]]()
+    found = read_keypoints(path, OPTIONS, lambda *counts: done.append(counts))
+    if ".csv" in suffix:
+        np.testing.assert_allclose(found.points.reshape(3, -1), rows, rtol=1e-6)
+        return
+    assert_same(found, read_keypoints(plain, OPTIONS))
+    assert all(0 <= part <= whole for part, whole in done) and done
+    whole = path.read_bytes()
+    if is_packed and ".json.gz" in suffix:
+        path.write_bytes(whole[: len(whole) // 2])
+        cut = read_keypoints(path, OPTIONS)
+        assert [finding.code for finding in cut.findings] == ["damaged"]
+        assert 0 < len(cut) < len(found)
+
+
+def test_a_damaged_table_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"frame,nose_x,nose_y\n" * 99)[:40])
+    with pytest.raises(KeypointFileError, match="a.csv.gz: "):
+        read_keypoints(tmp_path / "a.csv.gz")
 
 
 def test_missing_file_is_named(tmp_path: Path) -> None:

@@ -99,3 +99,9 @@ def test_what_is_no_camera_and_no_direction_is_refused() -> None:
     many = Lifter("human", LiftingOptions(min_visible=18), layout="coco17")
     with pytest.raises(ValueError, match="min_visible is 18"):
         VideoLifter(many)
+
+
+@pytest.mark.parametrize("seconds", [np.nan, np.inf])
+def test_a_time_that_is_none_is_refused(seconds: float) -> None:
+    with pytest.raises(ValueError, match=f"seconds is {seconds}; give the time of the frame"):
+        VideoLifter(LIFTER)(POINTS[0], seconds=seconds)

@@ -31,6 +31,9 @@ YAML = (b"*a", b"&a", b"!!int ''", b"<<: ", b"[", b"{", b"? ", b": ", b"\n- ", b
 JSON = (b"[", b"{", b"]", b"}", b",", b":", b'"', b"NaN", b"1e999", b"-Infinity", b"null", b"\xff",
         b"[" * 3000, b'{"people": []}', b"9" * 5000)  # fmt: skip
 
+CSV = (b",", b";", b"\n", b'"', b"#", b"sep=;\n", b"nan", b"1e999", b"-", b"x", b"frame", b"\xff",
+       b"\x00", b"9" * 30, b"0.5", b"10:00:00", b"(", b"[px]", b"a/b", b"\t")  # fmt: skip
+
 
 def views(f: int, p: int) -> np.ndarray:
     return np.random.default_rng(0).uniform(50, 600, (f, p, 2))
@@ -177,13 +180,23 @@ def test_a_keypoint_file_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: 
         "identities": np.array(["a", "b", "a", "c"]),
     }
 
+    others = {  # known by their shapes and the words in their names
+        "points": values["points"],
+        "keypoint_scores": np.ones((4, p)),
+        "frame_idx": np.array([0, 0, 1, 3]),
+        "timestamps": np.array([0.0, 0.0, 0.1, 0.2]),
+        "track_ids": np.array([1, 2, 1, 3]),
+        "fps": np.array([10.0]),
+    }
+
     def jsonl(content: object) -> bytes:
         return b"\n".join([json.dumps(content).encode()] * 2)
 
     def one(spoiler: Spoiler) -> str:
         kind = spoiler.choice(("json", "jsonl", "jsonl.gz", "npz"))
         if kind == "npz":
-            arrays = {name: value.copy() for name, value in values.items()}
+            chosen = spoiler.choice((values, others))
+            arrays = {name: value.copy() for name, value in chosen.items()}
             name = spoiler.choice([*arrays])
             changed = (
                 spoiler.anything(arrays[name].ravel()) if name != "identities" else arrays[name][1:]
@@ -214,3 +227,39 @@ def test_a_keypoint_file_is_read_or_refused(bench: Bench, fuzz: Fuzz, tmp_path: 
 
     # An array of an npz may claim terabytes: asked for, never touched, and given back.
     fuzz("keypoint file", one, touched=False)
+
+
+def test_a_table_is_read_or_refused(fuzz: Fuzz, tmp_path: Path) -> None:
+    rows = np.concatenate([views(6, 3), np.ones((6, 3, 1))], -1).reshape(6, -1).tolist()
+    names = [f"{name}_{c}" for name in ("nose", "ear", "tail") for c in ("x", "y", "score")]
+    flat = [point for row in rows for point in np.reshape(row, (3, 3)).tolist()]
+    levels = [["scorer", *["DLC"] * 9], ["bodyparts", *"aaabbbccc"], ["coords", *"xypxypxyp"]]
+    tables: list[list[list[Any]]] = [
+        [
+            ["frame", "time", "track", *names],
+            *([i // 2, i / 10, i % 2, *r] for i, r in enumerate(rows)),
+        ],
+        [["timestamp", *names], *([f"2024-05-01T10:00:0{i}", *r] for i, r in enumerate(rows))],
+        [
+            ["frame", "node", "x", "y", "score"],
+            *([i // 3, "abc"[i % 3], *p] for i, p in enumerate(flat)),
+        ],
+        [*levels, *([f"dir/{i}.png", *r] for i, r in enumerate(rows))],
+    ]
+    texts = ["\n".join(",".join(map(str, row)) for row in table).encode() for table in tables]
+
+    def one(spoiler: Spoiler) -> str:
+        content = spoiler.spoil_text(spoiler.choice(texts), CSV)
+        if spoiler.random() < 0.3:
+            content = spoiler.spoil_bytes(content)
+        file = tmp_path / "spoilt.csv"
+        file.write_bytes(content)
+        try:
+            seen = read_keypoints(file)
+        except KeypointFileError as refusal:
+            assert "spoilt" in str(refusal)
+            return "refused"
+        assert np.isfinite(seen.points).all() and (np.diff(seen.frame) >= 0).all()
+        return "read"
+
+    fuzz("table", one)

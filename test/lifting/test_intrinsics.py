@@ -136,3 +136,40 @@ def test_one_pixel_does_not_touch_another() -> None:
 def test_what_is_no_camera_is_refused(changes: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         Intrinsics(**{"focal": FOCAL, "principal": PRINCIPAL} | changes)
+
+
+K = np.array([[600.0, 0, 320], [0, 610, 236], [0, 0, 1]])
+MADE: Any = Intrinsics  # of arguments of other types, too
+
+
+@every_lens
+def test_a_camera_matrix_is_what_calibration_gives(lens: str) -> None:
+    name, distortion = LENSES[lens]
+    expected = camera(lens)
+    word = name if name == EQUIDISTANT else ""
+    assert Intrinsics.from_matrix(K, np.array([distortion]), word) == expected  # (1, n) of OpenCV
+    assert Intrinsics.from_matrix(K.ravel().tolist(), distortion, word) == expected  # of CameraInfo
+    arrays = MADE(np.array(FOCAL), list(PRINCIPAL), np.array([distortion]).T, name)
+    assert arrays == expected and hash(arrays) == hash(expected)
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (
+            lambda: MADE((1000,), (640, 360)),
+            r"focal of Intrinsics is \(1000,\); give \(fx, fy",
+        ),
+        (lambda: MADE(1000, (640, 360)), r"focal of Intrinsics is 1000; give \(fx, fy\)"),
+        (lambda: MADE((1, 1), 640), r"principal of Intrinsics is 640; give \(cx, cy\)"),
+        (lambda: MADE(K, (640, 360)), r"shape \(3, 3\); give Intrinsics.from_matrix\(K, d"),
+        (lambda: MADE("ab", (1, 1)), r"focal of Intrinsics is 'ab'"),
+        (lambda: MADE((1, 1), (1, 1), ("a",) * 4), "distortion of Intrinsics is .*numbers"),
+        (lambda: Intrinsics.from_matrix(K[:2]), r"is of shape \(2, 3\); it must be \(3, 3\)"),
+        (lambda: Intrinsics.from_matrix(K.T), r"must have the rows \(fx, 0, cx\)"),
+        (lambda: Intrinsics.from_matrix(K, [0.1] * 3), "'plumb_bob' has 3 coefficients"),
+    ],
+)
+def test_what_is_no_camera_says_what_to_give(make: Any, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        make()

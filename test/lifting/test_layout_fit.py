@@ -12,6 +12,7 @@ from deep_nrsfm_ros.layouts.keypoint_map import KeypointMap
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17, LAYOUTS
 from deep_nrsfm_ros.lifting.layout_fit import (
+    LayoutFit,
     ambiguity,
     better_layout,
     choose_layout,
@@ -38,6 +39,16 @@ def test_the_layout_of_seventeen_keypoints(human: Model, name: str) -> None:
     other = next(fit for fit in fits if fit.layout.name in {"human17", "coco17"} - {name})
     finding = better_layout(fits, other.layout, other.residual)
     assert finding and f"is it {name}? It fits {fits[0].residual:.2f}" in finding.message
+
+
+def test_a_layout_that_is_no_preset_is_called_that_of_the_model() -> None:
+    fits = [LayoutFit(KeypointLayout("mymouse", ("a", "b", "c", "d")), 0.05)]
+    finding = better_layout(fits, COCO17, 0.8)
+    assert (
+        finding
+        and "set the keypoint layout to that of the model (-p keypoint_layout:=model"
+        in (finding.message)
+    )
 
 
 @pytest.mark.parametrize("name", ["coco17", "posetrack18_17"])

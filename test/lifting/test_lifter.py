@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 
 from benchmarks.data.walking_person import in_layout
 from deep_nrsfm_ros.data.clip import read_clip
+from deep_nrsfm_ros.data.video_lifter import VideoLifter
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.layouts.presets import COCO17, HUMAN17
 from deep_nrsfm_ros.lifting.lifter import Lifted, Lifter
@@ -462,3 +464,42 @@ def test_mirrored_objects_over_time_and_under_gravity() -> None:
             )
         results.append(lifted.shapes * signs)
     np.testing.assert_allclose(results[0], results[1], atol=1e-5)
+
+
+def test_confidences_on_another_scale_are_said() -> None:
+    lifter = Lifter("human", layout="coco17")
+    points, confidence = in_layout(COCO17, 5)
+    with pytest.warns(UserWarning, match="it must be 0 to 1.*divide it by 100") as found:
+        lifter(points, 90 * confidence)
+    assert found[0].filename == __file__
+    with pytest.warns(UserWarning, match="it must be 0 to 1"):
+        VideoLifter(lifter)(points, 90 * confidence)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lifter(points, confidence)
+        lifter(points, 2 * (confidence > 0))  # COCO's visibility
+        lifter(points, confidence > 0)
+
+
+def test_what_a_mask_hides_is_missing() -> None:
+    lifter = Lifter("human", layout="coco17")
+    points, confidence = in_layout(COCO17, 5)
+    is_hidden = np.zeros((5, 17), bool)
+    is_hidden[:, 7:9] = True
+    expected = lifter(np.where(is_hidden[..., None], np.nan, points), confidence)
+    for masked in (
+        (np.ma.array(points, mask=np.stack([is_hidden] * 2, -1)), confidence),
+        (points, np.ma.array(confidence, mask=is_hidden)),
+        (points, np.ma.array(confidence, mask=False) * ~is_hidden),
+    ):
+        np.testing.assert_allclose(lifter(*masked).shapes, expected.shapes, atol=1e-6)
+    whole = np.round(points).astype(int)
+    found = lifter(np.ma.array(whole, mask=np.stack([is_hidden] * 2, -1)))
+    expected = lifter(whole, ~is_hidden)
+    np.testing.assert_allclose(found.shapes, expected.shapes, atol=1e-6)
+
+
+def test_names_of_an_npz_are_a_layout() -> None:
+    points, _ = in_layout(COCO17, 3)
+    found = Lifter("human", layout=np.array(COCO17.keypoints))(points)
+    np.testing.assert_array_equal(found.shapes, Lifter("human", layout="coco17")(points).shapes)

@@ -164,6 +164,20 @@ def test_points_relative_to_one_of_them() -> None:
     assert not find_origin(missing, ALL) and not find_origin(people(), np.zeros_like(ALL))
 
 
+@pytest.mark.parametrize("constant", [1000, (1300, 1300), (-1000, 2000)])
+def test_a_constant_makes_points_relative_to_one_of_them_sound(
+    constant: int | tuple[int, int],
+) -> None:
+    points = people() - people()[:, :1] + constant
+    points[7, 9] = constant  # another one by chance
+    assert not find_origin(points, ALL) and not codes(points)
+    points[::3, 5:8] = constant
+    assert codes(points) == ["sentinel"]
+    elsewhere = people()
+    elsewhere[::3, 5] = 1000  # one keypoint, but only at times
+    assert codes(elsewhere) == ["sentinel"]
+
+
 def test_points_relative_to_the_box_of_each_object() -> None:
     points = people()
     low, high = points.min(1, keepdims=True), points.max(1, keepdims=True)

@@ -15,7 +15,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 
 from benchmarks.data.walking_person import IMAGE, in_layout
-from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, HUMAN17
+from deep_nrsfm_ros.layouts.layout import KeypointLayout
+from deep_nrsfm_ros.layouts.presets import BODY25, BODY25B, COCO17, HUMAN17
 from deep_nrsfm_ros.lifting.intrinsics import Intrinsics
 from deep_nrsfm_ros.lifting.lifter import Lifter
 from deep_nrsfm_ros.lifting.observation import Observation
@@ -34,7 +35,7 @@ from deep_nrsfm_ros.messages.field_mapping import FieldMapping
 from deep_nrsfm_ros.messages.options import InputOptions
 from deep_nrsfm_ros.messages.pipeline import Pipeline
 from deep_nrsfm_ros.messages.serialised import MessageReader
-from deep_nrsfm_ros.messages.stream_check import StreamCheck
+from deep_nrsfm_ros.messages.stream_check import Choice, StreamCheck
 from deep_nrsfm_ros.model_files.model_file import load_model
 
 FRACTIONS = FieldMapping("other_msgs/Pose", keypoints="points", units="normalised")
@@ -164,3 +165,8 @@ def test_a_confidence_of_another_name_is_named(names: tuple[str, ...], expected:
     stream.received("/keypoints", MessageReader(POINT_CLOUD, lambda raw: cloud), b"\0\1\0\0")
     found = [f for f in stream.look(pipeline, None, None, 0.1) if f.code == "confidence-field"]
     assert [expected in str(finding) for finding in found] == [True] * bool(expected)
+
+
+def test_a_layout_is_named_as_the_parameter_takes_it() -> None:
+    assert Choice(COCO17, "").value == "coco17"
+    assert Choice(KeypointLayout("mymouse", ("a", "b", "c", "d")), "").value == "model"

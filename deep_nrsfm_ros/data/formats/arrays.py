@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,23 +14,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.detections import Detections, Frames, index_in_frame
+from deep_nrsfm_ros.data.formats.array_names import (
+    find_roles,
+    find_unused_arrays,
+    points_under_another_name,
+    read_headers,
+    taken_for,
+    unit_in_name,
+)
 from deep_nrsfm_ros.data.formats.builder import (
+    UNITS,
     KeypointFileError,
+    as_identity,
     identities_of,
+    plausible_unit,
     wrong_count,
 )
 from deep_nrsfm_ros.data.formats.frame_numbers import stamps_of
 from deep_nrsfm_ros.data.formats.names import contradiction, layout_of_names
+from deep_nrsfm_ros.data.formats.overlap import CROWD, SAME_PLACE, overlap_in_turn
 from deep_nrsfm_ros.data.read_options import DEFAULT_RATE, ReadOptions
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
 from deep_nrsfm_ros.lifting.observation import to_observation, without_value
-from deep_nrsfm_ros.lifting.sanity import confidence_scale, find_origin
+from deep_nrsfm_ros.lifting.sanity import Finding, confidence_scale, find_origin
 
 _MAX_EMPTY = 1_000_000  # frames without an object: nine hours at 30 Hz
-_OPTIONAL = (
-    *("confidence", "frame", "stamps", "identities", "scores"),
-    *("names", "frame_numbers", "frame_names"),
-)
+_TEXTS = ("identities", "names", "frame_names")
+_MEDIAPIPE = 33  # landmarks of MediaPipe Pose, of x, y, z, visibility
+_LATEST = 2.0**62  # ns
+_FRACTION = 2.0  # depths of MediaPipe, in widths of the image, are below it
+_SAMPLE = 5000  # objects
+_MANY = 0.5  # fraction of objects that makes a suspicion a warning
 _OF_OTHERS = {
     "positions_2d": "VideoPose3D's data_2d_*.npz",
     "boxes": "detections of Detectron, as VideoPose3D's infer_video.py writes them",
@@ -39,36 +54,47 @@ _OF_OTHERS = {
 def read_npz(path: Path, options: ReadOptions) -> Detections:
     """Return the objects in the arrays of an .npz: see README, "Files instead of topics".
 
-    Only the arrays that are needed are read; what else the file holds does not matter.
+    Only the arrays that are needed are read. One under another name is known by its shape and the
+    words in its name; what is not used is named.
     """
     warnings: list[str] = []
     arrays: dict[str, NDArray[Any]] = {}
     with _open(path) as file:
         if "points" not in file.files:
             raise KeypointFileError(_of_others(file, options))
-        for name in ("points", *_OPTIONAL):
-            if name not in file.files:
-                continue
+        headers = read_headers(file)
+        roles = find_roles(headers)
+        for role, name in roles.items():
             try:
-                arrays[name] = file[name]
+                arrays[role] = file[name]
             except ValueError as error:
                 if "pickle" not in str(error).lower():
                     raise
                 text = (
                     f"array `{name}` holds Python objects, which could run code when they are "
                     f"read; save it with a plain type: np.savez(..., {name}={name}.astype("
-                    f"{'str' if name in ('identities', 'names', 'frame_names') else 'float'}))"
+                    f"{'str' if role in _TEXTS else 'float'}))"
                 )
-                if name == "points":
+                if role == "points":
                     raise KeypointFileError(text) from None
                 warnings.append(text)
             except (BadZipFile, EOFError, OSError, zlib.error) as error:
                 raise KeypointFileError(f"array `{name}` is damaged: {error}") from error
-    return _detections(arrays, options, warnings)
+    rows, findings = _rows(arrays), list[Finding]()
+    if "frame" in rows:
+        rows["frame"] = _frame_of_each(rows, len(rows["points"]))
+    notes = _use_others(rows, roles, findings)
+    options = _with_rate(rows, roles, options)
+    sentences, unused = find_unused_arrays(headers, roles)
+    has_padding = arrays["points"].ndim == 4
+    found = _detections(rows, options, warnings, has_padding=has_padding)
+    return _said(
+        found, [*notes, *sentences], findings + unused + _find_axes(arrays["points"], found)
+    )
 
 
 def read_npy(path: Path, options: ReadOptions) -> Detections:
-    """Return the objects in an array: (frames, q, 2 or 3) or (frames, objects, q, 2 or 3).
+    """Return the objects in an array: (frames, q, 2 to 4) or (frames, objects, q, 2 to 4).
 
     Such an array has as many objects in each frame: one without a keypoint is padding.
     """
@@ -82,15 +108,179 @@ def read_npy(path: Path, options: ReadOptions) -> Detections:
         raise KeypointFileError(reason) from None
     if points.ndim == 2 and points.shape[1] in (2, 3):
         points = points[None]
-    arrays = {"points": points}
-    if points.ndim == 4:
-        f, n = points.shape[:2]
-        arrays = {
-            "points": points.reshape(f * n, *points.shape[2:]),
-            "frame": np.repeat(np.arange(f), n),
-            "stamps": stamps_of(None, f, options.rate or DEFAULT_RATE),
-        }
-    return _detections(arrays, options, [], is_npy=True)
+    found = _detections(_rows({"points": points}), options, [], has_padding=True)
+    return _said(found, [], _find_axes(points, found))
+
+
+def _said(found: Detections, notes: list[str], findings: list[Finding]) -> Detections:
+    """Return detections with more notes and findings."""
+    findings = [*found.findings, *findings]
+    return dataclasses.replace(found, notes=(*notes, *found.notes), findings=tuple(findings))
+
+
+def _rows(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return arrays with a row for each object, where `points` is (frames, objects, q, ...)."""
+    points = arrays["points"]
+    if points.ndim != 4:
+        return dict(arrays)
+    f, n = points.shape[:2]
+    rows = {
+        role: array.reshape(f * n, *array.shape[2:]) if array.shape[:2] == (f, n) else array
+        for role, array in arrays.items()
+    }
+    frame = rows.get("frame", np.arange(f))
+    rows["frame"] = np.repeat(frame, n) if frame.shape == (f,) else frame
+    return rows
+
+
+def _use_others(
+    rows: dict[str, NDArray[Any]], roles: Mapping[str, str], findings: list[Finding]
+) -> list[str]:
+    """Turn numbers and times under other names into `frame`, `frame_numbers` and `stamps`.
+
+    What is no number or time of a frame is left out, with a finding.
+
+    Args:
+        rows: the arrays by their roles; changed.
+        roles: what is read -> name of the array.
+        findings: is given what looks wrong.
+
+    Returns:
+        Sentences on how the arrays are taken.
+    """
+    notes, roles = list[str](), dict(roles)
+    if "stamps" in rows and _has_fractions(rows["stamps"]):  # in seconds, then
+        rows["times"], roles["times"] = rows.pop("stamps"), "stamps"
+    numbers, times = rows.pop("numbers", None), rows.pop("times", None)
+    taken = dict(roles)
+    if numbers is not None and not _use_numbers(rows, numbers):
+        del taken["numbers"]
+        findings.append(
+            Finding(
+                "unused",
+                f"not used: array {roles['numbers']}, which has no whole number for each object; "
+                "save the index of the frame of each as `frame`",
+            )
+        )
+    if times is not None and (unit := _use_times(rows, times, unit_in_name(roles["times"]))):
+        notes.append(f"its times (`{roles['times']}`) are taken for {unit}")
+    elif times is not None:
+        findings.append(
+            Finding(
+                "unused",
+                f"not used: array {roles['times']}, which has no growing time for each frame, 1 ms "
+                "to 10 s apart; save the times of the frames in ns as `stamps`",
+            )
+        )
+    return [*taken_for(taken), *notes]
+
+
+def _has_fractions(array: NDArray[Any]) -> bool:
+    """Return whether an array has a number that is no whole one."""
+    if array.dtype.kind != "f" or array.ndim != 1:
+        return False
+    finite = array[np.isfinite(array)]
+    return bool((finite != np.round(finite)).any())
+
+
+def _use_numbers(rows: dict[str, NDArray[Any]], numbers: NDArray[Any]) -> bool:
+    """Set the frames by their numbers in the input; return False if they are none."""
+    exact = numbers.astype(np.float64)
+    if not (np.abs(exact) < 2**62).all() or (exact != np.round(exact)).any():  # NaN compares false
+        return False
+    frame, m = rows.get("frame"), len(rows["points"])
+    numbers = numbers.astype(np.int64).ravel()
+    if frame is None:
+        rows["frame_numbers"], rows["frame"] = np.unique(numbers, return_inverse=True)
+        return True
+    f = int(frame.max(initial=-1)) + 1
+    if len(numbers) == m != f:  # of each of the objects of a frame
+        numbers = numbers.reshape(f, -1)[:, 0]
+    rows.setdefault("frame_numbers", numbers)
+    return True
+
+
+def _use_times(rows: dict[str, NDArray[Any]], times: NDArray[Any], unit: str) -> str:
+    """Set the stamps by times in a unit; return it, or "" if they are no times of the frames.
+
+    Args:
+        rows: the arrays by their roles; changed.
+        times: of each object or each frame.
+        unit: a key of `UNITS`; "" = the one in which frames are a plausible time apart.
+    """
+    values, m = times.astype(np.float64), len(rows["points"])
+    if not np.isfinite(values).all() or (np.diff(values) < 0).any():
+        return ""
+    frame = rows.get("frame")
+    if frame is None and len(values) == m:
+        values, frame = np.unique(values, return_inverse=True)
+    if frame is None:
+        return ""
+    f = max(int(frame.max(initial=-1)) + 1, len(rows.get("frame_numbers", ())))
+    if len(values) == m != f:
+        shown, first = np.unique(frame, return_index=True)
+        values = np.interp(np.arange(f), shown, values[first])
+    unit = unit or plausible_unit(values)
+    if len(values) != f or not unit or np.abs(values).max(initial=0) >= _LATEST / UNITS[unit]:
+        return ""
+    # Relative to the first one: a float64 of seconds since 1970 has steps of 0.2 us.
+    start = round(float(values[0])) if f else 0
+    rows["frame"] = frame
+    rows["stamps"] = np.round((values - start) * UNITS[unit]).astype(np.int64) + start * UNITS[unit]
+    return unit
+
+
+def _with_rate(
+    rows: dict[str, NDArray[Any]], roles: Mapping[str, str], options: ReadOptions
+) -> ReadOptions:
+    """Return options with the frames per second that a file says.
+
+    Raises:
+        KeypointFileError: the options say another one, or it is none.
+    """
+    if "rate" not in rows:
+        return options
+    rate, name = float(rows.pop("rate").ravel()[0]), roles["rate"]
+    if not 1e-3 <= rate <= 1e6:
+        raise KeypointFileError(f"`{name}` is {rate:g}, no number of frames a second")
+    if "stamps" in rows:
+        return options
+    if options.rate and abs(options.rate - rate) > 1e-3 * rate:
+        raise KeypointFileError(f"it has `{name}` {rate:g}: leave out --rate {options.rate:g}")
+    return dataclasses.replace(options, rate=rate)
+
+
+def _find_axes(points: NDArray[Any], found: Detections) -> list[Finding]:
+    """Return whether frames were taken for objects: these lie where others lie, as over time.
+
+    Args:
+        points: as the file has them.
+        found: the objects as they are read.
+    """
+    if points.ndim == 4 and points.shape[1] >= CROWD:
+        in_frame = overlap_in_turn(points)
+        if in_frame <= max(SAME_PLACE, overlap_in_turn(points.swapaxes(0, 1))):
+            return []
+        return [
+            Finding(
+                "one-frame",
+                f"`points` {points.shape} is read as frames, objects, keypoints, but the objects "
+                "of a frame lie on each other, as one does over time: save points.transpose(1, 0, "
+                "2, 3) if the first axis is the people, or points[0] if it is the cameras",
+            )
+        ]
+    m = len(found)
+    if points.ndim != 3 or m < CROWD or found.frame[0] != found.frame[-1]:
+        return []
+    if overlap_in_turn(found.points[None]) <= SAME_PLACE:
+        return []
+    return [
+        Finding(
+            "one-frame",
+            f"all {m} objects are of one frame, and lie on each other: if each is of a frame of "
+            "its own, leave `frame` out, or give it the number of the frame of each",
+        )
+    ]
 
 
 def _open(path: Path) -> Any:
@@ -112,7 +302,8 @@ def _of_others(file: Any, options: ReadOptions) -> str:
     found = ", ".join(f"`{name}`" for name in file.files) or "no array"
     text = f"no array `points` (objects, {q}, 2); there are: {found}"
     if not origin:
-        return text
+        name = points_under_another_name(read_headers(file))
+        return text + (f"; save np.savez(NEW, points=np.load(FILE)[{name!r}])" if name else "")
     return (
         f"it is {origin} ({found}), in which keypoints are Python objects: they could run code "
         "when they are read. Load it yourself with np.load(FILE, allow_pickle=True) if you trust "
@@ -124,7 +315,8 @@ def _detections(
     arrays: Mapping[str, NDArray[Any]],
     options: ReadOptions,
     warnings: list[str],
-    is_npy: bool = False,
+    *,
+    has_padding: bool,
 ) -> Detections:
     """Return the objects in arrays as detections, in the order of their frames.
 
@@ -132,8 +324,8 @@ def _detections(
         arrays: by their names in an .npz; `points` (m, q, 2 or 3), the others optional.
         options: how they are read.
         warnings: from reading the arrays.
-        is_npy: whether they are of an .npy, with as many objects in each frame, and `stamps` made
-            by `options.rate`.
+        has_padding: whether each frame has as many objects, so that one without a keypoint is
+            none.
 
     Raises:
         KeypointFileError: an array is not usable, or an option contradicts it.
@@ -141,19 +333,28 @@ def _detections(
     points = _numbers(arrays, "points", np.float64)
     layout = _layout(arrays, options)
     _check_shape(points, layout)
+    if points.shape[2] == 4:
+        points = points[..., [0, 1, 3]]
+        if points.shape[1] != _MEDIAPIPE:
+            warnings = [*warnings, "four numbers of a keypoint are read as x, y, z, confidence"]
     m, q = points.shape[:2]
+    solid = list[Finding]()
     if "confidence" in arrays:
-        confidence = _numbers(arrays, "confidence", np.float64, (m, q))
+        confidence = _confidence(arrays["confidence"], (m, q))
         points = np.concatenate([points[..., :2], confidence[..., None]], -1)
+    elif points.shape[2] == 3 and (depths := _count_depths(points)):
+        solid = _find_solid(points)
+        points[..., 2] = 1
+        warnings = warnings if solid else [*warnings, depths]
     frame = _frame_of_each(arrays, m)
-    frames, stamps = _frames_and_stamps(arrays, frame, options, rate_acts=is_npy)
+    frames, stamps = _frames_and_stamps(arrays, frame, options)
     scores = _scores(arrays, m, options)
     identities, warning = _identities(arrays, frame)
     warnings = [*warnings, warning] if warning else warnings
     given = points[..., 2] if points.shape[2] == 3 else np.ones((m, q))
-    findings = confidence_scale(given) + find_origin(points[..., :2], given)
+    findings = solid + confidence_scale(given) + find_origin(points[..., :2], given)
     observation = to_observation(points, options.min_confidence)
-    is_padding = _is_padding(points, options) if is_npy else np.zeros(m, bool)
+    is_padding = _is_padding(points, options) if has_padding else np.zeros(m, bool)
     order = np.argsort(frame, kind="stable")
     kept = order[scores[order] >= options.min_score] if options.min_score else order
     if len(kept) < m:
@@ -172,6 +373,44 @@ def _detections(
         findings=tuple(findings),
         is_padding=is_padding[kept],
     )
+
+
+def _confidence(given: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    """Return the confidence (m, q) of each keypoint; whether it is visible does, too."""
+    if given.shape == (*shape, 1):
+        given = given[..., 0]
+    if given.dtype.kind == "b":
+        given = given.astype(np.float64)
+    return _numbers({"confidence": given}, "confidence", np.float64, shape)
+
+
+def _count_depths(points: NDArray[Any]) -> str:
+    """Return the sentence that the third numbers of (m, q, 3) are depths; "" if they are not."""
+    third = points[..., 2]
+    count = int(((third < 0) & (third != -1)).any(1).sum())
+    shown = int((points[..., :2] != 0).any((1, 2)).sum())
+    if count <= _MANY * max(shown, 1):
+        return ""
+    return (
+        f"the third number of a keypoint is negative in {count} of {shown} objects: it is a depth "
+        "and no confidence, so all keypoints count as seen"
+    )
+
+
+def _find_solid(points: NDArray[Any]) -> list[Finding]:
+    """Return whether (m, q, 3) with depths look like 3D points, whose depths are no fractions."""
+    third = points[:: max(1, len(points) // _SAMPLE), :, 2]
+    third = np.abs(third[np.isfinite(third) & (third != 0)])
+    if not third.size or (third > _FRACTION).mean() <= _MANY:
+        return []
+    return [
+        Finding(
+            "depth",
+            f"the third number of a keypoint goes to {third.max():.4g} and is negative in many "
+            "objects: it is a depth. If the points are 3D, `lift` needs the 2D keypoints that they "
+            "come from; if x and y are pixels of the image, save points[..., :2]",
+        )
+    ]
 
 
 def _is_padding(points: NDArray[Any], options: ReadOptions) -> NDArray[np.bool_]:
@@ -199,7 +438,7 @@ def _layout(arrays: Mapping[str, NDArray[Any]], options: ReadOptions) -> Keypoin
             f"its `names` are {len(names)}, and `points` has {q} keypoints: save a name for each, "
             "or leave `names` out"
         )
-    named = layout_of_names(names.tolist())
+    named = layout_of_names(names.tolist(), options.owners())
     reason = contradiction(options.layout, named) if options.layout else ""
     if options.layout and reason:
         raise KeypointFileError(
@@ -210,8 +449,8 @@ def _layout(arrays: Mapping[str, NDArray[Any]], options: ReadOptions) -> Keypoin
 
 
 def _check_shape(points: NDArray[Any], layout: KeypointLayout | None) -> None:
-    """Raise KeypointFileError unless points are (m, q, 2 or 3), with the layout's q keypoints."""
-    if points.ndim != 3 or points.shape[2] not in (2, 3):
+    """Raise KeypointFileError unless points are (m, q, 2 to 4), with the layout's q keypoints."""
+    if points.ndim != 3 or points.shape[2] not in (2, 3, 4):
         q = len(layout) if layout else "q"
         raise KeypointFileError(
             f"`points` is {points.shape}; (objects, {q}, 2), or 3 with the confidence, is "
@@ -245,8 +484,6 @@ def _frames_and_stamps(
     arrays: Mapping[str, NDArray[Any]],
     frame: NDArray[np.int64],
     options: ReadOptions,
-    *,
-    rate_acts: bool,
 ) -> tuple[Frames, NDArray[np.int64]]:
     """Return numbers and names of all frames, and their stamps, also of those without objects.
 
@@ -261,7 +498,7 @@ def _frames_and_stamps(
     if "frame_numbers" in arrays:
         numbers = _numbers(arrays, "frame_numbers", np.int64, (count,))
     if "stamps" in arrays:
-        if options.rate and not rate_acts:
+        if options.rate:
             raise KeypointFileError("it has `stamps` of its own: leave out --rate")
         stamps = _numbers(arrays, "stamps", np.int64, (count,))
     else:
@@ -302,14 +539,19 @@ def _identities(
     given = arrays["identities"]
     if given.shape != frame.shape:
         raise KeypointFileError(f"`identities` is {given.shape}; ({len(frame)},) is needed")
-    texts = [None if t in ("-1", "") else t for t in given.astype(str).tolist()]
+    given = given.astype(str) if given.dtype.kind == "S" else given
+    texts = [as_identity(each) for each in given.tolist()]
     return identities_of(texts, frame)
 
 
 def _remedy(shape: tuple[int, ...]) -> str:
     """Return how an array of another order becomes one of objects; "" if that is not clear."""
+    if len(shape) > 4:
+        part = ", ".join([":"] * shape.index(1) + ["0"]) if 1 in shape[:-2] else "0"
+        return f"; save a part of it, such as points[{part}]"
     if len(shape) == 2 and shape[1] >= 8:
         sizes = [size for size in (3, 2) if shape[1] % size == 0]
+        sizes = [4] if shape[1] == 4 * _MEDIAPIPE else sizes
         forms = " or ".join(f"({shape[0]}, {shape[1] // n}, {n})" for n in sizes)
         return f"; if a row is an object, save points.reshape{forms}" if sizes else ""
     if len(shape) == 3 and (axes := [i for i in (1, 0) if shape[i] in (2, 3)]):
@@ -332,6 +574,9 @@ def _numbers(
     if array.dtype.kind not in "fiu" or shape is not None and array.shape != shape:
         wanted = "of numbers" if shape is None else f"of numbers {shape}"
         raise KeypointFileError(f"`{name}` is {array.dtype} {array.shape}; {wanted} is needed")
-    if kind is np.int64 and not (np.abs(array) < 2**63).all():
+    if kind is np.int64 and not (np.abs(array.astype(np.float64)) < 2**63).all():
         raise KeypointFileError(f"`{name}` has a number that is no whole one of 64 bits")
+    if kind is np.int64 and _has_fractions(array):
+        times = ", and the times in ns `stamps`" if name == "frame" else ""
+        raise KeypointFileError(f"`{name}` has fractions; whole numbers are needed{times}")
     return array.astype(kind)

@@ -488,7 +488,7 @@ class DetectionsBuilder:
             layout = self._preset or self._of_mediapipe()
         else:
             try:
-                layout = layout_of_names(names)
+                layout = layout_of_names(names, self.options.owners())
             except ValueError as error:
                 self.warnings.append(f"its names of keypoints are not used: {error}")
                 layout = self._preset
@@ -504,9 +504,8 @@ class DetectionsBuilder:
         return options.layout
 
     def _knows(self, names: Sequence[str]) -> bool:
-        """Return whether the layout that the options name has a keypoint of these names."""
-        layout = self.options.layout or self.options.fallback
-        return layout is not None and not set(names).isdisjoint(layout.keypoints)
+        """Return whether a layout that the options name has a keypoint of these names."""
+        return any(not set(names).isdisjoint(each.keypoints) for each in self.options.owners())
 
     def _of_mediapipe(self) -> KeypointLayout | None:
         """Return the layout of MediaPipe's landmarks; None if the objects are no such landmarks.

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from difflib import SequenceMatcher
 from functools import cache
 
 from deep_nrsfm_ros.layouts.layout import SIDE_WORDS, KeypointLayout
 from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.layouts.spelling import ALIASES, match_names, side_and_rest
 
 NAMED_BY_INPUT = "names_of_the_input"
 """Name of a layout of the names in an input, which are not those of a preset."""
@@ -32,16 +33,6 @@ _COUNTED = re.compile(
     r"(kp|kpt|keypoint|key_?point|point|pt|joint|landmark|lm|marker|p|k|j)[_ .-]?(\d{1,4})",
     re.IGNORECASE,
 )
-_ALIASES = {
-    "sho": "shoulder",
-    "elb": "elbow",
-    "wri": "wrist",
-    "kne": "knee",
-    "ank": "ankle",
-    "bigtoe": "big_toe",
-    "smalltoe": "small_toe",
-    "midhip": "mid_hip",
-}
 
 
 def layout_of_dataset(dataset: str) -> KeypointLayout | None:
@@ -50,21 +41,30 @@ def layout_of_dataset(dataset: str) -> KeypointLayout | None:
     return LAYOUTS.get(name)
 
 
-def layout_of_names(names: Sequence[str]) -> KeypointLayout:
+def layout_of_names(names: Sequence[str], owners: Iterable[KeypointLayout] = ()) -> KeypointLayout:
     """Return the layout with these keypoints: a preset if one has them, else a layout of them.
 
-    Known keypoints of another spelling ("LShoulder", "shoulder_l", "left shoulder") get that of
-    the presets; a name of no preset remains.
+    A name that an owner has in any spelling becomes the owner's. Other known keypoints of another
+    spelling ("LShoulder", "shoulder_l", "left shoulder") get that of the presets; a name of no
+    preset remains.
+
+    Args:
+        names: of the keypoints of an input.
+        owners: layouts to which the keypoints may be mapped, such as that of the model.
 
     Raises:
         ValueError: a name is not unique.
     """
-    for keypoints in (tuple(names), tuple(map(preset_spelling, names))):
-        for name in LAYOUTS:
-            if LAYOUTS[name].keypoints == keypoints:
-                return LAYOUTS[name]
-    unique = keypoints if len(set(keypoints)) == len(keypoints) else tuple(names)
-    return KeypointLayout(NAMED_BY_INPUT, unique)
+    own: dict[str, str] = {}
+    for owner in owners:
+        for name, place in match_names(names, owner.keypoints).items():
+            own.setdefault(names[place], name)
+    spelt = tuple(own.get(name) or preset_spelling(name) for name in names)
+    for keypoints in (tuple(names), spelt):
+        for preset in LAYOUTS:
+            if LAYOUTS[preset].keypoints == keypoints:
+                return LAYOUTS[preset]
+    return KeypointLayout(NAMED_BY_INPUT, spelt if len(set(spelt)) == len(spelt) else tuple(names))
 
 
 def are_numbers(names: Sequence[str]) -> bool:
@@ -81,25 +81,16 @@ def preset_spelling(name: str) -> str:
     known = _known()
     if name in known:
         return name
-    sides, rest = _words(name)
-    bare = [rest, _ALIASES.get(rest, rest)]
+    sides, rest = side_and_rest(name)
+    bare = [rest, ALIASES.get(rest, rest)]
     if sides:
         candidates = [f"{sides[0]}_{name}" for name in bare]
     elif rest[:1] in SIDE_WORDS:  # lshoulder
-        part = rest[1:]
-        side = SIDE_WORDS[rest[0]]
-        candidates = [*bare, *(f"{side}_{p}" for p in (part, _ALIASES.get(part, part)))]
+        side, part = SIDE_WORDS[rest[0]], rest[1:]
+        candidates = [*bare, *(f"{side}_{p}" for p in (part, ALIASES.get(part, part)))]
     else:
         candidates = bare
     return next((candidate for candidate in candidates if candidate in known), name)
-
-
-def _words(name: str) -> tuple[list[str], str]:
-    """Return the sides in a name, and the rest of it: ["left"], "small_toe" of LSmallToe."""
-    words = re.sub(r"([a-z0-9])([A-Z])|([A-Z])([A-Z][a-z])", r"\1\3_\2\4", name).lower()
-    parts = [part for part in re.split(r"[^a-z0-9]+", words) if part]
-    sides = [SIDE_WORDS[part] for part in parts if part in SIDE_WORDS]
-    return sides, "_".join(part for part in parts if part not in SIDE_WORDS)
 
 
 def misspelt(names: Collection[str], wanted: Sequence[str]) -> dict[str, str]:
@@ -111,12 +102,12 @@ def misspelt(names: Collection[str], wanted: Sequence[str]) -> dict[str, str]:
         names: of the keypoints of an input.
         wanted: names of the keypoints of a model.
     """
-    missing = {name: _words(name) for name in wanted if name not in names}
+    missing = {name: side_and_rest(name) for name in wanted if name not in names}
     found: dict[str, str] = {}
     for name in names:
         if name in _known() or name in wanted:
             continue
-        sides, rest = _words(name)
+        sides, rest = side_and_rest(name)
         likeness = {
             other: SequenceMatcher(None, rest, other_rest).ratio()
             for other, (other_sides, other_rest) in missing.items()
@@ -153,8 +144,9 @@ def contradiction(layout: KeypointLayout, names: KeypointLayout) -> str:
         return ""
     if len(layout) != len(names):
         return f"it names {len(names)} keypoints, {layout.name} has {len(layout)}"
-    own = dict.fromkeys(layout.keypoints)
-    for i, name in enumerate(names.keypoints):
-        if name in own and layout.keypoints[i] != name:
-            return f"its keypoint {i} is {name}, that of {layout.name} is {layout.keypoints[i]}"
-    return ""
+    found = match_names(names.keypoints, layout.keypoints)
+    moved = [place for name, place in found.items() if layout.index(name) != place]
+    if not moved:
+        return ""
+    own, other = names.keypoints[min(moved)], layout.keypoints[min(moved)]
+    return f"its keypoint {min(moved)} is {own}, that of {layout.name} is {other}"

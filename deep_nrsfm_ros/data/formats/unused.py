@@ -11,7 +11,10 @@ from deep_nrsfm_ros.lifting.sanity import Finding
 _SHOWN = 6  # names that a sentence lists
 _MEANINGS = {
     "the frame": ("frame", "image", "img", "file", "filename", "path"),
-    "the time": ("time", "timestamp", "stamp", "sec", "seconds", "ms", "usec", "pts", "fps"),
+    "the time": (
+        *("time", "timestamp", "stamp", "sec", "seconds", "ms", "us", "µs", "usec", "ns", "pts"),
+        "fps",
+    ),
     "an identity": ("id", "ids", "track", "tracks", "person", "individual", "animal", "subject"),
     "a confidence": (
         *("conf", "confidence", "confidences", "score", "scores", "prob", "probability", "vis"),
@@ -24,7 +27,8 @@ _MEANINGS = {
 def meaning(name: str) -> str:
     """Return what an unused name seems to hold: a key of `_MEANINGS`, or ""."""
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()
-    words = {word for word in re.split(r"[^a-z]+", spaced) if word}
+    words = {word for word in re.split(r"[^a-zµ]+", spaced) if word}
+    words |= {word.removesuffix("s") for word in words}
     return next((what for what, known in _MEANINGS.items() if not words.isdisjoint(known)), "")
 
 
