@@ -217,7 +217,8 @@ class Rank(NamedTuple):
 
     Attributes:
         doubtful: whether the rule doubts the model.
-        at_hand: whether it is the model at hand, which comes after all that are better.
+        at_hand: whether it is the model at hand, which comes after all that are better, or one that
+            cannot be compared with it.
         score: sum of its misfit, and the shares of frames that are turned or opposed. Few opposed
             frames say nothing: which of both models is right is unknown.
     """
@@ -630,7 +631,8 @@ def rank(new: Figures, old: Figures | None, *, has_advantage: bool = False) -> R
     opposed = new.opposed if is_opposed else 0.0
     worse = worse_figures(new, old, has_advantage=has_advantage)
     is_doubtful = new is not old and bool(worse)
-    return Rank(is_doubtful, new is old, new.misfit + new.wrong_sides + opposed)
+    is_unknown = has_advantage and not worse and bool(worse_figures(new, old))
+    return Rank(is_doubtful, new is old or is_unknown, new.misfit + new.wrong_sides + opposed)
 
 
 def _or_zero(value: float) -> float:

@@ -147,7 +147,9 @@ def test_a_model_is_not_doubtful_because_the_rival_has_learned_the_held_out_fram
     assert judgement.record()["rival_has_learned_the_frames"]
     hopeless = judge(frames, bad, rival)
     assert hopeless.doubtful and said in str(hopeless)
-    shown = {each.model.name: each for each in standings(frames, [new, bad], rival)}
+    places = standings(frames, [new, bad], rival)
+    assert [each.model.name for each in places] == ["good", "looser", "bad"]
+    shown = {each.model.name: each for each in places}
     assert shown["looser"].verdict == "unknown" and shown["bad"].verdict == "doubtful"
     assert shown["good"].has_learned and not shown["looser"].has_learned
 
