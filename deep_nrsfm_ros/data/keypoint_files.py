@@ -7,10 +7,10 @@ import dataclasses
 import gzip
 import io
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, nullcontext, suppress
 from functools import partial
-from itertools import pairwise
+from itertools import chain, count, islice, pairwise
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -28,7 +28,7 @@ from deep_nrsfm_ros.data.formats.builder import (
 )
 from deep_nrsfm_ros.data.formats.frame_numbers import natural
 from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
-from deep_nrsfm_ros.data.formats.json_items import Readable
+from deep_nrsfm_ros.data.formats.json_items import Readable, holds_documents, json_documents
 from deep_nrsfm_ros.data.formats.tables import read_csv, read_h5, read_trc
 from deep_nrsfm_ros.data.read_options import DEFAULT_READ_OPTIONS, ReadOptions
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
@@ -211,16 +211,41 @@ def _without_border(detections: Detections, size: Size) -> Detections:
 def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
     """Return the objects in a JSON file of any detector."""
     builder = DetectionsBuilder(options)
+    reader = JsonReader(builder)
     with path.open("rb") as file:
-        problem = _read_document(
-            JsonReader(builder), _Counted(file, path, on_progress), DefaultFrame(path.name)
-        )
+        several = holds_documents(file.read(_START))
+        file.seek(0)
+        counted = _Counted(file, path, on_progress)
+        if several:
+            problem = _read_documents(builder, reader, counted)
+        else:
+            problem = _read_document(reader, counted, DefaultFrame(path.name))
+    reader.finish()
     if problem and not builder.frames:
         reasons = builder.reasons()
         raise KeypointFileError("; ".join([problem, *reasons]))
     if problem:
         _find_damage(builder, problem)
     return builder.detections("it has no frame")
+
+
+def _read_documents(builder: DetectionsBuilder, reader: JsonReader, file: Readable) -> str:
+    """Read documents that follow one another, each a frame; return as `_read_document` does."""
+    builder.notes.append("it holds several documents, one after the other: each is a frame")
+    documents = json_documents(file)
+    for number in count():
+        frame = DefaultFrame(f"document {number + 1}", number, is_document=True)
+        try:
+            document = next(documents, _END)
+        except RecursionError:
+            return _DEEP
+        except ValueError as error:
+            return str(error)
+        if document is _END:
+            return ""
+        if problem := reader.read_value(document, frame):
+            builder.leave_out("cannot be read", f"{frame.name}: {problem}", is_loss=True)
+    return ""
 
 
 def _find_damage(builder: DetectionsBuilder, problem: str) -> None:
@@ -239,7 +264,7 @@ def _read_document(reader: JsonReader, file: Readable, frame: DefaultFrame) -> s
     try:
         return reader.read(file, frame)
     except RecursionError:
-        return "it is nested too deep for JSON of a detector"
+        return _DEEP
     except ValueError as error:
         return str(error)
 
@@ -264,9 +289,8 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
     is_compressed = path.name.lower().endswith(".gz")
 
     def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
-        lines = (line for line in file if line.strip())
-        for number, line in enumerate(lines):
-            yield DefaultFrame(f"line {number + 1}", number, is_document=True), line
+        for place, number, line in _numbered(file):
+            yield DefaultFrame(f"line {place}", number, is_document=True), line
             on_progress(min(raw.tell(), size), size)  # of what is compressed, as the size is
 
     with path.open("rb") as raw, gzip.open(raw) if is_compressed else nullcontext(raw) as file:
@@ -277,6 +301,22 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
                 raise
             _find_damage(builder, f"{error}, after {builder.frames} frames")
     return builder.detections("it is empty")
+
+
+def _numbered(lines: Iterable[bytes]) -> Iterator[tuple[int, int, bytes]]:
+    """Yield the lines of a file that are not empty, with their place from 1 and their frame.
+
+    An empty line is a frame without objects, unless there is one after each line.
+    """
+    remaining = iter(lines)
+    first = list(islice(remaining, 2 * _LOOKED_AT))
+    full = [i for i, line in enumerate(first) if line.strip()]
+    gaps = set(np.diff(full).tolist())
+    step = gaps.pop() if len(gaps) == 1 and len(full) > 2 else 1
+    start = full[0] if full and step > 1 else 0
+    for i, line in enumerate(chain(first, remaining)):
+        if line.strip():
+            yield i + 1, (i - start) // step, line
 
 
 def _table(
@@ -331,9 +371,14 @@ def _read_frames(
     reader = JsonReader(builder)
     for frame, text in documents:
         if problem := _read_document(reader, io.BytesIO(text), frame):
-            builder.leave_out("cannot be read", f"{frame.name}: {problem}")
+            builder.leave_out("cannot be read", f"{frame.name}: {problem}", is_loss=True)
+    reader.finish()
 
 
+_START = 1 << 20  # bytes of a file in which a document ends that is one of several
+_END = object()
+_DEEP = "it is nested too deep for JSON of a detector"
+_LOOKED_AT = 8  # lines that tell whether empty ones are frames
 _FEW_AT_BORDER = 0.01  # fraction of keypoints below which the border is no cause for doubt
 _BLOCK = 4096  # objects that are compared at once
 _SAMPLE = 256  # messages of a topic that `sample_bag` reads at least

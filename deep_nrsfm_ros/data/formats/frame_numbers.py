@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.detections import stamps_at
 
-_MOST_DIGITS = 18  # of a number of 64 bits
+_MOST_DIGITS = 19  # of a number of 64 bits
+_LARGEST = 2**63 - 1
 MOST = 1_000_000_000
 """A number from here on is a time or an identifier, not that of a frame: a year at 30 Hz."""
 
@@ -40,7 +41,10 @@ def numbers_in(names: Sequence[str]) -> NDArray[np.int64] | None:
             return None
         if any(len(part) > _MOST_DIGITS for part in parts[1::2]):
             return None
-        numbers[row] = [int(part) for part in parts[1::2]]
+        values = [int(part) for part in parts[1::2]]
+        if max(values, default=0) > _LARGEST:
+            return None
+        numbers[row] = values
     if len(names) == 1 and numbers.size:
         return numbers[:, -1]
     differing = np.flatnonzero((numbers != numbers[:1]).any(0))
