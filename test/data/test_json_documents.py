@@ -173,6 +173,17 @@ def test_the_name_of_a_video_is_no_frame(tmp_path: Path) -> None:
     assert len(read(write(tmp_path / "a.jsonl", lines)).stamps) == FRAMES
 
 
+def test_a_name_that_all_frames_have_names_none(tmp_path: Path) -> None:
+    frames = [
+        {"frame_id": "camera_link", "time": i / 10, "people": [{"keypoints": points(i)}]}
+        for i in range(FRAMES)
+    ]
+    for place in PLACES:
+        found = read(write(tmp_path / place, frames))
+        assert tenths(found) == list(range(FRAMES)) and not found.findings
+        assert found.frame.tolist() == list(range(FRAMES))
+
+
 def test_objects_of_several_frames_in_one_are_doubted(tmp_path: Path) -> None:
     """Also where two people take turns, and where there are but a few frames."""
     for frames in (2, 3, FRAMES):
@@ -246,6 +257,8 @@ def test_a_recording_says_its_rate(tmp_path: Path) -> None:
     found = read(tmp_path / "a.json", {"fps": 10, "frames": frames})
     assert tenths(found) == [0, 1, 2] and found.notes == ("10 frames a second, as it says (`fps`)",)
     assert tenths(read(tmp_path / "a.json", rate=5)) == [0, 2, 4]
+    found = read(tmp_path / "a.json", {"frames": frames, "info": {"frame_rate": 10}})
+    assert tenths(found) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -444,3 +457,6 @@ def test_3d_is_told_from_nothing(tmp_path: Path) -> None:
     world = [{"pose_world_landmarks": [[{"x": 0.1, "y": 0.2, "z": 0.3}] * 33]}] * 3
     with pytest.raises(KeypointFileError, match=r"pose_world_landmarks \(3D, and the 2D keypoi"):
         read(tmp_path / "a.json", world)
+    hands = [{"people": [{"hand_left_keypoints_2d": sum(points(0, 0, 21), [])}]}]
+    with pytest.raises(KeypointFileError, match="hands are read with --model hand21"):
+        read(tmp_path / "a.json", hands)
