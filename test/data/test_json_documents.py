@@ -168,6 +168,29 @@ def test_usual_names_of_the_frame(tmp_path: Path, name: str) -> None:
     assert is_silent(read(write(tmp_path / "a.jsonl", frames)))
 
 
+def test_the_number_of_a_frame_beside_its_objects(tmp_path: Path) -> None:
+    for name in ("index", "idx", "id", "number"):
+        frames = [{name: 3 * i, "people": [{"keypoints": points(i)}]} for i in range(FRAMES)]
+        for place in ("json", "jsonl"):
+            found = read(write(tmp_path / f"{name}.{place}", frames))
+            assert tenths(found) == list(range(FRAMES)) and is_silent(found)
+        same = [{**frame, name: 1} for frame in frames]  # of a camera
+        found = read(write(tmp_path / "same.jsonl", same))
+        assert len(found.stamps) == FRAMES and is_silent(found)
+
+
+def test_keypoints_with_labels(tmp_path: Path) -> None:
+    """Transformers leaves weak keypoints out, and gives the numbers of the others."""
+    frames = []
+    for i in range(4):
+        kept = [k for k in range(Q) if k != i]
+        frames.append([{"keypoints": [points(i)[k] for k in kept], "labels": kept}])
+    for options in ({}, {"layout": None}):
+        found = read(tmp_path / "a.json", frames, **options)
+        assert (found.confidence == 0).sum(1).tolist() == [1] * 4 and is_silent(found)
+        assert not found.confidence[range(4), range(4)].any()
+
+
 def test_the_name_of_a_video_is_no_frame(tmp_path: Path) -> None:
     lines = [{"file": "clip.mp4", "people": [{"keypoints": points(i)}]} for i in range(FRAMES)]
     assert len(read(write(tmp_path / "a.jsonl", lines)).stamps) == FRAMES

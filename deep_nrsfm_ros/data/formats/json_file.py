@@ -38,6 +38,8 @@ from deep_nrsfm_ros.data.formats.json_fields import (
 from deep_nrsfm_ros.data.formats.json_forms import (
     CONFIDENCE,
     KEYPOINTS,
+    NUMBER,
+    NUMBERS,
     OBJECTS,
     RECORDING,
     are_coordinates,
@@ -46,6 +48,7 @@ from deep_nrsfm_ros.data.formats.json_forms import (
     are_points,
     are_texts,
     as_list,
+    at_their_places,
     beside_points,
     check_frame,
     columns_of,
@@ -70,6 +73,7 @@ from deep_nrsfm_ros.data.formats.json_forms import (
     people_by_id,
     people_in,
     series_in,
+    with_number,
 )
 from deep_nrsfm_ros.data.formats.json_items import JsonItem, Readable, items_of, json_items
 from deep_nrsfm_ros.data.formats.json_unused import UnusedFields
@@ -124,7 +128,7 @@ class JsonReader:
         self._videos: dict[Any, None] = {}
         self._unused = UnusedFields()
         self._odd_times: list[Any] = []
-        self._last_name = ""  # of the frame before
+        self._last_name: Any = None  # of the frame before
 
     def read(self, file: Readable, frame: DefaultFrame) -> str:
         """Read a document; return what is wrong if it is of no known form, else "".
@@ -456,9 +460,12 @@ class JsonReader:
             frame: of the objects, where it does not say it.
         """
         people = [each for name in objects for each in as_list(value[name])]
-        if (name := frame_field(value)) and isinstance(value[name], str):
-            # The name of a video, a camera or a coordinate frame is the same for each frame.
-            is_repeated = value[name] == self._last_name
+        if not frame_field(value) and not any(map(names_its_frame, people)):
+            value = with_number(value)
+        if name := frame_field(value):
+            # A video, a camera or a coordinate frame has the same name for each frame.
+            is_weak = name == NUMBER or isinstance(value[name], str)
+            is_repeated = is_weak and value[name] == self._last_name
             self._last_name = value[name]
             value = other_fields(value, [name]) if is_repeated else value
         if frame_field(value) or time_field(value):
@@ -469,7 +476,7 @@ class JsonReader:
             self._nobody.append(frame)
         elif frame.known is None and not any(map(names_its_frame, people)):
             frame = frame._replace(known=self._frame_of({}, frame))
-        self._unused.look(value, objects)
+        self._unused.look(value, [*objects, NUMBER, *NUMBERS])
         for name in objects:
             if value[name] is not None and not isinstance(value[name], (list, dict)):
                 self._builder.leave_out(f"have no list `{name}`", frame.name)
@@ -531,6 +538,7 @@ class JsonReader:
                 keypoints, scores = self._points(keypoints, by_name), None
                 self._has.add("confidence")
             values = as_values(keypoints, scores, self._expected)
+            values = at_their_places(values, person.get("labels"), self._expected)
             if scores is None:
                 scores_field = confidence_field(person, values)
                 if scores_field:

@@ -33,6 +33,11 @@ CONFIDENCE = ("visibility", "score", "confidence", "presence", "likelihood")
 """Names of the confidence of a keypoint."""
 FEWEST = 3
 """Keypoints of an object without a field that names them."""
+NUMBER = "frame number"
+"""Name of the number of a frame that `with_number` gives it."""
+NUMBERS = ("index", "idx", "number", "num", "no", "nr", "i", "n", "id")
+"""Names of the number of a frame, beside its objects."""
+_LABELLED = (17, 133)  # keypoints of the models of Transformers, which leave weak ones out
 _FRAMES = ("frames", "results")
 """Fields with lists of frames, or of objects that are frames each."""
 _ROLES_BESIDE = ("frame", "time", "identity", "confidence")
@@ -132,6 +137,36 @@ def object_fields(value: Mapping[str, Any]) -> list[str]:
         if given == [] or any(map(_is_like_object, objects[:FEWEST])):
             found.append(name)
     return found
+
+
+def with_number(value: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a frame with its number under `NUMBER`, if a field of it can be that."""
+    for name, given in value.items():
+        if letters(name) in NUMBERS and isinstance(given, int) and not isinstance(given, bool):
+            return {**other_fields(value, [name]), NUMBER: given}
+    return value
+
+
+def at_their_places(
+    values: NDArray[np.float64], labels: Any, expected: int | None
+) -> NDArray[np.float64]:
+    """Return keypoints at the places that their labels say, the others NaN.
+
+    Args:
+        values: (k, 3) of an object.
+        labels: k numbers of the keypoints; the keypoints are as they are if it is anything else.
+        expected: number of keypoints of the layout; None = unknown.
+    """
+    if not isinstance(labels, list) or len(labels) != len(values):
+        return values
+    if not all(type(label) is int and label >= 0 for label in labels):
+        return values
+    q = next((q for q in (expected, *_LABELLED) if q and q > max(labels)), 0)
+    if len(set(labels)) < len(labels) or not q:
+        return values
+    placed = np.full((q, 3), np.nan)
+    placed[labels] = values
+    return placed
 
 
 def _is_like_object(value: Any) -> bool:
