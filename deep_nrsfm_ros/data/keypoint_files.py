@@ -288,14 +288,20 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
     size = path.stat().st_size
     is_compressed = path.name.lower().endswith(".gz")
 
+    empty = 0
+
     def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
-        for place, number, line in _numbered(file):
+        nonlocal empty
+        for read, (place, number, line) in enumerate(_numbered(file)):
+            empty = number - read
             yield DefaultFrame(f"line {place}", number, is_document=True), line
             on_progress(min(raw.tell(), size), size)  # of what is compressed, as the size is
 
     with path.open("rb") as raw, gzip.open(raw) if is_compressed else nullcontext(raw) as file:
         try:
-            _read_frames(builder, documents())
+            names_frames = _read_frames(builder, documents())
+            if empty and not names_frames:
+                builder.notes.append(f"{empty} empty lines count as frames without objects")
         except (EOFError, OSError, zlib.error) as error:
             if not builder.frames:
                 raise
@@ -366,13 +372,17 @@ def _folder(path: Path, options: ReadOptions, on_progress: Progress) -> Detectio
 
 def _read_frames(
     builder: DetectionsBuilder, documents: Iterator[tuple[DefaultFrame, bytes]]
-) -> None:
-    """Read documents, each a frame; what is none is left out and counted."""
+) -> bool:
+    """Read documents, each a frame; return whether they name their frames.
+
+    What is no frame is left out and counted.
+    """
     reader = JsonReader(builder)
     for frame, text in documents:
         if problem := _read_document(reader, io.BytesIO(text), frame):
             builder.leave_out("cannot be read", f"{frame.name}: {problem}", is_loss=True)
     reader.finish()
+    return reader.names_frames
 
 
 _START = 1 << 20  # bytes of a file in which a document ends that is one of several

@@ -136,6 +136,7 @@ def test_frames_of_nobody_keep_their_place_in_time(tmp_path: Path) -> None:
     lines = [json.dumps(forms[i]) if i in seen else "" for i in range(9)]
     found = read(tmp_path / "b.jsonl", "\n".join(lines) + "\n\n")
     assert found.frames.numbers.tolist() == seen
+    assert found.notes == ("3 empty lines count as frames without objects",)
     found = read(tmp_path / "c.jsonl", "\n\n".join(json.dumps(form) for form in forms))
     assert found.frames.numbers.tolist() == list(range(9))
     named = [{"frame": i, **(forms[i] if i in seen else {})} for i in range(9)]
@@ -275,6 +276,13 @@ def test_names_of_files_that_are_times(tmp_path: Path, unit: int) -> None:
     )
 
 
+def test_large_numbers_of_images_are_no_times(tmp_path: Path) -> None:
+    people = [{"image_id": 10_000_010_000 + i, "keypoints": points(i)} for i in range(3)]
+    found = read(tmp_path / "a.json", people)
+    assert found.stamps.tolist() == [0, 33_333_333, 66_666_667]
+    assert "are no count at a rate" in found.warnings[0]
+
+
 def test_a_recording_says_its_rate(tmp_path: Path) -> None:
     frames = [{"people": [{"keypoints": points(i)}]} for i in range(3)]
     found = read(tmp_path / "a.json", {"fps": 10, "frames": frames})
@@ -307,6 +315,15 @@ def test_numbers_of_entries_are_no_identities(tmp_path: Path) -> None:
     for entry in people:
         entry["image_id"] = entry.pop("frame")
     assert is_silent(read(tmp_path / "a.json", people))
+
+
+def test_kinds_of_objects_are_no_identities(tmp_path: Path) -> None:
+    pair = [{"animal": "dog", "keypoints": points(0, who)} for who in range(2)]
+    found = read(tmp_path / "a.json", [{"people": pair}] * 3)
+    assert found.identities.tolist() == ["0", "1"] * 3
+    assert found.notes == (
+        "its `animal` is the same for several objects of a frame, and no identity",
+    )
 
 
 def test_tracks_that_hold_their_frames(tmp_path: Path) -> None:

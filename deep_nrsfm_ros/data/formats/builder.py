@@ -49,6 +49,7 @@ _SAME_PLACE = 0.5  # overlap of boxes, which two people in an image hardly have
 _ALIKE = 0.1  # mean distance of keypoints in sizes of the object, of one object a frame later
 _ALIKE_OBJECTS = 3  # in one frame, of which most may be one object
 _COMPARED = 256  # objects that are compared with each other
+_REPEATED = 0.1  # fraction of objects with the identity of another one of their frame
 _LOST = 0.1  # fraction of objects that are left out, from which it is a finding
 _WEAK = 0.1  # fraction of keypoints below the least confidence, from which it is said
 _RATES = (0.1, 1000.0)  # frames a second
@@ -64,7 +65,7 @@ TIMES = {
 }
 """Names of the time of a frame -> its unit; "" if they do not say it."""
 _BACKWARDS = 0.25  # fraction of frames after a later one, from which times are none
-_YEARS = 5 * 10**9  # seconds since 1970, of the year 2128
+_YEARS = (1_200_000_000, 5_000_000_000)  # seconds since 1970, of the years 2008 and 2128
 _NAMED = 3  # places that a warning names
 
 
@@ -144,7 +145,8 @@ class DetectionsBuilder:
         is_mediapipe: the input is landmarks, which MediaPipe gives as fractions of the image's
             size.
         is_coco: the input is objects with a category and an image, as COCO has them.
-        has_plain_ids: identities have a name (`id`) that may also mean the number of an entry.
+        weak_identity: name of the field with identities, if it may mean something else too, as
+            the number of an entry or a kind of object; "" if not.
     """
 
     def __init__(self, options: ReadOptions) -> None:
@@ -153,7 +155,8 @@ class DetectionsBuilder:
         self.warnings: list[str] = []
         self.notes: list[str] = []
         self._findings: dict[str, Finding] = {}
-        self.is_mediapipe = self.is_coco = self.has_plain_ids = False
+        self.is_mediapipe = self.is_coco = False
+        self.weak_identity = ""
         self._own_rate: float | None = None
         self._lost = 0
         self._groups: dict[tuple[Any, int], _Group] = {}
@@ -375,8 +378,8 @@ class DetectionsBuilder:
                 "its landmarks are fractions of the image's size: give --image-width and "
                 "--image-height"
             )
-        if self.has_plain_ids and _are_numbers_of_entries(group):
-            self.notes.append("its `id` is another one for each object, and no identity")
+        if self.weak_identity and (reason := _no_identities(group)):
+            self.notes.append(f"its `{self.weak_identity}` is {reason}, and no identity")
             group.identities = [None] * len(group.identities)
         identities, warning = identities_of(group.identities, frame)
         self.warnings += [warning] if warning else []
@@ -692,10 +695,9 @@ def plausible_unit(times: NDArray[np.float64]) -> str:
 
 def unit_of_epoch(numbers: NDArray[np.int64]) -> str:
     """Return the unit in which numbers are times since 1970, and frames apart; "" if in none."""
-    if not len(numbers) or numbers.min() < MOST:
-        return ""
-    for unit, ns in UNITS.items():
-        if numbers.max() < _YEARS * (10**9 // ns):
+    for unit, ns in UNITS.items() if len(numbers) else ():
+        seconds = 10**9 // ns
+        if _YEARS[0] * seconds <= numbers.min() and numbers.max() < _YEARS[1] * seconds:
             return unit if plausible_spacing(np.diff(np.unique(numbers)), ns) else ""
     return ""
 
@@ -730,11 +732,16 @@ def weak_keypoints(group: _Group, min_confidence: float) -> list[str]:
     ]
 
 
-def _are_numbers_of_entries(group: _Group) -> bool:
-    """Return whether each object has another identity, in several frames."""
-    given = [identity for identity in group.identities if identity is not None]
-    several = len(set(group.frame)) > 1 and len(given) >= _ALIKE_OBJECTS
-    return several and len(set(given)) == len(given)
+def _no_identities(group: _Group) -> str:
+    """Return why values are no identities: they tell no objects apart, or are never the same."""
+    given = [(f, i) for f, i in zip(group.frame, group.identities, strict=True) if i is not None]
+    distinct = len(set(given))
+    if len(given) - distinct > _REPEATED * len(given):
+        return "the same for several objects of a frame"
+    several = len({frame for frame, _ in given}) > 1 and len(given) >= _ALIKE_OBJECTS
+    if several and len({identity for _, identity in given}) == len(given):
+        return "another one for each object"
+    return ""
 
 
 def _share(low: NDArray[Any], high: NDArray[Any], box: tuple[float, ...]) -> float:
@@ -756,24 +763,22 @@ def _boxes(group: _Group, most: int) -> tuple[NDArray[Any], NDArray[Any], NDArra
 
 
 def _is_one_object(group: _Group) -> bool:
-    """Return whether most objects lie where another lies, as the same object later does."""
-    points, low, high = _boxes(group, _COMPARED)
+    """Return whether most objects lie where the one before lies, as the same object later does."""
+    points, low, high = _boxes(group, _ROWS)
     if len(points) < _CROWD:
         return False
-    area = np.prod(high - low, 1)
-    size = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
-    common = np.prod(np.clip(size, 0, None), -1)
-    share = common / np.maximum(area[:, None] + area[None] - common, 1e-9)
-    np.fill_diagonal(share, 0)
-    return bool(np.median(share.max(1)) > _SAME_PLACE)
+    inside = np.clip(np.minimum(high[1:], high[:-1]) - np.maximum(low[1:], low[:-1]), 0, None)
+    area, common = np.prod(high - low, 1), np.prod(inside, 1)
+    union = area[1:] + area[:-1] - common
+    return bool(np.median(common / np.maximum(union, 1e-9)) > _SAME_PLACE)
 
 
 def _are_same_objects(group: _Group) -> bool:
-    """Return whether most of a few objects have the pose and place of another one, nearly.
+    """Return whether most objects have the pose and place of another one, nearly.
 
     Equal ones are copies, and are left out elsewhere.
     """
-    points, low, high = _boxes(group, _CROWD * 2)
+    points, low, high = _boxes(group, _COMPARED)
     if len(points) < _ALIKE_OBJECTS:
         return False
     size = np.linalg.norm(high - low, axis=1)

@@ -27,6 +27,7 @@ from deep_nrsfm_ros.data.formats.builder import (
     as_values,
 )
 from deep_nrsfm_ros.data.formats.json_fields import (
+    IDENTITIES,
     frame_field,
     frame_key,
     identity_field,
@@ -146,9 +147,14 @@ class JsonReader:
         """Read a document that is decoded; return as `read` does."""
         return self._read(items_of(value), frame)
 
+    @property
+    def names_frames(self) -> bool:
+        """Whether objects or frames named their frame."""
+        return "frame" in self._has
+
     def finish(self) -> None:
         """Add the frames without objects, and say what was not used, after the last document."""
-        if "frame" not in self._has:  # where frames are named, those without a name have no place
+        if not self.names_frames:  # where frames are named, those without a name have no place
             for frame in self._nobody:
                 self._builder.frame(frame.name, number=frame.number)
         self._nobody.clear()
@@ -555,7 +561,8 @@ class JsonReader:
         identity = as_identity(person[identity_name]) if identity_name else None
         if identity is not None:
             self._has.add("identity")
-            self._builder.has_plain_ids |= letters(identity_name) in ("id", "ids", "poseid")
+            if identity_name not in IDENTITIES:
+                self._builder.weak_identity = identity_name
         if role(field) == "hands" and is_landmarks(field) and identity is None:
             identity = next((side for side in ("left", "right") if side in letters(field)), None)
         score = next((s for n in _SCORE if (s := as_score(person.get(n))) is not None), None)
