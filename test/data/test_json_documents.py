@@ -283,6 +283,16 @@ def test_large_numbers_of_images_are_no_times(tmp_path: Path) -> None:
     assert "are no count at a rate" in found.warnings[0]
 
 
+@pytest.mark.parametrize("name", ["{}.{:03}.json", "{}.{:03}000000.json", "{}_{:03}000000.json"])
+def test_names_of_files_that_are_seconds_and_a_fraction(tmp_path: Path, name: str) -> None:
+    for i in range(12):
+        file = tmp_path / name.format(1_714_557_600 + i // 10, 100 * (i % 10))
+        file.write_text(json.dumps([{"keypoints": points(i)}]))
+    found = read(tmp_path)
+    assert tenths(found) == list(range(12)) and not found.findings
+    assert "are taken for times in nanoseconds" in found.warnings[0]
+
+
 def test_a_recording_says_its_rate(tmp_path: Path) -> None:
     frames = [{"people": [{"keypoints": points(i)}]} for i in range(3)]
     found = read(tmp_path / "a.json", {"fps": 10, "frames": frames})
@@ -493,10 +503,13 @@ def test_several_videos_in_a_file_are_doubted(tmp_path: Path) -> None:
     assert codes(found) == ["series"] and "are of 2 videos (0, 1)" in found.findings[0].message
 
 
-def test_3d_is_told_from_nothing(tmp_path: Path) -> None:
+def test_what_else_is_there_is_told(tmp_path: Path) -> None:
     world = [{"pose_world_landmarks": [[{"x": 0.1, "y": 0.2, "z": 0.3}] * 33]}] * 3
     with pytest.raises(KeypointFileError, match=r"pose_world_landmarks \(3D, and the 2D keypoi"):
         read(tmp_path / "a.json", world)
+    rows = [{"frame": i, "nose_x": 1, "nose_y": 2} for i in range(3)]
+    with pytest.raises(KeypointFileError, match="rows of a table: write it as .csv"):
+        read(tmp_path / "a.json", rows)
     hands = [{"people": [{"hand_left_keypoints_2d": sum(points(0, 0, 21), [])}]}]
     with pytest.raises(KeypointFileError, match="hands are read with --model hand21"):
         read(tmp_path / "a.json", hands)

@@ -45,7 +45,7 @@ _PATTERNS: dict[Role, re.Pattern[str]] = {
         "|bodyparts|xy)(?:2d|xy|px|list)?|pose"
     ),
     "hands": re.compile(
-        "(?:multi)?(?:left|right)?hands?(?:left|right)?(?:landmarks?|keypoints?)(?:2d)?"
+        "(?:multi)?(?:left|right)?hands?(?:left|right)?(?:landmarks?|keypoints?|kpts?)(?:2d)?"
     ),
     "objects": re.compile(
         "people|persons|bodies|humans|instances|pred(?:iction|icted)?s?(?:instances)?|poses"

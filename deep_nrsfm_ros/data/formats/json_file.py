@@ -428,6 +428,8 @@ class JsonReader:
             more = " (3D, and the 2D keypoints are needed)" if is_3d else ""
             if any(role(name) == "hands" and value[name] for name in value):
                 more = " (hands are read with --model hand21)"
+            if any(letters(name).endswith("x") and f"{name[:-1]}y" in value for name in value):
+                more = " (rows of a table: write it as .csv)"
             self._builder.leave_out(
                 f"{NO_KEYPOINTS}, but {', '.join(map(str, value))[:60] or 'nothing'}{more}",
                 frame.name,
