@@ -190,6 +190,9 @@ def test_keypoints_with_labels(tmp_path: Path) -> None:
         found = read(tmp_path / "a.json", frames, **options)
         assert (found.confidence == 0).sum(1).tolist() == [1] * 4 and is_silent(found)
         assert not found.confidence[range(4), range(4)].any()
+    weak = [{"keypoints": pairs(0)[3:], "labels": [*range(3, Q)], "conf": [0.5] * (Q - 3)}]
+    found = read(tmp_path / "a.json", weak)
+    assert found.confidence[0].tolist() == [0] * 3 + [0.5] * (Q - 3)
 
 
 def test_the_name_of_a_video_is_no_frame(tmp_path: Path) -> None:

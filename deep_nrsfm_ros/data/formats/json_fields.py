@@ -218,8 +218,9 @@ def _time_of_text(text: str, unit: str) -> Time | None:
 
 def _seconds_of(value: Mapping[str, Any]) -> int | None:
     """Return the ns of {sec, nanosec} of ROS, {secs, nsecs} of ROS 1; None if it is none."""
-    for pair in (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec")):
-        seconds, rest = (value.get(name) for name in pair)
-        if isinstance(seconds, int) and isinstance(rest, int) and abs(seconds) < 2**33:
-            return seconds * 10**9 + rest
+    for name, nano in (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec")):
+        if name in value and nano in value:
+            seconds, rest = value[name], value[nano]
+            if isinstance(seconds, int) and isinstance(rest, int) and abs(seconds) < 2**33:
+                return seconds * 10**9 + rest
     return None

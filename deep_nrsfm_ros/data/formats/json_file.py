@@ -56,6 +56,7 @@ from deep_nrsfm_ros.data.formats.json_forms import (
     confidence_field,
     fields_of,
     has_keypoints,
+    hint_of,
     holds_frames,
     is_empty_frame,
     is_frame,
@@ -423,17 +424,8 @@ class JsonReader:
             return True
         # Annotations of COCO are boxes of cars, too.
         if key != "annotations":
-            words = ("3d", "world", "jointpositions")
-            is_3d = any(word in letters(name) for word in words for name in value)
-            more = " (3D, and the 2D keypoints are needed)" if is_3d else ""
-            if any(role(name) == "hands" and value[name] for name in value):
-                more = " (hands are read with --model hand21)"
-            if any(letters(name).endswith("x") and f"{name[:-1]}y" in value for name in value):
-                more = " (rows of a table: write it as .csv)"
-            self._builder.leave_out(
-                f"{NO_KEYPOINTS}, but {', '.join(map(str, value))[:60] or 'nothing'}{more}",
-                frame.name,
-            )
+            names = ", ".join(value)[:60] or "nothing"
+            self._builder.leave_out(f"{NO_KEYPOINTS}, but {names}{hint_of(value)}", frame.name)
         return key == "annotations"
 
     def _result(self, value: Mapping[str, Any], fields: list[str], frame: DefaultFrame) -> None:
@@ -546,12 +538,10 @@ class JsonReader:
                 keypoints, scores = self._points(keypoints, by_name), None
                 self._has.add("confidence")
             values = as_values(keypoints, scores, self._expected)
+            if scores is None and (scores_field := confidence_field(person, values)):
+                scores = person[scores_field]
+                values = as_values(keypoints, scores, self._expected)
             values = at_their_places(values, person.get("labels"), self._expected)
-            if scores is None:
-                scores_field = confidence_field(person, values)
-                if scores_field:
-                    scores = person[scores_field]
-                    values = as_values(keypoints, scores, self._expected)
             self._builder.in_box(values, person.get("bbox", person.get("box")))
         except ValueError as error:
             is_loss = str(error) != NO_KEYPOINTS

@@ -194,6 +194,18 @@ def are_texts(value: Any) -> bool:
     return not value[0].strip().lstrip("+-").replace(".", "", 1).isdigit()
 
 
+def hint_of(value: Mapping[str, Any]) -> str:
+    """Return what to say of an object without keypoints that are read, "" for nothing."""
+    if any(letters(name).endswith("x") and f"{name[:-1]}y" in value for name in value):
+        return " (rows of a table: write it as .csv)"
+    if any(role(name) == "hands" and value[name] for name in value):
+        return " (hands are read with --model hand21)"
+    words = ("3d", "world", "jointpositions")
+    if any(word in letters(name) for word in words for name in value):
+        return " (3D, and the 2D keypoints are needed)"
+    return ""
+
+
 def is_empty_frame(value: Mapping[str, Any]) -> bool:
     """Return whether a value is a frame without objects: its name, and nothing else that counts.
 
