@@ -388,6 +388,7 @@ def test_fields_that_are_not_used_are_named(tmp_path: Path) -> None:
     found = of(path_of_image_file=lambda i: f"{i}", certainty_of_all=lambda i: [0.5] * 3)
     message = found.findings[0].message
     assert "path_of_image_file (is it the frame?)" in message and "call it 'frame'" in message
+    assert "number_of_track (is it an id" in of(number_of_track=lambda i: i % 2).findings[0].message
     assert is_silent(of(score_class=lambda i: 1, camera_file=lambda i: "cam"))
 
 

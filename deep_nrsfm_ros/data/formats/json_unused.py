@@ -61,7 +61,7 @@ class UnusedFields:
         if is_annotation(value):
             taken.add("id")
         for name, given in value.items():
-            if name in taken or is_usual(name) or not given:
+            if name in taken or is_usual(name) or given is None or given in ("", [], {}):
                 continue
             if role(name) not in ("keypoints", "hands", "objects"):
                 self._fields.setdefault(name, _Unused(meaning(name))).look(given)
