@@ -330,6 +330,19 @@ def test_numbers_of_entries_are_no_identities(tmp_path: Path) -> None:
     assert is_silent(read(tmp_path / "a.json", people))
 
 
+def test_identities_of_openpifpaf_and_scores_of_posetrack(tmp_path: Path) -> None:
+    """OpenPifPaf tracks by `id_`, beside a category; annotations of PoseTrack have no scores."""
+    frames = [
+        [
+            {"keypoints": sum(points(i, who), []), "category_id": 1, "id_": who, "scores": []}
+            for who in ((1, 2) if i else (2, 1))
+        ]
+        for i in range(3)
+    ]
+    found = read(tmp_path / "a.json", frames)
+    assert found.identities.tolist() == ["2", "1", "1", "2", "1", "2"] and is_silent(found)
+
+
 def test_kinds_of_objects_are_no_identities(tmp_path: Path) -> None:
     pair = [{"animal": "dog", "keypoints": points(0, who)} for who in range(2)]
     found = read(tmp_path / "a.json", [{"people": pair}] * 3)

@@ -161,7 +161,7 @@ def identity_field(value: Mapping[str, Any]) -> str:
     numbers = ("id", "ids") if is_annotation(value) else ()
     for name, given in value.items():
         is_identity = role(name) == "identity" and as_identity(given) is not None
-        if is_identity and letters(name) not in numbers:
+        if is_identity and name.lower() not in numbers:
             return name
     return ""
 

@@ -520,7 +520,8 @@ class JsonReader:
 
     def _one(self, person: Mapping[str, Any], field: str, frame: int) -> None:
         """Add an object with keypoints in a field, or count what is wrong with it."""
-        scores_field = next((n for n in _SCORES if isinstance(person.get(n), list)), "")
+        lists = (n for n in _SCORES if isinstance(person.get(n), list) and person[n])
+        scores_field = next(lists, "")
         scores = person.get(scores_field)
         try:
             keypoints: Any = person.get(field)
