@@ -486,6 +486,18 @@ def test_people_as_arrays(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.points[3], pairs(3), rtol=1e-6)
 
 
+def test_long_arrays_are_frames_too(tmp_path: Path) -> None:
+    """What goes with them in a list of its own is not read from so many, and is named."""
+    content: Document = {"keypoints": [pairs(0)] * 5000}
+    found = read(tmp_path / "a.json", content)
+    assert len(found.stamps) == 5000 and is_silent(found)
+    found = read(tmp_path / "a.json", {**content, "scores": [[0.5] * Q] * 5000})
+    assert codes(found) == ["unused"] and "scores (is it a conf" in found.findings[0].message
+    frames = [{"people": [{"keypoints": points(i)}]} for i in range(3)]
+    found = read(tmp_path / "a.json", {"timestamps": [0.0, 0.1, 0.2], "frames": frames})
+    assert "timestamps (is it the time?)" in found.findings[0].message
+
+
 def test_easy_vitpose_has_y_first(tmp_path: Path) -> None:
     turned = [{"4": [[y, x, c] for x, y, c in points(i)]} for i in range(3)]
     names = dict(enumerate(COCO17.keypoints))
@@ -518,6 +530,16 @@ def test_several_videos_in_a_file_are_doubted(tmp_path: Path) -> None:
     people = [{"image_id": i, "keypoints": points(i)} for i in range(6)]
     found = read(tmp_path / "a.json", {"images": images, "annotations": people})
     assert codes(found) == ["series"] and "are of 2 videos (0, 1)" in found.findings[0].message
+
+
+def test_large_numbers_of_frames_give_way_to_names(tmp_path: Path) -> None:
+    """PoseTrack numbers frames by video and frame; the names of its images count them."""
+    images = [
+        {"id": i, "frame_id": 10_000_010_000 + i, "file_name": f"v/{i:06}.jpg"} for i in range(3)
+    ]
+    people = [{"image_id": i, "keypoints": points(i)} for i in range(3)]
+    found = read(tmp_path / "a.json", {"images": images, "annotations": people})
+    assert found.frames.numbers.tolist() == [0, 1, 2] and is_silent(found)
 
 
 def test_what_else_is_there_is_told(tmp_path: Path) -> None:

@@ -665,7 +665,9 @@ class DetectionsBuilder:
         if keys and None not in self._numbers:
             numbers = np.array(self._numbers, np.int64)
             if len(np.unique(numbers)) == len(numbers):
-                return numbers
+                is_count = numbers.max() < MOST or unit_of_epoch(numbers)
+                found = None if is_count else numbers_in(self._frame_names)
+                return numbers if found is None else found
             self._find_series()
             return None
         if all(self._frame_names) and (found := numbers_in(self._frame_names)) is not None:

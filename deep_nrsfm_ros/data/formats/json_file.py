@@ -90,6 +90,7 @@ EXPECTED = (
 )
 _SCORES = ("keypoint_scores", "keypoints_scores", "keypoint_score", "scores", "confidence")
 _SCORE = ("score", "bbox_score", "confidence")
+_BESIDE = ("frame", "time", "identity", "confidence")  # roles of lists that go with frames
 _MAX_SIDE = 1_000_000  # pixels of an image; a larger number is no size
 _WHOLE = 4096  # elements of a document up to which it may be a frame
 _VIDEO = ("video_id", "vid_id", "video_name")
@@ -292,6 +293,8 @@ class JsonReader:
             keys[key] = None
             if key is not None and not is_element and not frame.is_document:
                 self._rate(key, value)
+            if key is not None and is_element and role(key) in _BESIDE:
+                self._unused.look_at(key, value)
             if points and key != points_key:
                 known |= self._array(points_key, points, frame)
                 points = []

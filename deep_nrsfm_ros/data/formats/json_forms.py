@@ -81,6 +81,9 @@ def is_frame(key: str | None, value: Any, series: Collection[str], is_document: 
     """Return whether an element of a list at the top is a frame, not an object."""
     if key in _FRAMES:
         return isinstance(value, (dict, list))
+    if key is not None and role(key) == "keypoints" and not is_landmarks(key):
+        is_object = isinstance(value, list) and (_is_array(value) or people_in(value))
+        return bool(is_object) and not is_document
     if key is not None and (role(key) != "objects" or is_document):
         return False
     if isinstance(value, dict):

@@ -64,7 +64,13 @@ class UnusedFields:
             if name in taken or is_usual(name) or given is None or given in ("", [], {}):
                 continue
             if role(name) not in ("keypoints", "hands", "objects"):
-                self._fields.setdefault(name, _Unused(meaning(name))).look(given)
+                self.look_at(name, given)
+
+    def look_at(self, name: str, value: Any) -> None:
+        """Look at a value of a field."""
+        field = self._fields.setdefault(name, _Unused(meaning(name)))
+        if field.count < _LOOKS:
+            field.look(value)
 
     def tell(self, builder: DetectionsBuilder, has: Collection[str]) -> None:
         """Name the fields to a builder.
@@ -79,13 +85,17 @@ class UnusedFields:
 
 
 class _Unused:
-    """A field that is not used: what it may mean, and whether its values are such."""
+    """A field that is not used: what it may mean, and whether its values are such.
+
+    Attributes:
+        count: values that were looked at.
+    """
 
     def __init__(self, meant: str) -> None:
         """Start without values."""
         self._meaning, self._is_plausible, self._varies = meant, False, False
         self._first: Any = None
-        self._count = 0
+        self.count = 0
 
     def look(self, value: Any) -> None:
         """Look at a value."""
@@ -94,9 +104,9 @@ class _Unused:
         else:
             is_plain = isinstance(value, (int, float, str)) and not isinstance(value, bool)
             self._is_plausible |= is_plain and len(str(value)) < _LONGEST
-        if not self._count:
+        if not self.count:
             self._first = value
-        self._count += 1
+        self.count += 1
         self._varies |= value != self._first
 
     def is_told(self, remedies: Collection[str]) -> bool:
@@ -107,5 +117,5 @@ class _Unused:
         """
         if not self._meaning:
             return True
-        is_same = self._meaning != "a confidence" and not self._varies and self._count > 1
+        is_same = self._meaning != "a confidence" and not self._varies and self.count > 1
         return self._meaning in remedies and self._is_plausible and not is_same

@@ -11,7 +11,10 @@ from deep_nrsfm_ros.lifting.sanity import Finding
 _SHOWN = 6  # names that a sentence lists
 _MEANINGS = {
     "the frame": ("frame", "image", "img", "file", "filename", "path"),
-    "the time": ("time", "timestamp", "stamp", "sec", "seconds", "ms", "usec", "pts", "fps"),
+    "the time": (
+        *("time", "times", "timestamp", "timestamps", "stamp", "stamps"),
+        *("sec", "seconds", "ms", "usec", "pts", "fps"),
+    ),
     "an identity": ("id", "ids", "track", "tracks", "person", "individual", "animal", "subject"),
     "a confidence": (
         *("conf", "confidence", "confidences", "score", "scores", "prob", "probability", "vis"),
