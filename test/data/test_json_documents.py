@@ -532,6 +532,13 @@ def test_several_videos_in_a_file_are_doubted(tmp_path: Path) -> None:
     assert codes(found) == ["series"] and "are of 2 videos (0, 1)" in found.findings[0].message
 
 
+def test_categories_that_nothing_names_are_said(tmp_path: Path) -> None:
+    results = [{"image_id": i, "category_id": 1 + i % 2, "keypoints": points(i)} for i in range(4)]
+    found = read(tmp_path / "a.json", results)
+    assert "several categories (1, 2) without names" in found.warnings[0] and len(found) == 4
+    assert is_silent(read(tmp_path / "a.json", category="1"))
+
+
 def test_large_numbers_of_frames_give_way_to_names(tmp_path: Path) -> None:
     """PoseTrack numbers frames by video and frame; the names of its images count them."""
     images = [

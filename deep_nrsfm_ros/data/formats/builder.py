@@ -413,7 +413,7 @@ class DetectionsBuilder:
         """Compare the keypoints of an object with its box, [x, y, width, height] or two corners."""
         try:
             x, y, a, b = (float(number) for number in (box[0] if len(box) == 1 else box))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, LookupError, OverflowError):
             return
         visible = values[(values[:, 2] > 0) & values[:, :2].any(1), :2]
         if len(visible) < _FEW or min(a, b) < _SMALLEST_BOX:  # a box of [0, 0, 1, 1] says nothing
@@ -554,6 +554,11 @@ class DetectionsBuilder:
         if len(present) > 1 and (len(names) > 1 or len({q for _, q in self._groups}) > 1):
             raise KeypointFileError(
                 f"it has objects of several categories: {text}; choose one with --category"
+            )
+        if len(present) > 1 and names == {None}:
+            self.warnings.append(
+                f"its objects are of several categories ({text}) without names of keypoints, and "
+                "are read as one: choose one with --category"
             )
         return present[0] if present else next(iter(self._names), None)
 
