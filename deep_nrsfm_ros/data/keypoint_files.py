@@ -6,15 +6,14 @@ from __future__ import annotations
 import dataclasses
 import gzip
 import io
-import shutil
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any, BinaryIO, NamedTuple, cast
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -209,15 +208,10 @@ def _without_border(detections: Detections, size: Size) -> Detections:
 def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
     """Return the objects in a JSON file of any detector."""
     builder = DetectionsBuilder(options)
-    with path.open("rb") as raw, _unpacked(raw, path) as file:
-        try:
-            problem = _read_document(
-                JsonReader(builder), _Counted(file, raw, path, on_progress), DefaultFrame(path.name)
-            )
-        except (EOFError, OSError, zlib.error) as error:  # of what is compressed
-            if not builder.frames:
-                raise
-            problem = str(error)
+    with path.open("rb") as file:
+        problem = _read_document(
+            JsonReader(builder), _Counted(file, path, on_progress), DefaultFrame(path.name)
+        )
     if problem and not builder.frames:
         reasons = builder.reasons()
         raise KeypointFileError("; ".join([problem, *reasons]))
@@ -226,21 +220,16 @@ def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections
     return builder.detections("it has no frame")
 
 
-def _unpacked(raw: BinaryIO, path: Path) -> AbstractContextManager[BinaryIO]:
-    """Return the content of an open file, without its compression."""
-    if not path.name.lower().endswith(".gz"):
-        return nullcontext(raw)
-    return cast("AbstractContextManager[BinaryIO]", gzip.open(raw))
-
-
 def _find_damage(builder: DetectionsBuilder, problem: str) -> None:
     """Add the finding that a file is read up to a damaged place."""
-    builder.find(
-        Finding(
-            "damaged",
-            f"it is read up to a damaged place only, and what follows is lost: {problem}; write or "
-            "copy the file anew",
-        )
+    builder.find(_damage(problem))
+
+
+def _damage(problem: str) -> Finding:
+    return Finding(
+        "damaged",
+        f"it is read up to a damaged place only, and what follows is lost: {problem}; write or "
+        "copy the file anew",
     )
 
 
@@ -255,18 +244,15 @@ def _read_document(reader: JsonReader, file: Readable, frame: DefaultFrame) -> s
 
 
 class _Counted:
-    """A file that reports how much of it is read: of what is compressed, as its size is."""
+    """A file that reports how much of it is read."""
 
-    def __init__(self, file: IO[bytes], raw: IO[bytes], path: Path, on_progress: Progress) -> None:
-        self._raw = raw
-        # A damaged archive gives what comes before the damage by `read1` alone.
-        self._read = file.read1 if isinstance(file, gzip.GzipFile) else file.read
-        self._size, self._on_progress = path.stat().st_size, on_progress
+    def __init__(self, file: IO[bytes], path: Path, on_progress: Progress) -> None:
+        self._file, self._size, self._on_progress = file, path.stat().st_size, on_progress
 
     def read(self, size: int = -1, /) -> bytes:
         """Return at most `size` bytes."""
-        data = self._read(size)
-        self._on_progress(min(self._raw.tell(), self._size), self._size)
+        data = self._file.read(size)
+        self._on_progress(min(self._file.tell(), self._size), self._size)
         return data
 
 
@@ -274,6 +260,7 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
     """Return the objects in a file that has in each line a document, which is a frame."""
     builder = DetectionsBuilder(options)
     size = path.stat().st_size
+    is_compressed = path.name.lower().endswith(".gz")
 
     def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
         lines = (line for line in file if line.strip())
@@ -281,7 +268,7 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
             yield DefaultFrame(f"line {number + 1}", number, is_document=True), line
             on_progress(min(raw.tell(), size), size)  # of what is compressed, as the size is
 
-    with path.open("rb") as raw, _unpacked(raw, path) as file:
+    with path.open("rb") as raw, gzip.open(raw) if is_compressed else nullcontext(raw) as file:
         try:
             _read_frames(builder, documents())
         except (EOFError, OSError, zlib.error) as error:
@@ -299,15 +286,27 @@ def _table(
 ) -> Detections:
     """Return the objects in a table."""
     builder = DetectionsBuilder(options)
-    if not path.name.lower().endswith(".gz"):
-        read(path, builder)
-        return builder.detections("it has no row")
-    with TemporaryDirectory() as folder, path.open("rb") as raw, _unpacked(raw, path) as content:
-        unpacked = Path(folder, path.stem)
-        with unpacked.open("wb") as file:
-            shutil.copyfileobj(content, file)
-        read(unpacked, builder)
+    read(path, builder)
     return builder.detections("it has no row")
+
+
+def _compressed(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
+    """Return the objects in a file of another kind that gzip has compressed."""
+    damage = ""
+    with TemporaryDirectory() as folder:
+        plain = Path(folder, path.stem)
+        with gzip.open(path) as content, plain.open("wb") as file:
+            try:
+                while part := content.read1(_PART):  # `read` loses what comes before damage
+                    file.write(part)
+            except (EOFError, OSError, zlib.error) as error:
+                damage = str(error)
+                if not file.tell():
+                    raise
+        found = _format_of(plain).read(plain, options, on_progress)
+    if damage and all(finding.code != "damaged" for finding in found.findings):
+        found = dataclasses.replace(found, findings=(*found.findings, _damage(damage)))
+    return found
 
 
 def _folder(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
@@ -354,6 +353,7 @@ def _read_frames(
 
 
 _FEW_AT_BORDER = 0.01  # fraction of keypoints below which the border is no cause for doubt
+_PART = 1 << 20  # bytes that are unpacked at once
 _BLOCK = 4096  # objects that are compared at once
 _SAMPLE = 256  # messages of a topic that `sample_bag` reads at least
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
@@ -363,14 +363,14 @@ FORMATS = (
     Format("an .npz with `points`", (".npz",), lambda path, options, _: read_npz(path, options)),
     Format("an .npy", (".npy",), lambda path, options, _: read_npy(path, options)),
     Format(
-        "JSON of COCO, OpenPose, MMPose, AlphaPose, MediaPipe or PoseNet (.json, .json.gz)",
-        (".json", ".json.gz"),
+        "JSON of COCO, OpenPose, MMPose, AlphaPose, MediaPipe or PoseNet (.json)",
+        (".json",),
         _json,
         has_categories=True,
     ),
     Format(
-        "a table (.csv, .csv.gz) of DeepLabCut, MediaPipe, or with columns such as nose_x",
-        (".csv", ".tsv", ".csv.gz", ".tsv.gz"),
+        "a table (.csv) of DeepLabCut, MediaPipe, or with columns such as nose_x",
+        (".csv", ".tsv"),
         partial(_table, read_csv),
         has_categories=True,
     ),
@@ -380,6 +380,12 @@ FORMATS = (
         "such JSON of a frame a line (.jsonl, .ndjson, also with .gz)",
         (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz"),
         _lines,
+    ),
+    Format(
+        "such JSON and tables compressed (.json.gz, .csv.gz)",
+        (".json.gz", ".csv.gz", ".tsv.gz"),
+        _compressed,
+        has_categories=True,
     ),
 )
 """The formats of single files."""

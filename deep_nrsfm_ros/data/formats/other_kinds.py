@@ -25,10 +25,6 @@ _REMEDIES = {
         "spreadsheets are not read: save it as .csv, or by pandas.read_excel(FILE).to_csv(NEW, "
         "index=False)"
     ),
-    (".slp",): (
-        "projects of SLEAP are not read: export the analysis as .csv, or in Python "
-        "np.save(NEW, sleap_io.load_file(FILE).numpy()), which is (frames, animals, q, 2)"
-    ),
     (".nwb",): f"files of NWB are not read: load it in Python (pynwb), and save {_ARRAY}",
     (".bvh", ".c3d", ".fbx", ".asf"): _IS_3D,
     (".amc",): f"{_IS_3D}; `train --cmu` takes CMU's motion capture",
