@@ -116,7 +116,7 @@ def _role(name: str, header: Header, lead: tuple[int, ...], q: int) -> str:
     """Return the role of an array by its name and shape, or ""."""
     shape, kind = header
     words = _words(name)
-    what = meaning(name)
+    what = _meaning(name)
     is_number = kind in "fiu"
     if prod(shape) == 1 and is_number and words & _RATES:
         return "rate"
@@ -124,7 +124,7 @@ def _role(name: str, header: Header, lead: tuple[int, ...], q: int) -> str:
         return "confidence"
     if kind == "U" and shape == (q,) and words & _NAMES:
         return "names"
-    is_time = meaning(re.sub("(?i)frame|image|img", "", name)) == "the time"
+    is_time = _meaning(re.sub("(?i)frame|image|img", "", name)) == "the time"
     is_time = is_time and not words & _NO_TIME or name.lower() in TIMES
     if is_number and len(shape) == 1 and is_time:
         return "times"
@@ -137,6 +137,11 @@ def _role(name: str, header: Header, lead: tuple[int, ...], q: int) -> str:
     if what == "an identity" and kind in "fiuU" and not words & _NO_IDENTITY:
         return "identities"
     return ""
+
+
+def _meaning(name: str) -> str:
+    """Return what an array seems to hold, as `unused.meaning`, also by a word in the plural."""
+    return meaning(name) or meaning(re.sub(r"(?i)(?<=[a-z])s(?![a-z])", "", name))
 
 
 def _words(name: str) -> set[str]:

@@ -25,7 +25,6 @@ def meaning(name: str) -> str:
     """Return what an unused name seems to hold: a key of `_MEANINGS`, or ""."""
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()
     words = {word for word in re.split(r"[^a-z]+", spaced) if word}
-    words |= {word.removesuffix("s") for word in words}
     return next((what for what, known in _MEANINGS.items() if not words.isdisjoint(known)), "")
 
 
