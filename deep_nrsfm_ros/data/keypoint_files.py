@@ -8,10 +8,10 @@ import gzip
 import io
 import shutil
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from functools import partial
-from itertools import pairwise
+from itertools import chain, count, islice, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO, Any, BinaryIO, NamedTuple, cast
@@ -31,7 +31,7 @@ from deep_nrsfm_ros.data.formats.builder import (
 from deep_nrsfm_ros.data.formats.frame_numbers import natural
 from deep_nrsfm_ros.data.formats.hdf5 import read_h5
 from deep_nrsfm_ros.data.formats.json_file import DefaultFrame, JsonReader
-from deep_nrsfm_ros.data.formats.json_items import Readable
+from deep_nrsfm_ros.data.formats.json_items import Readable, holds_documents, json_documents
 from deep_nrsfm_ros.data.formats.other_kinds import remedy_of
 from deep_nrsfm_ros.data.formats.tables import read_csv
 from deep_nrsfm_ros.data.formats.trc import read_trc
@@ -211,15 +211,21 @@ def _without_border(detections: Detections, size: Size) -> Detections:
 def _json(path: Path, options: ReadOptions, on_progress: Progress) -> Detections:
     """Return the objects in a JSON file of any detector."""
     builder = DetectionsBuilder(options)
+    reader = JsonReader(builder)
     with path.open("rb") as raw, _unpacked(raw, path) as file:
         try:
-            problem = _read_document(
-                JsonReader(builder), _Counted(file, raw, path, on_progress), DefaultFrame(path.name)
-            )
+            counted = _Counted(file, raw, path, on_progress)
+            several = holds_documents(counted.read(_START))
+            file.seek(0)
+            if several:
+                problem = _read_documents(builder, reader, counted)
+            else:
+                problem = _read_document(reader, counted, DefaultFrame(path.name))
         except (EOFError, OSError, zlib.error) as error:  # of what is compressed
             if not builder.frames:
                 raise
             problem = str(error)
+    reader.finish()
     if problem and not builder.frames:
         reasons = builder.reasons()
         raise KeypointFileError("; ".join([problem, *reasons]))
@@ -233,6 +239,25 @@ def _unpacked(raw: BinaryIO, path: Path) -> AbstractContextManager[BinaryIO]:
     if not path.name.lower().endswith(".gz"):
         return nullcontext(raw)
     return cast("AbstractContextManager[BinaryIO]", gzip.open(raw))
+
+
+def _read_documents(builder: DetectionsBuilder, reader: JsonReader, file: Readable) -> str:
+    """Read documents that follow one another, each a frame; return as `_read_document` does."""
+    builder.notes.append("it holds several documents, one after the other: each is a frame")
+    documents = json_documents(file)
+    for number in count():
+        frame = DefaultFrame(f"document {number + 1}", number, is_document=True)
+        try:
+            document = next(documents, _END)
+        except RecursionError:
+            return _DEEP
+        except ValueError as error:
+            return str(error)
+        if document is _END:
+            return ""
+        if problem := reader.read_value(document, frame):
+            builder.leave_out("cannot be read", f"{frame.name}: {problem}", is_loss=True)
+    return ""
 
 
 def _find_damage(builder: DetectionsBuilder, problem: str) -> None:
@@ -251,7 +276,7 @@ def _read_document(reader: JsonReader, file: Readable, frame: DefaultFrame) -> s
     try:
         return reader.read(file, frame)
     except RecursionError:
-        return "it is nested too deep for JSON of a detector"
+        return _DEEP
     except ValueError as error:
         return str(error)
 
@@ -277,20 +302,41 @@ def _lines(path: Path, options: ReadOptions, on_progress: Progress) -> Detection
     builder = DetectionsBuilder(options)
     size = path.stat().st_size
 
+    empty = 0
+
     def documents() -> Iterator[tuple[DefaultFrame, bytes]]:
-        lines = (line for line in file if line.strip())
-        for number, line in enumerate(lines):
-            yield DefaultFrame(f"line {number + 1}", number, is_document=True), line
+        nonlocal empty
+        for read, (place, number, line) in enumerate(_numbered(file)):
+            empty = number - read
+            yield DefaultFrame(f"line {place}", number, is_document=True), line
             on_progress(min(raw.tell(), size), size)  # of what is compressed, as the size is
 
     with path.open("rb") as raw, _unpacked(raw, path) as file:
         try:
-            _read_frames(builder, documents())
+            names_frames = _read_frames(builder, documents())
+            if empty and not names_frames:
+                builder.notes.append(f"{empty} empty lines count as frames without objects")
         except (EOFError, OSError, zlib.error) as error:
             if not builder.frames:
                 raise
             _find_damage(builder, f"{error}, after {builder.frames} frames")
     return builder.detections("it is empty")
+
+
+def _numbered(lines: Iterable[bytes]) -> Iterator[tuple[int, int, bytes]]:
+    """Yield the lines of a file that are not empty, with their place from 1 and their frame.
+
+    An empty line is a frame without objects, unless there is one after each line.
+    """
+    remaining = iter(lines)
+    first = list(islice(remaining, 2 * _LOOKED_AT))
+    full = [i for i, line in enumerate(first) if line.strip()]
+    gaps = set(np.diff(full).tolist())
+    step = gaps.pop() if len(gaps) == 1 and len(full) > 2 else 1
+    start = full[0] if full and step > 1 else 0
+    for i, line in enumerate(chain(first, remaining)):
+        if line.strip():
+            yield i + 1, (i - start) // step, line
 
 
 def _table(
@@ -347,14 +393,23 @@ def _folder(path: Path, options: ReadOptions, on_progress: Progress) -> Detectio
 
 def _read_frames(
     builder: DetectionsBuilder, documents: Iterator[tuple[DefaultFrame, bytes]]
-) -> None:
-    """Read documents, each a frame; what is none is left out and counted."""
+) -> bool:
+    """Read documents, each a frame; return whether they name their frames.
+
+    What is no frame is left out and counted.
+    """
     reader = JsonReader(builder)
     for frame, text in documents:
         if problem := _read_document(reader, io.BytesIO(text), frame):
-            builder.leave_out("cannot be read", f"{frame.name}: {problem}")
+            builder.leave_out("cannot be read", f"{frame.name}: {problem}", is_loss=True)
+    reader.finish()
+    return reader.names_frames
 
 
+_START = 1 << 20  # bytes of a file in which a document ends that is one of several
+_END = object()
+_DEEP = "it is nested too deep for JSON of a detector"
+_LOOKED_AT = 8  # lines that tell whether empty ones are frames
 _FEW_AT_BORDER = 0.01  # fraction of keypoints below which the border is no cause for doubt
 _BLOCK = 4096  # objects that are compared at once
 _SAMPLE = 256  # messages of a topic that `sample_bag` reads at least

@@ -432,7 +432,7 @@ def test_people_far_away_and_those_left_out(
     assert "56 of 60 objects" in said and "left out: 4 have fewer than 4 detected" in said
 
 
-@pytest.mark.parametrize(("share", "code"), [(0.1, 0), (0.4, 3)])
+@pytest.mark.parametrize(("share", "code"), [(0.1, 0), (0.6, 3)])
 def test_a_wrong_keypoint_is_named(
     share: float, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -523,6 +523,8 @@ def test_normalised_keypoints_become_pixels(tmp_path: Path) -> None:
         ([[100, 100, 500, 500]], False),  # of MMPose
         ([1, 2, 3, 4], False),  # a placeholder
         (None, False),
+        ({"x": 1}, False),
+        ([10**400, 1, 2, 3], False),
         ([900, 700, 400, 400], True),
         ([900, 700, 1300, 1100], True),
     ],

@@ -302,9 +302,9 @@ def often_wrong(objects: int, share: float) -> np.ndarray:
 
 
 def test_a_keypoint_that_is_often_wrong_is_named() -> None:
-    (finding,) = wrong_keypoints(often_wrong(50, 0.3), "abc")
+    (finding,) = wrong_keypoints(often_wrong(50, 0.6), "abc")
     assert finding.code == "wrong-keypoint"
-    assert str(finding).startswith("keypoint 'c' contradicts the others in 30% of the objects, ")
+    assert str(finding).startswith("keypoint 'c' contradicts the others in 60% of the objects, ")
     assert not wrong_keypoints(often_wrong(50, 0.1), "abc")
     assert not wrong_keypoints(often_wrong(10, 1.0), "abc")  # too few
     assert not wrong_keypoints(often_wrong(0, 0), "abc")

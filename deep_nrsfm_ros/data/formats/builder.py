@@ -46,6 +46,13 @@ _FEW = 4  # keypoints, which are too few to be compared with a box
 _SMALLEST_BOX = 20.0  # pixels; a smaller one is a placeholder
 _CROWD = 5  # objects, of which as many in one frame may be one object in as many frames
 _SAME_PLACE = 0.5  # overlap of boxes, which two people in an image hardly have
+_ALIKE = 0.1  # mean distance of keypoints in sizes of the object, of one object a frame later
+_ALIKE_OBJECTS = 3  # in one frame, of which most may be one object
+_COMPARED = 256  # objects that are compared with each other
+_REPEATED = 0.1  # fraction of objects with the identity of another one of their frame
+_LOST = 0.1  # fraction of objects that are left out, from which it is a finding
+_WEAK = 0.1  # fraction of keypoints below the least confidence, from which it is said
+_RATES = (0.1, 1000.0)  # frames a second
 _MANY = 0.5  # fraction of objects that makes a suspicion a warning
 UNITS = {"seconds": 10**9, "milliseconds": 10**6, "microseconds": 1000, "nanoseconds": 1}
 """Units of time in ns."""
@@ -57,6 +64,8 @@ TIMES = {
     **dict.fromkeys(("timestamp_ns", "time_ns", "stamp_ns"), "nanoseconds"),
 }
 """Names of the time of a frame -> its unit; "" if they do not say it."""
+_BACKWARDS = 0.25  # fraction of frames after a later one, from which times are none
+_YEARS = (1_200_000_000, 5_000_000_000)  # seconds since 1970, of the years 2008 and 2128
 _NAMED = 3  # places that a warning names
 
 
@@ -136,6 +145,8 @@ class DetectionsBuilder:
         is_mediapipe: the input is landmarks, which MediaPipe gives as fractions of the image's
             size.
         is_coco: the input is objects with a category and an image, as COCO has them.
+        weak_identity: name of the field with identities, if it may mean something else too, as
+            the number of an entry or a kind of object; "" if not.
     """
 
     def __init__(self, options: ReadOptions) -> None:
@@ -145,6 +156,9 @@ class DetectionsBuilder:
         self.notes: list[str] = []
         self._findings: dict[str, Finding] = {}
         self.is_mediapipe = self.is_coco = False
+        self.weak_identity = ""
+        self._own_rate: float | None = None
+        self._lost = 0
         self._groups: dict[tuple[Any, int], _Group] = {}
         self._identities: dict[str, str] = {}
         self._frames: dict[Any, int] = {}
@@ -219,6 +233,17 @@ class DetectionsBuilder:
         self._times[index] = value
         self._time_unit = unit
 
+    def own_rate(self, rate: float, name: str) -> None:
+        """Set the frames a second that the input says, for frames without times.
+
+        Args:
+            rate: frames a second; an impossible one is ignored.
+            name: of its field.
+        """
+        if _RATES[0] <= rate <= _RATES[1] and not self.options.rate and not self._own_rate:
+            self._own_rate = float(rate)
+            self.notes.append(f"{rate:g} frames a second, as it says (`{name}`)")
+
     @property
     def frames(self) -> int:
         """Number of frames so far."""
@@ -258,9 +283,16 @@ class DetectionsBuilder:
             for finding in find_unused(kind, listed, remedies):
                 self.find(finding)
 
-    def leave_out(self, reason: str, place: str) -> None:
-        """Count an entry of the input that is left out."""
+    def leave_out(self, reason: str, place: str, is_loss: bool = False) -> None:
+        """Count an entry of the input that is left out.
+
+        Args:
+            reason: completes "left out: 3 that ...".
+            place: of the entry.
+            is_loss: it is an object that should have been read.
+        """
         self._left_out_counts[reason] += 1
+        self._lost += is_loss
         places = self._left_out.setdefault(reason, [])
         if len(places) <= _NAMED and place not in places:
             places.append(place)
@@ -336,7 +368,9 @@ class DetectionsBuilder:
             raise KeypointFileError("; ".join(["no object is left", *self.reasons()]))
         self._stamp_frames()
         self.warnings += self._looks_wrong(group)
+        self._find_lost(group)
         frame = np.array(group.frame, np.int64)
+        self.warnings += weak_keypoints(group, options.min_confidence)
         points, confidence = group.arrays(options.min_confidence)
         is_normalised = self.is_mediapipe and looks_normalised(points, confidence > 0)
         if is_normalised and options.image_size is None:
@@ -344,6 +378,9 @@ class DetectionsBuilder:
                 "its landmarks are fractions of the image's size: give --image-width and "
                 "--image-height"
             )
+        if self.weak_identity and (reason := _no_identities(group)):
+            self.notes.append(f"its `{self.weak_identity}` is {reason}, and no identity")
+            group.identities = [None] * len(group.identities)
         identities, warning = identities_of(group.identities, frame)
         self.warnings += [warning] if warning else []
         scores = np.array(group.scores, np.float32)
@@ -376,7 +413,7 @@ class DetectionsBuilder:
         """Compare the keypoints of an object with its box, [x, y, width, height] or two corners."""
         try:
             x, y, a, b = (float(number) for number in (box[0] if len(box) == 1 else box))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, LookupError, OverflowError):
             return
         visible = values[(values[:, 2] > 0) & values[:, :2].any(1), :2]
         if len(visible) < _FEW or min(a, b) < _SMALLEST_BOX:  # a box of [0, 0, 1, 1] says nothing
@@ -411,7 +448,7 @@ class DetectionsBuilder:
                     "their box: are they pixels of the box's crop? Pixels of the image are needed",
                 )
             )
-        if len(self._keys) == 1 and len(group.frame) >= _CROWD and _is_one_object(group):
+        if len(self._keys) == 1 and (_is_one_object(group) or _are_same_objects(group)):
             self.find(
                 Finding(
                     "one-frame",
@@ -422,18 +459,49 @@ class DetectionsBuilder:
             )
         return warnings
 
+    def _find_lost(self, group: _Group) -> None:
+        """Find that many objects are left out."""
+        total = len(group.frame) + self._lost
+        if self._lost > _LOST * total and group.frame:
+            self.find(
+                Finding(
+                    "left-out",
+                    f"{self._lost} of {total} objects are left out; the warnings say why",
+                )
+            )
+
     def _stamp_frames(self) -> None:
         """Set the stamps by the times of the input, if it gives all of them."""
-        if not self._times or len(self._times) < len(self._keys):
+        if not self._times:
+            return
+        rate = self.options.rate or self._own_rate or DEFAULT_RATE
+        if missing := len(self._keys) - len(self._times):
+            self.find(
+                Finding(
+                    "times",
+                    f"its times are not used: {missing} of {len(self._keys)} frames have none; "
+                    f"frames follow each other at {rate:g} a second",
+                )
+            )
             return
         if self.options.rate:
             raise KeypointFileError("it has times of its own: leave out --rate")
         values = np.array([self._times[i] for i in range(len(self._keys))])
         unit = self._time_unit or plausible_unit(values)
+        if not unit and len(self._keys) == 1:
+            return
+        if not self._do_grow(values):
+            self.notes.append(
+                f"its times ({values[0]:g}, ...) do not grow with the frames, and are not used"
+            )
+            return
         if not unit:
-            self.warnings.append(
-                f"its times ({values[0]:g}, ...) are not used: in no unit are frames 1 ms to 10 s "
-                f"apart; they follow each other at {DEFAULT_RATE:g} a second"
+            self.find(
+                Finding(
+                    "times",
+                    f"its times ({values[0]:g}, ...) are not used: in no unit are frames 1 ms to "
+                    f"10 s apart; they follow each other at {rate:g} a second",
+                )
             )
             return
         if not self._time_unit:
@@ -442,6 +510,17 @@ class DetectionsBuilder:
         stamps = np.round((values - values.min()) * UNITS[unit]).astype(np.int64)
         stamps += round(float(values.min())) * UNITS[unit] if abs(values.min()) < 2**53 else 0
         self._stamps = stamps.tolist()
+
+    def _do_grow(self, times: NDArray[Any]) -> bool:
+        """Return whether times (f,) of the frames are in their order, but for a few.
+
+        How long a detector took for each image is no time of a frame.
+        """
+        if all(isinstance(key, float) for key in self._keys):
+            return True  # frames that only their times tell apart
+        numbers = self._frame_numbers()
+        steps = np.diff(times if numbers is None else times[np.argsort(numbers, kind="stable")])
+        return bool(not len(steps) or (steps < 0).mean() <= _BACKWARDS and steps.any())
 
     def reasons(self) -> list[str]:
         """Return a sentence for each reason for which entries were left out."""
@@ -475,6 +554,11 @@ class DetectionsBuilder:
         if len(present) > 1 and (len(names) > 1 or len({q for _, q in self._groups}) > 1):
             raise KeypointFileError(
                 f"it has objects of several categories: {text}; choose one with --category"
+            )
+        if len(present) > 1 and names == {None}:
+            self.warnings.append(
+                f"its objects are of several categories ({text}) without names of keypoints, and "
+                "are read as one: choose one with --category"
             )
         return present[0] if present else next(iter(self._names), None)
 
@@ -538,7 +622,7 @@ class DetectionsBuilder:
         for (_, q), group in self._groups.items():
             if q == keypoints:
                 for frame in group.frame:
-                    self.leave_out(reason, self.frame_name(frame))
+                    self.leave_out(reason, self.frame_name(frame), is_loss=True)
 
     def _in_order(self) -> tuple[NDArray[np.int64], Frames, NDArray[np.int64]]:
         """Return the order of the frames in time, what they are called, and their stamps."""
@@ -551,9 +635,15 @@ class DetectionsBuilder:
         else:
             order = np.array(sorted(range(f), key=self._place_in_order), np.int64)
         numbers = None if numbers is None else numbers[order]
-        rate = self.options.rate or DEFAULT_RATE
+        rate = self.options.rate or self._own_rate or DEFAULT_RATE
         times = stamps_of(numbers, f, rate)
-        if numbers is not None and f and numbers.max() >= MOST:
+        unit = "" if numbers is None or self.options.rate else unit_of_epoch(numbers)
+        if numbers is not None and unit:
+            times = numbers * UNITS[unit]
+            self.warnings.append(
+                f"numbers of frames such as {numbers[0]} are taken for times in {unit}"
+            )
+        elif numbers is not None and f and numbers.max() >= MOST and None in stamps:
             self.warnings.append(
                 f"numbers of frames such as {numbers.max()} are no count at a rate: frames follow "
                 f"each other at {rate:g} a second"
@@ -578,9 +668,21 @@ class DetectionsBuilder:
         keys = self._keys
         if keys and None not in self._numbers:
             numbers = np.array(self._numbers, np.int64)
-            return numbers if len(np.unique(numbers)) == len(numbers) else None
+            if len(np.unique(numbers)) == len(numbers):
+                is_count = numbers.max() < MOST or unit_of_epoch(numbers)
+                found = None if is_count else numbers_in(self._frame_names)
+                return numbers if found is None else found
+            self._find_series()
+            return None
         if all(self._frame_names) and (found := numbers_in(self._frame_names)) is not None:
             return found
+        self._find_series()
+        if all(isinstance(key, int) and abs(key) < 2**62 for key in keys):
+            return np.array(keys, np.int64)
+        return None
+
+    def _find_series(self) -> None:
+        """Find that the names of the frames are numbered anew, as those of several videos."""
         if series := series_of(self._frame_names):
             self.find(
                 Finding(
@@ -589,18 +691,63 @@ class DetectionsBuilder:
                     "are they of several cameras or videos? Read each by itself",
                 )
             )
-        if all(isinstance(key, int) and abs(key) < 2**62 for key in keys):
-            return np.array(keys, np.int64)
-        return None
 
 
 def plausible_unit(times: NDArray[np.float64]) -> str:
     """Return the largest unit in which frames are 1 ms to 10 s apart; "" if there is none."""
     spacing = np.diff(np.unique(times))
-    if not len(spacing):
-        return ""
-    middle = float(np.median(spacing)) / 1e9
-    return next((name for name, ns in UNITS.items() if 0.001 <= middle * ns <= 10), "")
+    return next((name for name, ns in UNITS.items() if plausible_spacing(spacing, ns)), "")
+
+
+def unit_of_epoch(numbers: NDArray[np.int64]) -> str:
+    """Return the unit in which numbers are times since 1970, and frames apart; "" if in none."""
+    for unit, ns in UNITS.items() if len(numbers) else ():
+        seconds = 10**9 // ns
+        if _YEARS[0] * seconds <= numbers.min() and numbers.max() < _YEARS[1] * seconds:
+            return unit if plausible_spacing(np.diff(np.unique(numbers)), ns) else ""
+    return ""
+
+
+def plausible_spacing(spacing: NDArray[Any], ns: int) -> bool:
+    """Return whether frames are 1 ms to 10 s apart.
+
+    Args:
+        spacing: (f - 1,) of their times.
+        ns: the unit of the times.
+    """
+    return bool(len(spacing)) and 0.001 <= float(np.median(spacing)) / 1e9 * ns <= 10
+
+
+def weak_keypoints(group: _Group, min_confidence: float) -> list[str]:
+    """Return what to say where many keypoints are below the least confidence, before they go."""
+    weak = present = 0
+    n = len(group.frame)
+    for rows in slices(n):
+        confidence = group.confidence[:n][rows]
+        given = confidence > 0
+        present += int(given.sum())
+        weak += int((given & (confidence < min_confidence)).sum())
+    if weak <= _WEAK * present:
+        return []
+    sample = group.confidence[: min(n, _ROWS)]
+    middle = float(np.median(sample[sample > 0])) if (sample > 0).any() else 0.0
+    return [
+        f"{weak} of {present} keypoints have a confidence below --min-confidence "
+        f"{min_confidence:g}, and count as missing (the median of all is {middle:.2g}): lower it "
+        "if they are right"
+    ]
+
+
+def _no_identities(group: _Group) -> str:
+    """Return why values are no identities: they tell no objects apart, or are never the same."""
+    given = [(f, i) for f, i in zip(group.frame, group.identities, strict=True) if i is not None]
+    distinct = len(set(given))
+    if len(given) - distinct > _REPEATED * len(given):
+        return "the same for several objects of a frame"
+    several = len({frame for frame, _ in given}) > 1 and len(given) >= _ALIKE_OBJECTS
+    if several and len({identity for _, identity in given}) == len(given):
+        return "another one for each object"
+    return ""
 
 
 def _share(low: NDArray[Any], high: NDArray[Any], box: tuple[float, ...]) -> float:
@@ -609,20 +756,43 @@ def _share(low: NDArray[Any], high: NDArray[Any], box: tuple[float, ...]) -> flo
     return float(np.prod(inside) / max(np.prod(high - low), 1e-9))
 
 
-def _is_one_object(group: _Group) -> bool:
-    """Return whether most objects lie where the one before lies, as the same object later does."""
-    n = min(len(group.frame), _ROWS)
+def _boxes(group: _Group, most: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return keypoints (n, q, 2), NaN where missing, and corners (n, 2) of the first objects."""
+    n = min(len(group.frame), most)
     points = group.points[:n].astype(np.float64)
     usable = (group.confidence[:n] > 0) & points.any(-1) & np.isfinite(points).all(-1)
     points[~usable] = np.nan
     points = points[usable.sum(1) >= _FEW]
+    if not len(points):
+        return points, np.empty((0, 2)), np.empty((0, 2))
+    return points, np.nanmin(points, 1), np.nanmax(points, 1)
+
+
+def _is_one_object(group: _Group) -> bool:
+    """Return whether most objects lie where the one before lies, as the same object later does."""
+    points, low, high = _boxes(group, _ROWS)
     if len(points) < _CROWD:
         return False
-    low, high = np.nanmin(points, 1), np.nanmax(points, 1)
     inside = np.clip(np.minimum(high[1:], high[:-1]) - np.maximum(low[1:], low[:-1]), 0, None)
     area, common = np.prod(high - low, 1), np.prod(inside, 1)
     union = area[1:] + area[:-1] - common
     return bool(np.median(common / np.maximum(union, 1e-9)) > _SAME_PLACE)
+
+
+def _are_same_objects(group: _Group) -> bool:
+    """Return whether most objects have the pose and place of another one, nearly.
+
+    Equal ones are copies, and are left out elsewhere.
+    """
+    points, low, high = _boxes(group, _COMPARED)
+    if len(points) < _ALIKE_OBJECTS:
+        return False
+    size = np.linalg.norm(high - low, axis=1)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    distance = np.where(np.isfinite(apart).any(-1), np.nanmean(np.nan_to_num(apart), -1), np.inf)
+    distance = distance / np.maximum(size, 1e-9)[:, None]
+    distance[distance == 0] = np.inf
+    return bool(np.median(distance.min(1)) < _ALIKE)
 
 
 def wrong_count(q: int, layout: KeypointLayout | None) -> str:

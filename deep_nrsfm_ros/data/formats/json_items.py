@@ -46,6 +46,41 @@ def json_items(file: Readable) -> Iterator[JsonItem]:
     return _Reader(file).items()
 
 
+def items_of(value: Any) -> Iterator[JsonItem]:
+    """Yield the same for a document that is decoded."""
+    if isinstance(value, list):
+        yield from (JsonItem(None, each, True) for each in value)
+        if not value:
+            yield JsonItem(None, [], False)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            if isinstance(inner, list) and inner:
+                yield from (JsonItem(key, each, True) for each in inner)
+            else:
+                yield JsonItem(key, inner, False)
+    else:
+        yield JsonItem(None, value, False)
+
+
+def json_documents(file: Readable) -> Iterator[Any]:
+    """Yield the documents of a file in which one follows the other, as in JSON lines.
+
+    Raises:
+        ValueError: one of them is no JSON, or ends early; those before are yielded.
+    """
+    return _Reader(file).documents()
+
+
+def holds_documents(start: bytes) -> bool:
+    """Return whether a file that begins so holds several documents, one after the other."""
+    try:
+        text = codecs.getincrementaldecoder(_encoding(start))().decode(start).lstrip()
+        _, end = json.JSONDecoder().raw_decode(text)
+    except (ValueError, RecursionError):
+        return False
+    return text[end:].lstrip()[:1] in ("{", "[") and text[:1] in ("{", "[")
+
+
 def _encoding(start: bytes) -> str:
     """Return the encoding of a document that begins so: UTF-16 is what PowerShell's `>` writes."""
     is_utf16 = start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -86,6 +121,12 @@ class _Reader:
         if self._peek():
             rest = self._text[self._at : self._at + 20]
             raise ValueError(f"no JSON: {rest!r} after its end{self._place(self._at)}")
+
+    def documents(self) -> Iterator[Any]:
+        """See `json_documents`."""
+        while self._peek():
+            yield self._value()
+            self._whole += 1
 
     def _elements(self, key: str | None) -> Iterator[JsonItem]:
         """Yield the elements of the list that begins here."""

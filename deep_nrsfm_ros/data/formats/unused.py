@@ -12,8 +12,8 @@ _SHOWN = 6  # names that a sentence lists
 _MEANINGS = {
     "the frame": ("frame", "image", "img", "file", "filename", "path"),
     "the time": (
-        *("time", "timestamp", "stamp", "sec", "seconds", "ms", "us", "µs", "usec", "ns", "pts"),
-        "fps",
+        *("time", "times", "timestamp", "timestamps", "stamp", "stamps", "sec", "seconds", "ms"),
+        *("us", "µs", "usec", "ns", "pts", "fps"),
     ),
     "an identity": ("id", "ids", "track", "tracks", "person", "individual", "animal", "subject"),
     "a confidence": (
