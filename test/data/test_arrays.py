@@ -102,6 +102,13 @@ def test_times_that_are_none_are_said(tmp_path: Path) -> None:
     assert not found.findings and found.notes == ("not used: arrays inference_time",)
 
 
+def test_python_objects_are_no_cause_for_doubt(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, points=ROWS, ids=np.array(["anna"] * len(ROWS), object))
+    found = read_keypoints(path)
+    assert not found.findings and found.notes == ("not used: arrays ids (Python objects)",)
+
+
 def test_frames_a_second(tmp_path: Path) -> None:
     found = npz(tmp_path, points=ROWS, fps=10)
     assert found.stamps[1] == 100_000_000

@@ -196,7 +196,11 @@ def find_unused_arrays(
     shapes = {lead, lead[:1], (prod(lead),), points[:-1]} - {()}
     others = _NO_FRAME | _NO_IDENTITY | _NO_TIME
     suspects = [
-        name for name in left if headers[name].shape in shapes and not _words(name) & others
+        name
+        for name in left
+        if headers[name].shape in shapes and headers[name].kind != "O" and not _words(name) & others
     ]
     known = {what: name for what, name in remedies.items() if name}
-    return [unused_sentence("arrays", left)], find_unused("arrays", suspects, known)
+    # Python objects are never read, since they could run code.
+    listed = [f"{name} (Python objects)" if headers[name].kind == "O" else name for name in left]
+    return [unused_sentence("arrays", listed)], find_unused("arrays", suspects, known)
