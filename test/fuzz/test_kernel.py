@@ -107,7 +107,7 @@ def lift(spoiler: Spoiler, network: Sizes | None = None, made: object = None) ->
     n, p = spoiler.choice((0, 1, 2, 30)), network.p
     confidence = np.abs(floats(spoiler, n, p))
     outputs = [output(n, p, 3), output(n, 3, 3), output(n), output(n, 2), output(n), output(n, p)]
-    arrays = [*outputs, output(n, dtype=np.bool_)]
+    arrays = [*outputs, output(n, p, dtype=np.bool_), output(n, dtype=np.bool_)]
     context = None
     if made is None:
         arguments = plan(spoiler, network)

@@ -13,11 +13,13 @@ what they have; else it holds them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deep_nrsfm_ros.data.formats.builder import (
     NO_KEYPOINTS,
@@ -80,6 +82,7 @@ from deep_nrsfm_ros.data.formats.json_forms import (
 from deep_nrsfm_ros.data.formats.json_items import JsonItem, Readable, items_of, json_items
 from deep_nrsfm_ros.data.formats.json_unused import UnusedFields
 from deep_nrsfm_ros.data.formats.names import layout_of_dataset
+from deep_nrsfm_ros.data.formats.overlap import CROWD, SAME_PLACE, overlap_in_turn
 from deep_nrsfm_ros.layouts.layout import MAX_KEYPOINTS
 from deep_nrsfm_ros.lifting.sanity import Finding
 
@@ -97,6 +100,7 @@ _VIDEO = ("video_id", "vid_id", "video_name")
 _NAMED_VIDEOS = 4  # that a finding names
 _MOST_VIDEOS = 100  # that are told apart
 _SEVERAL = 5  # arrays of objects that are frames, and no people of one
+_COMPARED = 64  # entries by number that tell whether they are people or frames
 _RATES = ("fps", "framerate", "videofps")
 
 
@@ -420,9 +424,16 @@ class JsonReader:
             self._time(value, self._frame_of(value, frame))
             return True
         if people := people_by_id(value):
+            entries = {
+                name: person if isinstance(person, dict) else {"keypoints": person}
+                for name, person in people.items()
+            }
+            if not frame.is_document and self._is_one_object(entries.values()):
+                for name, one in entries.items():  # identity -> frame -> object
+                    self._element({"track_id": frame.name, **one}, DefaultFrame(name), key)
+                return True
             index = self._frame_of({}, frame)
-            for identity, person in people.items():
-                one = person if isinstance(person, dict) else {"keypoints": person}
+            for identity, one in entries.items():
                 self._person({"track_id": identity, **one}, index)
             return True
         # Annotations of COCO are boxes of cars, too.
@@ -430,6 +441,16 @@ class JsonReader:
             names = ", ".join(value)[:60] or "nothing"
             self._builder.leave_out(f"{NO_KEYPOINTS}, but {names}{hint_of(value)}", frame.name)
         return key == "annotations"
+
+    def _is_one_object(self, entries: Iterable[Mapping[str, Any]]) -> bool:
+        """Return whether entries lie where the one before lies, as one object in frames does."""
+        found: list[NDArray[np.float64]] = []
+        for entry in islice(entries, _COMPARED):
+            if fields := self._keypoint_fields(entry):
+                with suppress(ValueError):
+                    found.append(as_values(entry[fields[0]], None, self._expected))
+        found = [each for each in found if each.shape == found[0].shape]
+        return len(found) >= CROWD and overlap_in_turn(np.stack(found)[None]) > SAME_PLACE
 
     def _result(self, value: Mapping[str, Any], fields: list[str], frame: DefaultFrame) -> None:
         """Read a result of MediaPipe: the landmarks of a person, or those of each person."""

@@ -14,7 +14,6 @@ from deep_nrsfm_ros.model_files.model_file import load_model
 
 NOT_READ = {
     "YOLO labels (ultralytics 6641)": "YOLO labels",
-    "identity -> frame -> keypoints (PoseLift 4)": "neither COCO",
     "pickle of VIBE": "it is a pickle",
     "array of rows (f, 3q)": "save points.reshape(30, 17, 3)",
     "array (f, 3, q)": "save points.transpose(0, 2, 1)",
