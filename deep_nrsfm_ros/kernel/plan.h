@@ -171,8 +171,8 @@ void correct(Plan *k, Object *o, double noise);
 
    points (n, p, 2), confidence (n, p). Outputs, as in `lifting.Lifted`: shapes (n, p, 3), rotations (n, 3, 3),
    scale (n), translation (n, 2), residual (n), confidence (n, p) and, apart, wrong (n, p), a detected keypoint that
-   contradicts the others; not_lifted (n) is 1 where too few keypoints are detected or all lie on one line. An object's result does not depend on the others. context: NULL if there is
-   none; its states are updated. */
+   contradicts the others; not_lifted (n) is 1 where too few keypoints are detected or all lie on one line. An object's
+   result does not depend on the others. context: NULL if there is none; its states are updated. */
 void lift(Plan *k, ptrdiff_t n, const float *points, const float *confidence, int perspective,
           const Context *context, float *const outputs[6], char *wrong, char *not_lifted);
 

@@ -94,6 +94,12 @@ def test_fractions_are_no_frames_and_no_nanoseconds(tmp_path: Path) -> None:
     assert "its times (`stamps`) are taken for seconds" in found.notes
 
 
+@pytest.mark.parametrize("unit", ["us", "µs", "μs"])  # the sign of micro, and the Greek letter
+def test_microseconds_are_no_seconds(unit: str, tmp_path: Path) -> None:
+    found = npz(tmp_path, points=ROWS, frame=FRAME, **{f"timestamps_{unit}": np.arange(F) * 1e5})
+    np.testing.assert_allclose(np.diff(found.stamps), 1e8, atol=1000)
+
+
 def test_times_that_are_none_are_said(tmp_path: Path) -> None:
     for times in (RNG.uniform(0, 1, F * P), np.arange(5) / 10, np.full(F * P, np.nan)):
         found = npz(tmp_path, points=ROWS, frame=FRAME, timestamps=times)

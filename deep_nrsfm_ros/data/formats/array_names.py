@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from deep_nrsfm_ros.data.formats.builder import TIMES
-from deep_nrsfm_ros.data.formats.unused import find_unused, meaning, unused_sentence
+from deep_nrsfm_ros.data.formats.unused import find_unused, meaning, unused_sentence, words_of
 from deep_nrsfm_ros.lifting.sanity import Finding
 
 NATIVE = (
@@ -33,7 +33,7 @@ _NAMES = {"names", "name", "keypoints", "bodyparts", "joints", "nodes", "landmar
 _UNITS = {
     **dict.fromkeys(("s", "sec", "secs", "seconds"), "seconds"),
     **dict.fromkeys(("ms", "msec", "milliseconds"), "milliseconds"),
-    **dict.fromkeys(("us", "usec", "microseconds"), "microseconds"),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "microseconds"), "microseconds"),
     **dict.fromkeys(("ns", "nsec", "nanoseconds"), "nanoseconds"),
 }
 _NO_IDENTITY = {"category", "class", "label", "cat", "cls", "video", "camera", "cam"}
@@ -115,8 +115,7 @@ def _is_known(role: str, roles: Collection[str]) -> bool:
 def _role(name: str, header: Header, lead: tuple[int, ...], q: int) -> str:
     """Return the role of an array by its name and shape, or ""."""
     shape, kind = header
-    words = _words(name)
-    what = meaning(name)
+    words, what = words_of(name), meaning(name)
     is_number = kind in "fiu"
     if prod(shape) == 1 and is_number and words & _RATES:
         return "rate"
@@ -139,12 +138,6 @@ def _role(name: str, header: Header, lead: tuple[int, ...], q: int) -> str:
     return ""
 
 
-def _words(name: str) -> set[str]:
-    """Return the words in the name of an array."""
-    spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()
-    return {word for word in re.split(r"[^a-z]+", spaced) if word}
-
-
 def points_under_another_name(headers: Mapping[str, Header]) -> str:
     """Return the name of the one array that may be `points`; "" if none or several may."""
     found = [
@@ -159,7 +152,7 @@ def unit_in_name(name: str) -> str:
     """Return the unit of time that the name of an array says, a key of `UNITS`, or ""."""
     if unit := TIMES.get(name, TIMES.get(name.lower(), "")):
         return unit
-    return next((unit for word, unit in _UNITS.items() if word in _words(name)), "")
+    return next((unit for word, unit in _UNITS.items() if word in words_of(name)), "")
 
 
 def taken_for(roles: Mapping[str, str]) -> list[str]:
@@ -198,7 +191,9 @@ def find_unused_arrays(
     suspects = [
         name
         for name in left
-        if headers[name].shape in shapes and headers[name].kind != "O" and not _words(name) & others
+        if headers[name].shape in shapes
+        and headers[name].kind != "O"
+        and not words_of(name) & others
     ]
     known = {what: name for what, name in remedies.items() if name}
     # Python objects are never read, since they could run code.

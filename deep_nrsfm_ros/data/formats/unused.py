@@ -13,7 +13,7 @@ _MEANINGS = {
     "the frame": ("frame", "image", "img", "file", "filename", "path"),
     "the time": (
         *("time", "times", "timestamp", "timestamps", "stamp", "stamps", "sec", "seconds", "ms"),
-        *("us", "µs", "usec", "ns", "pts", "fps"),
+        *("us", "µs", "μs", "usec", "ns", "pts", "fps"),
     ),
     "an identity": ("id", "ids", "track", "tracks", "person", "individual", "animal", "subject"),
     "a confidence": (
@@ -24,10 +24,15 @@ _MEANINGS = {
 """What a name may mean -> its words."""
 
 
+def words_of(name: str) -> set[str]:
+    """Return the words of a name in small letters: frame and number of `frameNumber`."""
+    spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()
+    return {word for word in re.split(r"[^a-zµμ]+", spaced) if word}
+
+
 def meaning(name: str) -> str:
     """Return what an unused name seems to hold: a key of `_MEANINGS`, or ""."""
-    spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()
-    words = {word for word in re.split(r"[^a-zµ]+", spaced) if word}
+    words = words_of(name)
     words |= {word.removesuffix("s") for word in words}
     return next((what for what, known in _MEANINGS.items() if not words.isdisjoint(known)), "")
 
