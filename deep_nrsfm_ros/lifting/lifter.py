@@ -63,8 +63,7 @@ class Lifted(NamedTuple):
         residual: (n,) image error of the network before the correction: distance of its keypoints
             from those given, relative to their size; 0 = perfect, below 0.1 typical, above 0.3
             poor. It is the mean over the `test_time_rotations` of the image; the image error that
-            `train` prints is of the image alone, and so smaller on frames that a model has learned
-            (of a mouse 0.007 instead of 0.05).
+            `train` prints is of the image alone, and so smaller on frames that a model has learned.
         confidence: (n, p) probability in [0, 1] that the point is close to its true position.
         wrong: (n, p) bool, whether a detected keypoint contradicts the others of its object; it
             was taken as missing (option `leave_out_wrong`).

@@ -96,7 +96,8 @@ def test_fractions_are_no_frames_and_no_nanoseconds(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("unit", ["us", "µs", "μs"])  # the sign of micro, and the Greek letter
 def test_microseconds_are_no_seconds(unit: str, tmp_path: Path) -> None:
-    found = npz(tmp_path, points=ROWS, frame=FRAME, **{f"timestamps_{unit}": np.arange(F) * 1e5})
+    times: dict[str, Any] = {f"timestamps_{unit}": np.arange(F) * 1e5}
+    found = npz(tmp_path, points=ROWS, frame=FRAME, **times)
     np.testing.assert_allclose(np.diff(found.stamps), 1e8, atol=1000)
 
 
