@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deep_nrsfm_ros.layouts.layout import KeypointLayout
-from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.layouts.presets import preset_keypoints
 from deep_nrsfm_ros.layouts.spelling import match_names
 
 _MIN_SHARED = 4  # a shape is unique from four points on
@@ -114,11 +114,12 @@ class KeypointMap:
         """
         missing = [name for name in self.target.keypoints if name not in self.filled]
         others = self.unused
-        if {"left_hip", "left_ankle"} <= set(self.target.keypoints):
-            known = {name for layout in LAYOUTS.values() for name in layout.keypoints}
-            others = tuple(name for name in others if name not in known)
         if len(missing) <= _MOST_MISSING * len(self.target) or len(others) < _MANY_OTHERS:
             return None
+        if {"left_hip", "left_ankle"} <= set(self.target.keypoints):
+            others = tuple(name for name in others if name not in preset_keypoints())
+            if len(others) < _MANY_OTHERS:
+                return None
         counts = f"{len(self.filled)} of the {len(self.target)} keypoints"
         return Unnamed(counts, f"{len(others)} other ones ({_shown(others)})", _shown(missing))
 

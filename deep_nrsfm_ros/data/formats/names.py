@@ -6,10 +6,9 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Sequence
 from difflib import SequenceMatcher
-from functools import cache
 
 from deep_nrsfm_ros.layouts.layout import SIDE_WORDS, KeypointLayout
-from deep_nrsfm_ros.layouts.presets import LAYOUTS
+from deep_nrsfm_ros.layouts.presets import LAYOUTS, preset_keypoints
 from deep_nrsfm_ros.layouts.spelling import ALIASES, match_names, side_and_rest
 
 NAMED_BY_INPUT = "names_of_the_input"
@@ -78,7 +77,7 @@ def are_numbers(names: Sequence[str]) -> bool:
 
 def preset_spelling(name: str) -> str:
     """Return the name of a keypoint as the presets spell it, or `name` if none of them has it."""
-    known = _known()
+    known = preset_keypoints()
     if name in known:
         return name
     sides, rest = side_and_rest(name)
@@ -105,7 +104,7 @@ def misspelt(names: Collection[str], wanted: Sequence[str]) -> dict[str, str]:
     missing = {name: side_and_rest(name) for name in wanted if name not in names}
     found: dict[str, str] = {}
     for name in names:
-        if name in _known() or name in wanted:
+        if name in preset_keypoints() or name in wanted:
             continue
         sides, rest = side_and_rest(name)
         likeness = {
@@ -121,18 +120,12 @@ def misspelt(names: Collection[str], wanted: Sequence[str]) -> dict[str, str]:
 
 def unknown_names(names: Collection[str], wanted: Sequence[str]) -> list[str]:
     """Return the names that are neither wanted ones nor those of a preset."""
-    return [name for name in names if name not in wanted and name not in _known()]
+    return [name for name in names if name not in wanted and name not in preset_keypoints()]
 
 
 def are_mostly_known(names: Collection[str], wanted: Sequence[str]) -> bool:
     """Return whether at least half of some names are wanted ones, or those of a preset."""
     return 2 * len(unknown_names(names, wanted)) <= len(names)
-
-
-@cache
-def _known() -> frozenset[str]:
-    """Return the names of the keypoints of all presets."""
-    return frozenset(keypoint for layout in LAYOUTS.values() for keypoint in layout.keypoints)
 
 
 def contradiction(layout: KeypointLayout, names: KeypointLayout) -> str:

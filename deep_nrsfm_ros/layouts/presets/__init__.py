@@ -84,3 +84,9 @@ def __getattr__(name: str) -> KeypointLayout:
     if name.lower() in NAMES and name.isupper():
         return preset(name.lower())
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+@cache
+def preset_keypoints() -> frozenset[str]:
+    """Return the names of the keypoints of all presets, whose files are read for it."""
+    return frozenset(keypoint for layout in LAYOUTS.values() for keypoint in layout.keypoints)
